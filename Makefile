@@ -3,14 +3,27 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 PAPERS := .venv/.papers
+ONLY ?=
 
-# two processes more than cores, for many tests wait for processes of their own
+# two processes more than cores, because many tests wait for processes of their own
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 2 )) --dist loadfile
-export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
+export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench image kube country-bench
+# Main targets have a comment "##", campaigns "#=", everything else "#-"; `make help` and `make campaigns` print them.
+.DEFAULT_GOAL := help
+.PHONY: help campaigns setup demo test test-all test-shuffled check package docs lint types results figures release \
+  faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability roads-bench \
+  page-bench ahead-bench browser-test batch-bench image kube country-bench
 
-setup: $(STAMP)  ## make .venv and install everything, pinned
+help:  #- print the main targets
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | awk -F '\t' '{printf "%-18s%s\n", $$1, $$2}'
+	@echo; echo "make demo runs the demonstration; make campaigns lists the long measurements"
+
+campaigns:  #- print the campaigns
+	@grep -E '^[a-z-]+:.*#= ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*#= /\t/' | awk -F '\t' '{printf "%-18s%s\n", $$1, $$2}'
+	@echo; echo "Each writes figures.json; make figures keeps them in deploy/figures and writes deploy/docs/results.md."
+
+setup: $(STAMP)  ## install everything into .venv, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -22,102 +35,109 @@ $(PAPERS): $(STAMP)
 	$(BIN)/python -m deploy.precompile papers
 	touch $@
 
-demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
+demo: setup  #= router, service and simulated cars; prints the address of the live map
 	$(BIN)/python -m deploy.demo $(ARGS)
 
-test: $(PAPERS)  ## the tests that take seconds; says what the slowest cost
+test: $(PAPERS)  ## tests that take seconds
 	$(TESTS) --durations 10 -m 'not long and not campaign'
 
-test-all: $(PAPERS)  ## these, and the campaigns in their quick form
+test-all: $(PAPERS)  #- all tests, and the campaigns in their quick form
 	$(TESTS) --durations 10
 
-test-shuffled: $(PAPERS)  ## all ten times in an order drawn anew: none may lean on another
+test-shuffled: $(PAPERS)  #- all tests ten times in random order
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
 
-browser-test: setup  ## pages in the system's Chromium, and axe-core's scan of them; pictures in .page
+browser-test: setup  #= pages in Chromium, with accessibility checks
 	$(BIN)/python -m tests.npm axe-core
 	$(BIN)/python -m pytest -q -rs tests/fleet_service/page tests/fleet_service/analytics/test_page.py
 
-docs: setup  ## the documentation site, .docs/index.html; a warning is an error
+docs: setup  ## build the documentation site in .docs; warnings are errors
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -c deploy/docs . .docs
 	cp deploy/docs/landing.html .docs/index.html
 
-lint: setup
+lint: setup  #- ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: setup
+types: setup  #- mypy
 	$(BIN)/mypy
 
-check: lint types test-all package faults-quick  ## what CI runs
+check: lint types test-all package faults-quick  ## lint, types, all tests, package, quick faults: what CI runs
 
-package: setup  ## wheel and sdist, installed in a fresh environment outside the repository and used there
+package: setup  #- wheel and sdist, installed and used in a fresh environment
 	$(BIN)/python -m tests.packaging
 
-faults: setup  ## the fault campaigns, hours; writes .faults/figures.json
+faults: setup  #= fault campaigns, hours
 	$(BIN)/python -m tests.faults
 
-faults-quick: setup  ## the same mechanisms in three minutes
+faults-quick: setup  #= the same mechanisms in three minutes
 	$(BIN)/python -m tests.faults --quick
 
-roads-bench: setup  ## how often cells are joined to the right link, against SUMO's traffic; writes .roads/figures.json
+roads-bench: setup  #= road join against SUMO traffic
 	$(BIN)/python -m tests.benchmarks.roads
 
-page-bench: setup  ## the live page measured, beside MapLibre in the same browser, and what leaves the house; .page/figures.json
+page-bench: setup  #= the live page next to MapLibre in the same browser; needs Chromium and npm
 	$(BIN)/python -m tests.npm axe-core maplibre-gl
 	$(BIN)/python -m tests.benchmarks.page
 
-ahead-bench: setup  ## cars that listen: warned in time, cost, delay, the map as a prior, towns that listen; .evaluation
+ahead-bench: setup  #= warnings in the car, and the map as a prior
 	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
 	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
 
-usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
+usability: setup  #= the first hour of a new user; needs Chromium and unshare
 	$(BIN)/python -m tests.usability
 
-figures: setup  ## keep what the campaigns' last runs measured in deploy/figures, and write the READMEs' numbers anew
-	$(BIN)/python -m tests.usability.kept
+figures: setup  #- keep the figures of the last runs, and write the results page
+	$(BIN)/python -m tests.results
 
-image: setup  ## the steps of deploy/Dockerfile as a script, and a service of what they leave
+results: setup  #- write the results page from the kept figures
+	$(BIN)/python -m tests.results --pages-only
+
+release: setup  #- VERSION=x.y.z: check the changelog, set the version, build sdist, wheel and SBOM in dist/
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[release]'
+	$(BIN)/python -m tests.release $(VERSION)
+
+image: setup  #= the steps of the Dockerfile, and a service of its result
 	$(BIN)/python -m tests.image
 
-kube: setup  ## manifests for Kubernetes: validated, and their pods' commands started; wants kubectl; .kube/figures.json
+kube: setup  #= Kubernetes manifests validated, their commands started; needs kubectl
 	$(BIN)/python -m tests.deploy.kubernetes
 
-cluster-faults: setup  ## services that follow each other, a hundred times; writes .faults/cluster/figures.json
+cluster-faults: setup  #= a hundred failovers between services
 	$(BIN)/python -m tests.faults.cluster
 
-soak: setup  ## half an hour of steady load: does anything grow?
+soak: setup  #= half an hour of steady load; memory and handles
 	$(BIN)/python -m tests.faults.soak
 
-bench: setup  ## cost of each part, side by side; writes .bench/figures.json
+bench: setup  ## measure the cost of each part; ONLY=fusion measures one
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
-	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m tests.benchmarks $(ONLY)
 
-batch-bench: setup  ## Iceberg tables beside the archive, Spark beside this machine; wants a Java; writes .batch/figures.json
+batch-bench: setup  #= Iceberg and Spark next to one machine; needs Java
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.batch
 
-country-bench: setup  ## SUMO's traffic for 300 of our vehicles, then 100 000 for ten minutes; writes .country/figures.json
+country-bench: setup  #= a city and 100 000 vehicles
 	$(BIN)/python -m tests.benchmarks.country
 
-analytics-bench: setup  ## archive and analytics on ten million rows, Spark beside; writes .analytics/figures.json
+analytics-bench: setup  #= archive and questions on ten million rows
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.analytics
 
-spark-test: setup  ## Spark beside DuckDB and beside this machine; installs it, wants a Java
+spark-test: setup  #= Spark and DuckDB give the same answers; needs Java
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py tests/fleet_service/analytics/test_spark_rebuild.py tests/edge_agent/app/test_spark_replay.py
 
-tune: setup  ## the ant colony over the memberships; writes the shipped file anew
+tune: setup  #- search the memberships; writes the shipped file
 	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json
 
-proto: setup  ## generate the message modules from the .proto files
+proto: setup  #- generate the message modules
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto
 	cd edge_agent/inputs/live/kuksa && $(CURDIR)/$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. broker.proto
 
-lock: setup  ## write the installed versions to constraints.txt
+lock: setup  #- write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info
+	rm -rf deploy/docs/reference/generated .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info

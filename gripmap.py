@@ -53,14 +53,14 @@ def __dir__() -> list[str]:
 def edge_agent_main() -> NoReturn:
     """Run `edge-agent`."""
     from edge_agent.cli import main
-    from schemas.runtime.process import leave
+    from schemas.runtime.process import exit_fast
 
-    leave(main())
+    exit_fast(main())
 
 
 def fleet_service_main() -> NoReturn:
     """Run `fleet-service`."""
     from fleet_service.cli import main
-    from schemas.runtime.process import leave
+    from schemas.runtime.process import exit_fast
 
-    leave(main())
+    exit_fast(main())

@@ -1,1 +1,1 @@
-"""Putting the parts to work: the router, configurations, and the demo."""
+"""Programs and files that start the parts: the router, configurations, and the demo."""

@@ -1,10 +1,10 @@
-"""From wheels to observations on disk, without a network: what the fusion's campaign needs end to end.
+"""Observations of simulated vehicles with the real estimator, without a network, for the fusion's evaluation.
 
     python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000] [--scenario demo]
         [--rough 0] [--winter 0]
 
-Simulated vehicles with the default estimator drive a scenario; DIR/observations.parquet gets what they would have sent,
-DIR/truth.parquet what they drove over.
+Simulated vehicles with the default estimator drive a scenario. DIR/observations.parquet gets the observations that they
+would send, DIR/truth.parquet the friction under them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REPORT_S = 30.0
 
 
 def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
-    """Columns of all observations, with `vehicle`; writes the truth."""
+    """Return the columns of all observations, with `vehicle`; write the truth."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
@@ -59,7 +59,7 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
 
 
 def write(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
-    """Drive, and write both files into a folder that is there."""
+    """Drive, and write both files into an existing folder."""
     columns = drive(fleet, duration_s, folder / "truth.parquet")
     arrays = {name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()}
     pq.write_table(pa.table(arrays), folder / "observations.parquet")

@@ -1,10 +1,10 @@
-"""A town that listens, without a network: simulated cars, the fusion and its alerts, cars that hear the map and react.
+"""Town with listening cars, without a network: simulated cars, the fusion and its alerts, cars that receive the map.
 
     python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario hills-SEED]
 
-Every second what the cars observed is fused, as a service would; alerts and, now and then, tiles go to the cars that
-listen, by the bytes that would travel. Each seed is driven twice from the same start, once with all cars listening and
-once with none. DIR/figures.json gets what became of it.
+Every second the cars' observations are fused, as in a service. Alerts and, now and then, tiles are passed to the
+listening cars as bytes. Each seed is driven twice from the same start, once with all cars listening and once with none.
+DIR/figures.json gets the figures.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.ahead.hearing import heard_alert, heard_cells
+from edge_agent.ahead.hearing import decode_alert_message, decode_cells
 from edge_agent.ahead.horizon import horizon_length, look_ahead
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import Pose
 from edge_agent.ahead.prior import MapPrior
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, absolute
 from edge_agent.lab.seeds import FIGURES
@@ -53,7 +53,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """What became of one drive; rows are visits of a vehicle to a cell, by the simulator's truth."""
+    """Result of one drive; rows are visits of a vehicle to a cell, from the simulator's truth."""
 
     slid: set[tuple[int, int]] = field(default_factory=set)  # (vehicle, lap) that lost grip on the new ice
     passed: set[tuple[int, int]] = field(default_factory=set)  # ... and that were there
@@ -76,7 +76,7 @@ class ListeningTown:
         self.fusion = Fusion(LATENESS_S)
         self.alerts = Alerts(self.fusion)
         self.drivers = WarnedDrivers(self.fleet, 1.0 if listening else 0.0)
-        self.heard, self.prior = HeardMap(), MapPrior(vehicles)
+        self.heard, self.prior = LocalMap(), MapPrior(vehicles)
         self.active: list[tuple[Active, ...]] = [()] * vehicles
         self.drive = Drive()
         self.ice = self.fleet.scenario.events[0]
@@ -86,19 +86,19 @@ class ListeningTown:
         self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
 
     def run(self, duration_s: float) -> Drive:
-        """Drive, and judge the map at the end."""
+        """Drive, and evaluate the map at the end."""
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
             self._fuse([part for part in parts if len(part["cell"])])
             if self._listening:
                 self._hear(second)
                 self._look()
-        self.drive.inside = self._covered()
+        self.drive.inside = self._check_intervals()
         self.drive.visits = self.fusion.live.visits[: self.fusion.size].sum()
         return self.drive
 
-    def _covered(self) -> list[bool]:
-        """Whether the map's interval holds the last truth, for each place that several vehicles visited."""
+    def _check_intervals(self) -> list[bool]:
+        """Return whether the map's interval holds the last truth, for each place that several vehicles visited."""
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
         several = slots >= 0
@@ -118,7 +118,7 @@ class ListeningTown:
         return seen.columns | {"vehicle": seen.vehicle}
 
     def _truth(self, now: float) -> None:
-        """Who is on the new ice, and who slides there."""
+        """Record the cars on the new ice, and those that slide there."""
         true, patch = self.fleet.truth, self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
         places = cells * grid.SECTORS + grid.sector_of(true.yaw[-1])
@@ -136,7 +136,7 @@ class ListeningTown:
         if not parts:
             return
         columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        raised = self.alerts.updated(self.fusion.update(observations_in(columns)).slots)
+        raised = self.alerts.update(self.fusion.update(observations_in(columns)).slots)
         now = self._now()
         for alert in raised:
             if alert.raised and self._on_ice(alert.latitude, alert.longitude):
@@ -144,12 +144,12 @@ class ListeningTown:
                     self.drive.alert_passes = float(len(self.drive.passed))
                 self.drive.alerts += 1
             key = keys.alert_key(int(grid.tile_of(alert.cell)))
-            self.heard.alert(heard_alert(key, wire.encode_alert(alert), now), now)
+            self.heard.alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """The tiles as they would come, and the alerts that stand put again."""
+        """Pass on the changed tiles, and repeat the standing alerts."""
         now = self._now()
-        for alert in self.alerts.standing:
+        for alert in self.alerts.standing_alerts:
             self.heard.alert(alert, now)
         if second - self._asked < ASKED_S:
             return
@@ -158,7 +158,7 @@ class ListeningTown:
         tiles = grid.tile_of(self.fusion.live.key[: self.fusion.size] // grid.SECTORS)
         for tile in np.unique(tiles).tolist():
             payload = arrow_stream(batch_of(view(self.fusion, slots[tiles == tile], now), now))
-            self.heard.take(*heard_cells(keys.map_key(tile), payload, now), now)
+            self.heard.take(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _look(self) -> None:
         self.drivers.refresh()
@@ -169,7 +169,9 @@ class ListeningTown:
             path = route.ahead(pose, horizon_length(pose.speed)) if route is not None else None
             if path is None:
                 continue
-            self.active[k], issued = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
+            self.active[k], issued = update_warnings(
+                self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard
+            )
             self.drive.warnings += sum(one.state == "raised" for one in issued)
             for warning in issued:
                 self.drivers.hear(self.fleet.names[k], warning)
@@ -225,15 +227,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             passes = f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after {drive.alert_passes:.0f}"
             more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
             print(f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}", flush=True)
-    found = measured(with_, without)
+    found = measure(with_, without)
     campaign = "deploy.listening" + (f" --seeds {args.seeds}" if args.seeds < SEEDS else "")
     figures.write(args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found)
     print(figures.markdown(found))
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
 
 
-def measured(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """The figures of drives with and without listening."""
+def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
+    """Return the figures of drives with and without listening."""
     slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
     laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))
     errors = np.array([pair for drive in with_ for pair in drive.known_error]).reshape(-1, 2)

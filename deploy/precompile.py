@@ -1,8 +1,7 @@
-"""`python -m deploy.precompile [papers]`: compile what is needed often, once on this machine.
+"""`python -m deploy.precompile [papers]`: compile frequently used kernels once on this machine.
 
-`make setup` ends with what service, agent and simulated vehicle need, so that the first start of anything does not
-wait. The tests need the papers' filters too. What cannot be compiled here is compiled at the first start, which says
-so.
+`make setup` ends with the kernels of service, agent and simulated vehicle, so that their first start does not wait. The
+tests need the papers' filters too. A kernel that cannot be compiled here is compiled at its first use.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ DEFAULT: Final = "aco-fckf"
 
 
 def main(words: list[str]) -> int:
-    """Compile, a process a core; 0 whatever comes of it."""
+    """Compile with one process per core; always return 0."""
     began = time.monotonic()
     papers = words == ["papers"]
     print(f"compiling {'the filters of the papers' if papers else 'kernels'}, once on this machine", flush=True)
@@ -45,7 +44,7 @@ def _estimate(name: str) -> tuple[str, ...]:
 
 
 def _run(folder: str, code: str, *words: str) -> list[str]:
-    """Run a process; its lines that tell of an error."""
+    """Run a process; return its lines with errors."""
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True)
     return [line for line in (done.stdout + done.stderr).splitlines() if "error" in line.lower()]
 

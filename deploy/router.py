@@ -1,7 +1,7 @@
-"""A Zenoh router in a process of its own: `python -m deploy.router [--config FILE] [--listen ENDPOINT]`.
+"""Zenoh router in a process of its own: `python -m deploy.router [--config FILE] [--listen ENDPOINT]`.
 
-The Python package of Zenoh holds the whole router, so no other binary is needed.
-It prints `router: tcp/…` when it listens (with the real port where port 0 was asked for) and ends on SIGINT or SIGTERM.
+The Python package of Zenoh contains the router, so no other binary is needed. It prints `router: tcp/…` when it listens
+(with the real port if port 0 was given) and ends on SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import zenoh
 
 from schemas.errors import InputError
-from schemas.runtime.process import end_now
+from schemas.runtime.process import force_exit
 
 CLOSE_S = 2.0
 ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -25,10 +25,10 @@ CONFIG = Path(__file__).with_name("router.json5")
 
 
 def configuration(config: Path = CONFIG, listen: str | None = None) -> zenoh.Config:
-    """The router's configuration from a file, with another endpoint if one is given.
+    """Return the router's configuration from a file, with another endpoint if one is given.
 
     Raises:
-        InputError: the file cannot be read as a Zenoh configuration, or the endpoint is none.
+        InputError: the file is not a Zenoh configuration, or the endpoint is not valid.
     """
     try:
         settings = zenoh.Config.from_file(str(config))
@@ -41,10 +41,10 @@ def configuration(config: Path = CONFIG, listen: str | None = None) -> zenoh.Con
 
 
 def open_router(config: Path = CONFIG, listen: str | None = None) -> tuple[zenoh.Session, list[str]]:
-    """Start a router in this process; returns its session and the endpoints that it listens on.
+    """Start a router in this process; return its session and the endpoints that it listens on.
 
     Raises:
-        InputError: the configuration is wrong, or the endpoint is taken.
+        InputError: the configuration is wrong, or the endpoint is in use.
     """
     settings = configuration(config, listen)
     try:
@@ -85,4 +85,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 if __name__ == "__main__":
     # Zenoh may hang where one of two connected routers is closed, then or when the interpreter ends; a router has
     # nothing to save.
-    end_now(main())
+    force_exit(main())

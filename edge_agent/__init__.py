@@ -10,7 +10,7 @@ The names of `__all__` are what other programs may rely on; they are loaded when
 from __future__ import annotations
 
 import gripmap  # noqa: F401 says which other package hides one of ours, where one does
-from schemas.runtime import face
+from schemas.runtime import lazy_exports
 
 _FACE = {
     "ESTIMATORS": "edge_agent.estimators",
@@ -36,4 +36,4 @@ _FACE = {
     "simulate_manoeuvre": "edge_agent.lab.simulation",
     "to_table": "edge_agent.app.library",
 }
-__all__, __getattr__, __dir__ = face.lazy(__name__, _FACE)
+__all__, __getattr__, __dir__ = lazy_exports.lazy_exports(__name__, _FACE)

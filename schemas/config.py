@@ -1,4 +1,4 @@
-"""Configuration of the agent and the service: every setting with its default, unit and reason, in one place."""
+"""Configuration of agent and service: every setting with its default, unit and reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Settings(BaseModel):
 
 
 class ZenohSettings(Settings):
-    """How to reach the routers; `config` is handed to Zenoh as it is (same keys as a Zenoh configuration file)."""
+    """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh configuration file)."""
 
     connect: list[str] = Field(default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn")
     config: dict[str, Any] = Field(
@@ -34,13 +34,15 @@ class ZenohSettings(Settings):
 
 
 class MonitoringSettings(Settings):
-    """How a running part shows itself."""
+    """Settings for metrics, health and log format."""
 
     metrics_port: int | None = Field(
         default=None, ge=0, le=65535, description="/metrics (OpenMetrics) and /healthz; 0: a free port; null: off"
     )
-    metrics_host: str = Field(default="127.0.0.1", description="address for them; anyone who reaches it may read")
-    log: Literal["text", "json"] = Field(default="text", description="lines for people, or JSON lines for programs")
+    metrics_host: str = Field(
+        default="127.0.0.1", description="listen address for both; everyone who can reach it may read"
+    )
+    log: Literal["text", "json"] = Field(default="text", description="form of log lines: text, or JSON")
 
 
 class AgentConfig(MonitoringSettings):
@@ -50,37 +52,42 @@ class AgentConfig(MonitoringSettings):
     estimator: str = Field(default="aco-fckf", description="estimator by name")
     state_rate_hz: Positive = Field(default=2.0, le=10.0, description="state records per second")
     flush_s: Positive = Field(default=1.0, description="longest time a record waits for its batch")
-    batch_rows: int = Field(default=50, ge=1, le=50, description="records per batch at the most")
-    slippery_mu: Positive = Field(default=SLIPPERY_MU, description="a visit whose upper bound is below is sent at once")
+    batch_rows: int = Field(default=50, ge=1, le=50, description="maximum number of records per batch")
+    slippery_mu: Positive = Field(
+        default=SLIPPERY_MU, description="a visit with an upper bound below this is sent at once"
+    )
     position_std: Positive = Field(default=1.5, description="[m] of the satellite receiver")
     yaw_std: Positive = Field(default=0.02, description="[rad] of the satellite receiver")
     spool: Path = Field(
-        default=Path("spool.sqlite"), description="what is not yet acknowledged; {name} in it is the vehicle's name"
+        default=Path("spool.sqlite"), description="file of the outbox; {name} in it is the vehicle's name"
     )
     spool_mb: Positive = Field(
-        default=256.0, description="[MB] at the most; oldest state goes first, then observations"
+        default=256.0, description="[MB] limit; the oldest states are dropped first, then observations"
     )
     resend_s: Positive = Field(
         default=2.0,
-        description="first wait before a batch is sent again; doubles up to 6 s, to minutes if nobody answers",
+        description="first wait before a batch is sent again; doubles up to 6 s, or to minutes without any answer",
     )
     trip_end_m: float = Field(
-        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip; nothing is published of them"
+        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip that are not published"
     )
     trip_end_s: float = Field(
-        default=0.0, ge=0.0, allow_inf_nan=False, description="[s] likewise; both must have passed"
+        default=0.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="[s] at both ends of a trip that are not published; both limits apply",
     )
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
     def spool_of(self, name: str) -> Path:
-        """The outbox of a vehicle, or of a process."""
+        """Return the path of a vehicle's outbox, or of a process's."""
         return Path(str(self.spool).replace("{name}", name))
 
 
 class ArchiveSettings(Settings):
-    """Where the archive is."""
+    """Location of the archive."""
 
-    path: Path | None = Field(default=None, description="folder, one service per archive; `--archive` goes before it")
+    path: Path | None = Field(default=None, description="folder, one service per archive; `--archive` takes precedence")
     second: str | None = Field(
         default=None,
         alias="copy",
@@ -94,7 +101,7 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """`store` as it is, with its secrets."""
+        """Return `store` with its secrets."""
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
 
@@ -113,23 +120,25 @@ class ServiceConfig(MonitoringSettings):
         default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
     )
     standby: bool = Field(
-        default=False, description="waits until the service whose archive's copy it names is gone, and goes on as it"
+        default=False, description="run as standby: take over when the active service on this replica stops"
     )
     lease_s: Positive = Field(
-        default=5.0, ge=1.0, description="after which a service with a copy that is not heard of may be followed"
+        default=5.0, ge=1.0, description="time after which a standby may replace a silent service"
     )
     segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
-    put_s: Positive = Field(default=1.0, description="shortest time between two puts of one tile")
-    lateness_s: Positive = Field(default=120.0, description="later observations are archived, not fused")
+    put_s: Positive = Field(default=1.0, description="minimum time between two publications of one tile")
+    lateness_s: Positive = Field(default=120.0, description="observations older than this are fused as old news")
     weather: Path | None = Field(
-        default=None, description="Parquet file of road weather to begin with; reports over Zenoh come on top"
+        default=None, description="Parquet file of road weather to read at the start; reports over Zenoh are added"
     )
     public_vehicles: int = Field(
-        default=1, ge=1, description="cells are shown of so many vehicles; from 2 on, of the last 12 to 24 h (privacy)"
+        default=1,
+        ge=1,
+        description="minimum number of vehicles of a visible cell; from 2 on, within the last 12 to 24 h (privacy)",
     )
     clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
     oldest_s: Positive = Field(
-        default=30 * 86400.0, le=30 * 86400.0, description="records older than this are refused, 30 days at the most"
+        default=30 * 86400.0, le=30 * 86400.0, description="records older than this are refused; at most 30 days"
     )  # a start reads 31 days back for what it holds: an older batch would be taken twice
     compact_s: float = Field(
         default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two compactions of the archive; 0: never"
@@ -138,7 +147,7 @@ class ServiceConfig(MonitoringSettings):
         default=300.0,
         ge=0.0,
         allow_inf_nan=False,
-        description="time between two checkpoints, which a restart begins from",
+        description="time between two checkpoints, from which a restart begins",
     )
     snapshot_s: float = Field(
         default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two snapshots of the map; 0: never"
@@ -146,19 +155,21 @@ class ServiceConfig(MonitoringSettings):
     raw_days: int = Field(
         default=0, ge=0, description="days of raw rows that stay in the archive, 31 at least; roll-ups stay; 0: all"
     )
-    put_to: str | None = Field(default=None, description="URI where compacted files are put too, e.g. s3://bucket/a")
+    put_to: str | None = Field(default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a")
     queue_batches: int = Field(
-        default=20_000, ge=1, description="batches waiting at the most; more wait unacknowledged"
+        default=20_000,
+        ge=1,
+        description="maximum number of waiting batches; further ones stay unacknowledged with their senders",
     )
     vehicle_kb_s: Positive = Field(
         default=40.0, description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with it"
     )
     vehicle_burst_kb: Positive = Field(
-        default=2000.0, ge=64.0, description="[kB] at once, as after an outage of an hour; the largest batch must fit"
+        default=2000.0,
+        ge=64.0,
+        description="[kB] at once, for example after an outage of an hour; the largest batch must fit",
     )
-    fleet: Path | None = Field(
-        default=None, description="enrolment file; reports of vehicles that are not on it are not looked at"
-    )
+    fleet: Path | None = Field(default=None, description="enrolment file; reports of other vehicles are ignored")
 
     @field_validator("archive", mode="before")
     @classmethod

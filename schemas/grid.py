@@ -1,4 +1,4 @@
-"""Where on earth: quadint cells, tiles, regions, zones, and heading sectors. Everything is vectorised.
+"""Places on earth: quadint cells, tiles, regions, zones, and heading sectors. All functions are vectorised.
 
 A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the even bits), so that its
 base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 - z)`.
@@ -9,8 +9,8 @@ base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 
     zone     zoom 7    one folder of the archive
     sector   0 east, 1 north, 2 west, 3 south: quarter of the compass the vehicle heads for, so carriageways do not mix
 
-Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°.
-Source: the slippy-map tile scheme (OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
+Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°. Source: the slippy-map tile scheme
+(OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ def _gather(v: IntArray) -> IntArray:
 
 
 def interleave(x: IntArray, y: IntArray) -> IntArray:
-    """Tile column and row as a quadint of the same zoom."""
+    """Return tile column and row as a quadint of the same zoom."""
     return _spread(x) | (_spread(y) << 1)
 
 
 def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Column and row of a quadint."""
+    """Return column and row of a quadint."""
     c = np.asarray(cell, dtype=np.int64)
     return _gather(c), _gather(c >> 1)
 
 
 def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """The cell that holds a position [deg]; (…,) int64. Positions must be finite."""
+    """Return the cell that holds a position [deg]; (…,) int64. Positions must be finite."""
     n = 1 << zoom
     phi = np.radians(np.clip(np.asarray(latitude, dtype=np.float64), -MAX_LATITUDE, MAX_LATITUDE))
     x = np.floor((np.asarray(longitude, dtype=np.float64) + 180.0) / 360.0 * n).astype(np.int64) % n
@@ -72,22 +72,22 @@ def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) ->
 
 
 def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
-    """The ancestor at `zoom` of a cell at zoom `of`."""
+    """Return the ancestor at `zoom` of a cell at zoom `of`."""
     return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
 
 
 def tile_of(cell: ArrayLike) -> IntArray:
-    """The z14 tile of a cell."""
+    """Return the z14 tile of a cell."""
     return parent(cell, TILE_ZOOM)
 
 
 def region_of(cell: ArrayLike) -> IntArray:
-    """The z10 region of a cell."""
+    """Return the z10 region of a cell."""
     return parent(cell, REGION_ZOOM)
 
 
 def zone_of(cell: ArrayLike) -> IntArray:
-    """The z7 zone of a cell."""
+    """Return the z7 zone of a cell."""
     return parent(cell, ZONE_ZOOM)
 
 
@@ -100,22 +100,23 @@ def _longitude(column: NDArray[Any], zoom: int) -> FloatArray:
 
 
 def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray]:
-    """Latitude and longitude [deg] of the middle of a cell."""
+    """Return latitude and longitude [deg] of the centre of a cell."""
     x, y = deinterleave(cell)
     return _latitude(y + 0.5, zoom), _longitude(x + 0.5, zoom)
 
 
 def bounds(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """West, south, east, north [deg] of a cell."""
+    """Return west, south, east, north [deg] of a cell."""
     x, y = deinterleave(cell)
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
 
 
 def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
-    """Longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,), from the south-west on.
+    """Return longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,), from the south-west
+    on.
 
-    With heading sectors (n,): (n, 3) of the quarter of the cell on the side that is headed for, from the middle on, so
-    that the sectors of a cell lie side by side.
+    With heading sectors (n,): (n, 3) of the quarter of the cell on the side of the heading, from the centre on, so that
+    the sectors of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
     x, y = np.stack([west, east, east, west], axis=-1), np.stack([south, south, north, north], axis=-1)
@@ -131,13 +132,14 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:
-    """Whether areas and a box, each given as west, south, east, north [deg], share more than a border."""
+    """Return True where areas and a box, each given as west, south, east, north [deg], share more than a border."""
     west, south, east, north = (np.asarray(side) for side in area)
     return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
 
 
 def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """The eight cells around a cell, (…, 8), row by row from the north-west; columns wrap, beyond the poles is -1."""
+    """Return the eight cells around a cell, (…, 8), row by row from the north-west; columns wrap, -1 beyond the
+    poles."""
     n = 1 << zoom
     x, y = deinterleave(cell)
     dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
@@ -147,23 +149,23 @@ def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
 
 
 def quadkey(cell: int, zoom: int) -> str:
-    """The digits of one quadint: a string of `zoom` digits 0–3."""
+    """Return the digits of one quadint: a string of `zoom` digits 0–3."""
     return "".join(str((cell >> (2 * place)) & 3) for place in range(zoom - 1, -1, -1))
 
 
 def from_quadkey(digits: str) -> int:
-    """The quadint of a quadkey; its zoom is the number of digits."""
+    """Return the quadint of a quadkey; its zoom is the number of digits."""
     return int(digits, 4)
 
 
 def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
-    """The heading sector of a yaw [rad, counter-clockwise from east]."""
+    """Return the heading sector of a yaw [rad, counter-clockwise from east]."""
     quarter = np.floor((np.asarray(yaw, dtype=np.float64) + np.pi / 4) / (np.pi / 2))
     return np.mod(quarter, SECTORS).astype(np.int8)
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """The sector of a yaw, and the second one where the yaw lies within 15° of an edge (else -1)."""
+    """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else -1)."""
     angle = np.asarray(yaw, dtype=np.float64)
     first, left, right = sector_of(angle), sector_of(angle + SECTOR_MARGIN), sector_of(angle - SECTOR_MARGIN)
     second = np.where(left != first, left, np.where(right != first, right, -1))

@@ -1,4 +1,4 @@
-"""The one table of topics: key expression → message and quality of service; keys are built and parsed here only.
+"""Table of topics: key expression → message and quality of service; keys are built and parsed only here.
 
 A region is cut into chunks of 4, 3 and 3 quadkey digits, a tile into 4, 3, 3 and 4, so that a wildcard is a region of
 any size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
@@ -14,7 +14,7 @@ from schemas.config import NAME_PATTERN, REGION_PATTERN
 from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
-SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `Served`
+SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `ServiceToken`
 CLAIMS: Final = f"{ROOT}/claims"  # likewise of who has it for itself, from before it answers until it does no more
 WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
 _ALL: Final = "all"
@@ -22,12 +22,12 @@ _CHUNKS: Final = (4, 3, 3, 4)
 
 
 class Topic(NamedTuple):
-    """One kind of key.
+    """Kind of key.
 
     Attributes:
-        zoom: of the quadint in the key, None where there is none.
-        named: whether the last chunk is a name (a vehicle, or a service).
-        message: what is put there; None for a liveliness token.
+        zoom: of the quadint in the key, None without one.
+        named: True if the last chunk is a name (of a vehicle or a service).
+        message: payload; None for a liveliness token.
         priority: Zenoh priority by name.
         block: congestion control: block (True) or drop (False).
     """
@@ -58,7 +58,7 @@ TOPICS: Final = {
 
 
 def chunks(quadint: int, zoom: int) -> str:
-    """Quadkey digits of a region (z10) or tile (z14), cut by slashes."""
+    """Return the quadkey digits of a region (z10) or tile (z14), separated by slashes."""
     digits, parts = grid.quadkey(quadint, zoom), []
     for size in _CHUNKS:
         if digits:
@@ -68,67 +68,67 @@ def chunks(quadint: int, zoom: int) -> str:
 
 
 def observation_key(region: int, vehicle: str) -> str:
-    """Where a vehicle puts the observations of a region."""
+    """Return the key of a vehicle's observations of a region."""
     return f"{ROOT}/obs/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 
 def state_key(region: int, vehicle: str) -> str:
-    """Where a vehicle puts its states in a region."""
+    """Return the key of a vehicle's states in a region."""
     return f"{ROOT}/state/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 
 def ack_key(vehicle: str) -> str:
-    """Where a vehicle hears what is settled."""
+    """Return the key of a vehicle's acknowledgements."""
     return f"{ROOT}/ack/{vehicle}"
 
 
 def map_key(tile: int) -> str:
-    """Where a tile of the map is put and asked for."""
+    """Return the key of a tile of the map."""
     return f"{ROOT}/map/{chunks(tile, grid.TILE_ZOOM)}"
 
 
 def alert_key(tile: int) -> str:
-    """Where the alerts of a tile are put."""
+    """Return the key of a tile's alerts."""
     return f"{ROOT}/alert/{chunks(tile, grid.TILE_ZOOM)}"
 
 
 def ahead_key(vehicle: str) -> str:
-    """Where a vehicle tells what lies ahead of it."""
+    """Return the key of a vehicle's view ahead."""
     return f"{ROOT}/ahead/{vehicle}"
 
 
 def vss_key(vehicle: str) -> str:
-    """Where a vehicle tells the friction where it is, in words of the Vehicle Signal Specification."""
+    """Return the key of a vehicle's friction as signals of the Vehicle Signal Specification."""
     return f"{ROOT}/vss/{vehicle}"
 
 
 def private_keys(vehicle: str) -> list[str]:
-    """What a vehicle tells itself and its owner, and nobody else."""
+    """Return the keys that only a vehicle and its owner may read."""
     return [ahead_key(vehicle), vss_key(vehicle)]
 
 
 def weather_key(region: int) -> str:
-    """Where the weather of a region is put."""
+    """Return the key of a region's weather."""
     return f"{ROOT}/weather/{chunks(region, grid.REGION_ZOOM)}"
 
 
 def alive_key(vehicle: str) -> str:
-    """Liveliness token of a vehicle."""
+    """Return the key of a vehicle's liveliness token."""
     return f"{ROOT}/alive/{vehicle}"
 
 
 def shard_key(service: str) -> str:
-    """Liveliness token of a service."""
+    """Return the key of a service's liveliness token."""
     return f"{ROOT}/shard/{service}"
 
 
-class Served(NamedTuple):
-    """A service's word that it serves a region: a liveliness token, there as long as the service is.
+class ServiceToken(NamedTuple):
+    """Announcement that a service serves a region: a liveliness token that exists as long as the service.
 
     Attributes:
         region: key expression, chunks of 4, 3 and 3 digits or `*`.
         service: its name.
-        start: tells one start of it from another.
+        start: distinguishes the starts of a service.
     """
 
     region: str
@@ -137,29 +137,30 @@ class Served(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may have."""
-        return self.below(SERVES)
+        """Return the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may
+        contain."""
+        return self.key_under(SERVES)
 
-    def below(self, root: str) -> str:
-        """The token below another root: CLAIMS, or WAITS, where a standby says for which region it waits."""
+    def key_under(self, root: str) -> str:
+        """Return the token below another root: CLAIMS, or WAITS for a standby."""
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
 
-def parse_served(key: str, root: str = SERVES) -> Served:
-    """Read such a token.
+def parse_served(key: str, root: str = SERVES) -> ServiceToken:
+    """Parse such a token.
 
     Raises:
-        InputError: it is none.
+        InputError: the key is not such a token.
     """
     *found, service, start = ["", "", *key.removeprefix(f"{root}/").split("/")]
     region = "/".join(found[2:]).replace(_ALL, "*")
     if not key.startswith(f"{root}/") or not re.fullmatch(REGION_PATTERN, region):
-        raise InputError("key", f"{key[:80]!r} names no service's region", "see `Served`")
-    return Served(region, service, start)
+        raise InputError("key", f"{key[:80]!r} names no service's region", "see `ServiceToken`")
+    return ServiceToken(region, service, start)
 
 
 class Parsed(NamedTuple):
-    """A concrete key taken apart: topic, quadint and name, None where the topic has none."""
+    """Parts of a concrete key: topic, quadint and name, None where the topic has none."""
 
     topic: Topic
     quadint: int | None
@@ -167,10 +168,10 @@ class Parsed(NamedTuple):
 
 
 def parse(key: str) -> Parsed:
-    """Take a concrete key apart.
+    """Parse a concrete key.
 
     Raises:
-        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or a name that is none.
+        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or an invalid name.
     """
     head, _, rest = key.removeprefix(ROOT + "/").partition("/")
     topic = TOPICS.get(head)

@@ -1,4 +1,4 @@
-"""What may be asked of the map: the parameters of `get gripmap/v1/map/**?…`."""
+"""Parameters of a map query: `get gripmap/v1/map/**?…`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FIXES: Final = {
 
 
 class Format(StrEnum):
-    """Form of an answer."""
+    """Format of an answer."""
 
     ARROW = "arrow"
     GEOJSON = "geojson"
@@ -42,7 +42,7 @@ Degrees = Annotated[float, Field(ge=-180.0, le=180.0, allow_inf_nan=False)]
 
 
 class MapQuery(BaseModel):
-    """A parsed query; None is 'not asked'."""
+    """Parsed query; None is 'not given'."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -86,10 +86,10 @@ class MapQuery(BaseModel):
 
 
 def parse(parameters: Mapping[str, str]) -> MapQuery:
-    """Read the parameters of a selector.
+    """Parse the parameters of a selector.
 
     Raises:
-        InputError: an unknown parameter, or one that cannot be read; names it and the fix.
+        InputError: a parameter is unknown or not valid; names it and the fix.
     """
     if sum(len(name) + len(value) for name, value in parameters.items()) > MAX_TEXT:
         raise InputError("query", f"is longer than {MAX_TEXT} characters", "ask for less at once")

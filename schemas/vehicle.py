@@ -1,4 +1,4 @@
-"""The vehicle file: nominal parameters, known to a few per cent, and the estimator knows that."""
+"""Vehicle file: nominal parameters, known to a few per cent, as the estimator assumes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Learned = tuple[Annotated[float, Field(allow_inf_nan=False)], Spread]
 
 
 class Calibration(BaseModel):
-    """What a car's own drives say its devices are off by: value and standard deviation; None where not learned."""
+    """Device errors learned from a car's own drives: value and standard deviation; None if not learned."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -41,7 +41,7 @@ class Opened:
 
     @property
     def drawn(self) -> int:
-        """How many shapes the page says that it painted."""
+        """Return the number of shapes that the page reports as painted."""
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
     def colours(self, panel: int = 0) -> dict[str, int]:

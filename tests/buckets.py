@@ -97,7 +97,7 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
 
 
 def held(root: Path) -> dict[str, bytes]:
-    """What of an archive is to be in its copy."""
+    """Return the files of an archive that must be in its copy."""
     from fleet_service.archive.copies import FOLDERS
 
     paths = [path for name in FOLDERS for path in (root / name).rglob("*") if path.is_file()]

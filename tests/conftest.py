@@ -1,4 +1,4 @@
-"""What holds for all tests: property tests draw the same examples every time."""
+"""Settings of all tests: property tests draw the same examples every time."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The real minute of a dry motorway, as README's first drive takes it: imported, checked, and on the map under three
-names."""
+"""The tutorial's first drive: a real minute of a dry motorway, imported, checked and published under three names."""
 
 from __future__ import annotations
 
@@ -22,9 +21,9 @@ Cells: TypeAlias = list[dict[str, object]]
 
 
 def commands() -> list[str]:
-    """What README says to type."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    block = re.search(r"Your first drive:.*?```\n(.*?)```", text, re.DOTALL)
+    """Return the commands of the tutorial's first drive."""
+    text = (ROOT / "deploy" / "docs" / "tutorials" / "first-drive.md").read_text(encoding="utf-8")
+    block = re.search(r"## A real minute\n.*?```\n(.*?)```", text, re.DOTALL)
     assert block
     return block[1].strip().splitlines()
 

@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from schemas.runtime.talk import COMPILING
+from schemas.runtime.progress_messages import COMPILING
 from tests.house import ROOT
 from tests.packaging import candidates
 from tests.waiting import until
@@ -39,7 +39,7 @@ def steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """What the steps leave, below `root`."""
+    """Result of the steps, below `root`."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.user = root, "root"

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from tests.buckets import BucketServer
 from tests.faults.processes import Part
 
@@ -34,11 +34,11 @@ class Link:
 
     @property
     def is_cut(self) -> bool:
-        """Whether it is cut."""
+        """True if it is cut."""
         return not self._open.is_set()
 
     def mend(self) -> None:
-        """What waited goes on."""
+        """Resume the waiting traffic."""
         self._open.set()
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ class Host:
         self.part = Part("service", [sys.executable, *words], folder)
 
     def said(self, start: str) -> bool:
-        """Whether a line of the present start begins so."""
+        """Return True if a line of the present start begins with this text."""
         return any(line.startswith(start) for line in self.part.lines())
 
     def close(self) -> None:
@@ -122,9 +122,9 @@ def restored(folder: Path, bucket: BucketServer) -> Path:
     """The archive that an empty disk gets from the bucket; nothing is changed there."""
     root = folder / "archive"
     root.mkdir(parents=True)
-    copy = Copy(root, bucket.url, bucket.store)
+    copy = BucketReplica(root, bucket.url, bucket.store)
     try:
-        copy.get_ahead()
+        copy.prefetch()
     finally:
         copy.close()
     return root

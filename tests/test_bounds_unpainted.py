@@ -1,4 +1,4 @@
-"""What nobody measured has no number to colour by, in any form in which it leaves the house.
+"""Unmeasured cells have no number to colour by, in any form of output.
 
 The first promise: unknown never reads as dry. A cell of which only lower bounds are known, or a row that rolled, has a
 median that is mostly the prior, and the prior's median looks like wet asphalt.
@@ -148,8 +148,8 @@ def test_a_picture_hatches_what_was_not_measured() -> None:
     assert faces.tolist() == [[1.0, 1.0, 1.0, 1.0]]
 
 
-@pytest.mark.parametrize("page", ["README.md", "archive"])
-def test_the_sql_of_the_readmes_takes_values_only(archive: Path, page: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", ["deploy/docs/tutorials/first-analysis.md", "archive"])
+def test_the_sql_of_the_pages_takes_values_only(archive: Path, page: str, monkeypatch: pytest.MonkeyPatch) -> None:
     text = readme.text() if page == "archive" else (ROOT / page).read_text()
     (sql,) = re.findall(r"duckdb\.sql\((?:\"{3}|'{3})(.*?)(?:\"{3}|'{3})", text, re.DOTALL)
     monkeypatch.chdir(archive)

@@ -47,7 +47,7 @@ def test_the_example_of_each_help_is_a_command_that_is_understood(name: str, com
     words = shlex.split(example.partition(" > ")[0])
     assert words[:2] == [name, command]
     parser = commandline.parser_of(*LINES[name].LINE, command)
-    assert parser.parse_args(commandline.joined(words[1:])).command == command
+    assert parser.parse_args(commandline.join_negative_numbers(words[1:])).command == command
 
 
 @pytest.mark.parametrize("name", LINES)
@@ -73,7 +73,7 @@ def test_completion_is_a_script_of_the_shell(name: str, shell: str, capsys: Capt
     ],
 )
 def test_a_minus_sign_is_a_number_behind_an_option(given: list[str], understood: list[str]) -> None:
-    assert commandline.joined(given) == understood
+    assert commandline.join_negative_numbers(given) == understood
 
 
 def test_the_western_hemisphere_is_asked_like_the_eastern(archive: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -86,7 +86,7 @@ def test_ctrl_c_is_130_and_one_word(capsys: Capture) -> None:
     def interrupted() -> int:
         raise KeyboardInterrupt
 
-    assert commandline.guarded(interrupted) == 130
+    assert commandline.run_guarded(interrupted) == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
@@ -125,7 +125,7 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(words: list[str], arc
 
 
 def on_terminal(command: list[str], answer: str) -> str:
-    """What a command says to a person on a terminal who answers its question so."""
+    """Return the output of a command for a person who types this answer."""
     here, there = pty.openpty()
     with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
         os.close(there)
@@ -220,14 +220,12 @@ def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path
     with pytest.raises(InputError, match="out: .* is a folder"):
         commandline.out_folder("out", tmp_path)
     with pytest.raises(InputError, match="out: a.xls has no known ending; use one of .csv"):
-        commandline.ending("out", Path("a.xls"), (".csv",))
-    assert commandline.ending("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet")) == ".geo.parquet"
+        commandline.ending_of("out", Path("a.xls"), (".csv",))
+    assert commandline.ending_of("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet")) == ".geo.parquet"
 
 
 @pytest.mark.parametrize("out", ["/proc/none/e.parquet", "file/e.parquet"])
-def test_estimates_for_a_place_that_cannot_be_written_are_refused_in_one_line(
-    out: str, tmp_path: Path, capsys: Capture
-) -> None:
+def test_unwritable_estimates_are_refused_in_one_line(out: str, tmp_path: Path, capsys: Capture) -> None:
     log = tmp_path / "x.parquet"
     drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(tmp_path / "x.json")]
     assert edge_agent.cli.main(drive) == 0

@@ -179,7 +179,8 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     archive = DATA / "v1.0" / "archive"
     done = command("fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json")
     assert json.loads(done.stdout)["rows"] > 0, done.stderr
-    words = "from schemas.runtime import plugins; b = list(plugins.loaded(plugins.SOURCES, 'mine')('1')); print(len(b))"
+    words = "from schemas.runtime.plugins import SOURCES, load_entry_point; "
+    words += "print(len(list(load_entry_point(SOURCES, 'mine')('1'))))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
     assert int(done.stdout) >= 10
@@ -191,7 +192,7 @@ def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPat
     from schemas.runtime import plugins
 
     broken = {"odd": EntryPoint("odd", "no_such_module:bank", plugins.ESTIMATORS)}
-    monkeypatch.setattr(plugins, "found", lambda group: broken)
+    monkeypatch.setattr(plugins, "entry_points_of", lambda group: broken)
     with pytest.raises(InputError, match="estimator: 'odd' cannot be loaded from no_such_module:bank"):
         edge_agent.make_bank("odd", [])
 

@@ -37,7 +37,7 @@ def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> No
     assert len(owed) == len(set(owed))
 
 
-def test_every_campaign_owes_a_figure_of_what_it_did_so_that_none_holds_when_nothing_happened() -> None:
+def test_every_campaign_owes_a_figure_of_what_it_did() -> None:
     assert [one.name for one in CAMPAIGNS if not any(BARS[name].better == "more" for name in one.owes)] == []
 
 
@@ -68,7 +68,7 @@ leave(lambda: len(conduct([Campaign("raises", run, ())], Path("out"), "test", Tr
 """
 
 
-def test_a_campaign_that_raises_ends_the_run_with_its_message_whatever_it_left_running(tmp_path: Path) -> None:
+def test_a_raising_campaign_ends_the_run_with_its_message(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     command = [sys.executable, "-c", RAISES]
     done = subprocess.run(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, timeout=120)
@@ -128,12 +128,12 @@ def served(number: int, folder: Path) -> list[str]:
 
 
 @pytest.mark.campaign
-def test_no_history_of_a_service_on_a_disk_that_forgets_loses_doubles_or_brings_back_anything(tmp_path: Path) -> None:
+def test_no_history_on_a_forgetful_disk_loses_or_doubles_anything(tmp_path: Path) -> None:
     found_bugs = (45, 84)  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
     assert [problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)] == []
 
 
-def test_the_disk_that_forgets_catches_a_service_that_does_not_sync_its_keys(
+def test_forgetful_disk_catches_a_service_that_does_not_sync_its_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pseudonyms, "sync_directory", lambda folder: None)

@@ -1,4 +1,4 @@
-"""README's first drive: few commands, and what they put onto the map raises no alert and reads as slippery nowhere."""
+"""The tutorial's first drive has few commands, raises no alert, and is slippery nowhere on the map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:
     assert not minute[1]
 
 
-def test_the_first_drive_of_the_readme_takes_few_commands_and_they_are_those_that_are_tested() -> None:
+def test_first_drive_of_the_tutorial_has_few_commands_all_tested() -> None:
     assert 0 < len(commands()) <= MOST_COMMANDS
     assert [command.split()[1] for command in commands()] == ["install", "import", "check", "replay"]
     assert "--publish --start now" in commands()[-1]

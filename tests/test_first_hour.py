@@ -1,4 +1,4 @@
-"""What new users once met in their first hour and no other test holds; the other bugs have theirs beside the code."""
+"""Bugs that new users met in their first hour and that no other test covers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.usability.wrong_logs import unnoticed
 from tests.waiting import until
 
 
-def test_a_mistake_in_a_recording_is_mentioned_by_replay_and_a_sound_one_passes_in_silence(tmp_path: Path) -> None:
+def test_replay_mentions_faulty_signals_and_is_silent_for_sound_ones(tmp_path: Path) -> None:
     assert unnoticed(tmp_path, ["a_y flipped", "yaw rate in deg/s", "mass in tonnes"], 9000) == []
 
 

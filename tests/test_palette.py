@@ -41,7 +41,7 @@ def test_none_of_them_is_the_white_of_what_was_not_measured(sight: str) -> None:
     assert min(difference(lab(shade(mu, *GRIP_RANGE), sight), white) for mu in SURFACES.values()) >= LEAST
 
 
-def test_the_scale_grows_lighter_all_the_way_so_that_grey_print_keeps_its_order() -> None:
+def test_colour_scale_lightness_increases_monotonically() -> None:
     light = [float(lab(stop)[0]) for stop in GRIP]
     assert all(b > a + 2.0 for a, b in pairwise(light))
     surfaces = [float(lab(shade(mu, *GRIP_RANGE))[0]) for mu in SURFACES.values()]

@@ -172,7 +172,7 @@ def test_rooms_stand_at_the_top_of_a_package_and_no_loose_modules(package: str) 
     assert len(house.loose_modules(ROOT, package)) <= 3
 
 
-def test_the_contract_is_imported_without_compiler_session_or_science_library() -> None:
+def test_contract_imports_no_compiler_session_or_science_library() -> None:
     _, modules, heavy = house.light_import(ROOT)
     assert modules > 50, "nothing was imported"
     assert not heavy
@@ -228,13 +228,13 @@ def test_imports_between_packages_point_one_way(package: str) -> None:
     assert not found, "\n".join(found)
 
 
-def test_no_package_imports_relatively_so_that_every_import_names_its_package() -> None:
+def test_no_package_imports_relatively() -> None:
     found = [where(path, line) for path in sources(*PACKAGES) for line, name in imported(parse(path)) if name[0] == "."]
     assert not found, "\n".join(found)
 
 
 @pytest.mark.parametrize("folder", [*PURE, *SANS_IO])
-def test_pure_core_reaches_neither_files_network_clock_nor_global_randomness(folder: str) -> None:
+def test_pure_core_uses_no_files_network_clock_or_global_randomness(folder: str) -> None:
     assert sources(folder), f"{folder} is gone; name its successor in PURE"
     tables = ("pyarrow",) if folder in SANS_IO else ()
     found = [
@@ -247,7 +247,7 @@ def test_pure_core_reaches_neither_files_network_clock_nor_global_randomness(fol
 
 
 @pytest.mark.parametrize("folder", PURE)
-def test_pure_core_imports_only_pure_core_and_the_plain_part_of_the_contract(folder: str) -> None:
+def test_pure_core_imports_only_pure_core_and_plain_contract(folder: str) -> None:
     allowed = {pure.removesuffix(".py").replace("/", ".") for pure in PURE} | {
         f"schemas.{name}" for name in PURE_SCHEMAS
     }

@@ -1,1 +1,1 @@
-"""The demo: a router, a fleet service and a fleet of simulated vehicles, and what came out of it beside the truth."""
+"""The demo: a router, a fleet service and a fleet of simulated vehicles, compared with the truth."""

@@ -1,6 +1,6 @@
-"""`make demo`: from wheels to map on this machine, in about three minutes.
+"""`make demo`: from wheel speeds to the map on this machine, in about three minutes.
 
-Everything that it makes lies in `.demo/`.
+All files go to `.demo/`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ REPORT_S = 5.0
 
 
 def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, float]]:
-    """Let the fleet drive; returns what was heard, and the fleet's counts."""
+    """Let the fleet drive; return the received data and the fleet's counts."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")
@@ -47,7 +47,7 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
 
 
 def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
-    """One query by a client that uses nothing of ours, and how to read the Parquet."""
+    """Show one query by a client without GripMap code, and how to read the Parquet files."""
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
     bbox = ",".join(f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max()))
     print("\nA client that knows only Zenoh asks for the map:", flush=True)
@@ -63,7 +63,7 @@ The observations, as any Parquet reader sees them:
 def report(
     folder: Path, comparison: compare.MapComparison, measured: list[figures.Figure], grip: compare.LostGrip, seed: int
 ) -> list[figures.Figure]:
-    """Write and print all figures, and draw the map beside the truth, with who lost grip; returns the figures."""
+    """Write and print all figures, draw the map next to the truth and the passes that lost grip; return the figures."""
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
     picture.draw(comparison, folder / "map.png", grip)
@@ -75,9 +75,9 @@ def report(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the demo; exit code 1 where a bar does not hold that a promise or this machine's part in it has.
+    """Run the demo; exit code 1 if a bar of a promise, or of this machine's part in it, does not hold.
 
-    How soon the first alert comes is a goal: one that is missed is said, in figures and README, and no failed demo.
+    The delay of the first alert is a goal: a miss is reported in figures and README, but does not fail the demo.
     """
     parser = argparse.ArgumentParser(prog="make demo", description="From wheels to map on this machine.")
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\n  See it: {address}\n", flush=True)
         listener, counts = drive(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
-        changed_ns = compare.started(visits) + int(appears_s * NS)
+        changed_ns = compare.start_time(visits) + int(appears_s * NS)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
         show(FOLDER, endpoint, comparison)

@@ -1,7 +1,7 @@
-"""The map beside the truth: the demo's figures.
+"""Figures of the demo: the map compared with the truth.
 
-The truth is what the simulator says of each visit of a vehicle to a cell: mean friction under its wheels, and the
-largest share of the grip that it used. A visit with a share of at least 0.6 is *excited*: it can tell friction.
+The truth is the simulator's record of each visit of a vehicle to a cell: mean friction under its wheels, and the
+largest share of the grip that it used. A visit with a share of at least 0.6 is *excited*: it shows the friction.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from edge_agent.lab.simulation.listeners import warned_ones
 from fleet_service.archive import reading
-from fleet_service.client.stretches import Stretches, linked
+from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
@@ -34,7 +34,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def works(found: Sequence[Figure]) -> bool:
-    """Whether the demo did its work: an alert that comes late and a map wider than it need be are said, no more."""
+    """Return True if the demo did its work; a late alert or a wide map does not count as a failure."""
 
     def breaks(figure: Figure) -> bool:
         wide = figure.name == COVERAGE and figure.value > WIDEST
@@ -45,36 +45,37 @@ def works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Cells of the map that have a truth, row by row; `truth` is the friction when the demo ended."""
+    """Cells of the map that have a truth, one per row; `truth` is the friction at the end of the demo."""
 
     cells: pa.Table
     truth: FloatArray
 
     @property
-    def covered(self) -> BoolArray:
-        """Whether the truth lies in the interval."""
+    def is_covered(self) -> BoolArray:
+        """True where the truth lies in the interval."""
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
-    def several(self) -> BoolArray:
-        """Whether two or more vehicles were there."""
+    def has_several_vehicles(self) -> BoolArray:
+        """True where two or more vehicles were."""
         return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
 
     @property
-    def measured(self) -> BoolArray:
-        """Whether the value rests on more than lower bounds."""
+    def is_measured(self) -> BoolArray:
+        """True where the value rests on more than lower bounds."""
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
     @property
     def values(self) -> FloatArray:
-        """The map's median, (n,); NaN where nothing was measured."""
+        """Median of the map, (n,); NaN where nothing was measured."""
         mu = self.cells["mu"].to_numpy()
-        return np.where(self.measured, mu, np.nan)
+        return np.where(self.is_measured, mu, np.nan)
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
-    """Friction of each visited (cell, sector) at the end: mean over visits since the road changed, else over all."""
+    """Return the friction of each visited (cell, sector) at the end: mean over visits since the change, else over
+    all."""
     keys = _keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
     mu = visits["mu"].to_numpy()
@@ -85,7 +86,7 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
 
 
 def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
-    """The final truth as a file that the live page lays over its map."""
+    """Write the final truth as a file for the overlay of the live page."""
     truth = final_truth(visits, changed_ns)
     cell, sector = zip(*truth, strict=True)
     table = pa.table(
@@ -105,13 +106,13 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 
 
 def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int) -> float:
-    """Excited passes over the new patch until its first alert was heard; infinite without one.
+    """Return the excited passes over the new patch until its first alert; infinite without one.
 
     Args:
         visits: the truth.
-        patch: (visits,) whether the visit was to a cell of the patch, after it had appeared.
-        alerts: (ns when it was heard, alert).
-        changed_ns: when the patch appeared.
+        patch: (visits,) True for visits to a cell of the patch after it had appeared.
+        alerts: (time of receipt [ns], alert).
+        changed_ns: time at which the patch appeared.
     """
     cells = set(visits["cell"].filter(pa.array(patch)).to_pylist())
     heard = [at for at, alert in alerts if alert.raised and alert.cell in cells and at >= changed_ns]
@@ -124,7 +125,7 @@ def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Ale
 
 
 def passes(rows: pa.Table) -> int:
-    """Number of passes: visits of one vehicle to neighbouring cells in a row are one pass."""
+    """Return the number of passes: successive visits of one vehicle to neighbouring cells are one pass."""
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
     enter, left = (order[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
@@ -137,15 +138,15 @@ def figures(
     comparison: MapComparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
     counts: dict[str, float], archive: Path, wall_s: float,
 ) -> list[Figure]:  # fmt: skip
-    """The demo's figures with their bars."""
-    several, value = comparison.several, comparison.several & comparison.measured
+    """Return the demo's figures with their bars."""
+    several, value = comparison.has_several_vehicles, comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
     patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
-    rows, distinct, vehicles = archived(archive)
+    rows, distinct, vehicles = archive_counts(archive)
     false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
-        Figure(COVERAGE, _mean(comparison.covered[several]), "", (0.80, WIDEST), "within"),
+        Figure(COVERAGE, _mean(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
         Figure(DELAY, delay_passes(visits, patch, alerts, changed_ns), "passes", 4),
         Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
@@ -161,7 +162,8 @@ def figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Passes over the new ice since its first alert, one row each: was the driver warned, did a wheel lose its grip.
+    """Passes over the new ice since its first alert, one per row: whether the driver was warned and a wheel lost its
+    grip.
 
     `cell` is where it was lost, or the first of the pass.
     """
@@ -171,7 +173,7 @@ class LostGrip:
     cell: IntArray
 
     def figures(self) -> list[Figure]:
-        """Shares of passes that lost grip, and how many there were."""
+        """Return the shares of passes that lost grip, and their number."""
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         shares = [
             Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes") for name, rows in kinds if rows.any()
@@ -179,14 +181,14 @@ class LostGrip:
         return shares + [Figure(f"demo.passes.{name}", int(rows.sum()), "over new ice") for name, rows in kinds]
 
     def line(self) -> str:
-        """In words."""
+        """Return the result as one line."""
         counts = [f"{int(self.lost[rows].sum())} of {int(rows.sum())}" for rows in (self.warned, ~self.warned)]
         known = "Over the new ice, once it was known"
         return f"{known}: {counts[0]} warned drivers lost grip, {counts[1]} who were not warned."
 
 
 def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float) -> LostGrip:
-    """Who lost grip on the new ice since its first alert; `share` of the drivers is warned."""
+    """Return the passes over the new ice since its first alert; `share` of the drivers is warned."""
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     cells = set(visits["cell"].filter(pa.array(on)).to_pylist())
     known = min((at for at, a in alerts if a.raised and a.cell in cells and at >= changed_ns), default=None)
@@ -216,8 +218,10 @@ def _number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """(visits,) whether the visit came after the road had changed, and found it clearly less than all before it in the
-    cell: old snow that is reached late, or its border, is no new ice."""
+    """Return True for visits (visits,) after the change that found clearly less grip than all before in the cell.
+
+    Old snow that is reached late, or its border, does not count as new ice.
+    """
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
     cell, mu = visits["cell"].to_numpy(), visits["mu"].to_numpy()
     cells, index = np.unique(cell, return_inverse=True)
@@ -228,19 +232,19 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
-    """Alerts that an operator got, per icy stretch and direction of travel; NaN without ice."""
+    """Return alerts of stretches per icy stretch and driving direction; NaN without ice."""
     road, ids = Stretches(), set[str]()
     for _, alert in alerts:
         road.take(alert)
         ids |= {one.id for one in road.changes()}
     icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
     cell, sector = icy["cell"].to_numpy(), icy["sector"].to_numpy()
-    stretches = sum(int(linked(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
+    stretches = sum(int(link_cells(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
     return len(ids) / stretches if stretches else float("nan")
 
 
-def archived(archive: Path) -> tuple[int, int, int]:
-    """Rows, distinct rows and distinct vehicles of the archived observations."""
+def archive_counts(archive: Path) -> tuple[int, int, int]:
+    """Return rows, distinct rows and distinct vehicles of the archived observations."""
     identity = ["vehicle", "boot", "region", "seq", "row"]
     tables = list(reading.read(archive, Kind.OBSERVATION, identity))
     if not tables:
@@ -249,8 +253,8 @@ def archived(archive: Path) -> tuple[int, int, int]:
     return whole.num_rows, whole.group_by(identity).aggregate([]).num_rows, len(pc.unique(whole["vehicle"]))
 
 
-def started(visits: pa.Table) -> int:
-    """When the first vehicle moved [ns]."""
+def start_time(visits: pa.Table) -> int:
+    """Return when the first vehicle moved [ns]."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 

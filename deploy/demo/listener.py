@@ -1,4 +1,4 @@
-"""What a user hears while the fleet drives: tiles and alerts, as they are put."""
+"""Subscriber of the demo: receives tiles and alerts while the fleet drives."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from schemas.wire import Alert
 
 
 def read_tile(payload: bytes) -> pa.Table:
-    """The cells of one tile."""
+    """Return the cells of one tile."""
     return pa.ipc.open_stream(payload).read_all()
 
 
 @dataclass
 class Listener:
-    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with the time it was heard."""
+    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with its time of receipt."""
 
     session: zenoh.Session
     tiles: dict[str, pa.Table] = field(default_factory=dict)
@@ -43,11 +43,11 @@ class Listener:
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
-        """End the session; a session that is left open keeps the interpreter from ending."""
+        """End the session; an open session keeps the interpreter from ending."""
         self.session.close()
 
     def progress(self) -> str:
-        """One line: cells, how many are measured and slippery, alerts that stand."""
+        """Return one line: cells, how many are measured and slippery, standing alerts."""
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None
             alerts = list(self.alerts)
@@ -62,6 +62,6 @@ class Listener:
         )
 
     def whole_map(self) -> pa.Table:
-        """Ask for the whole map, one reply per tile."""
+        """Query the whole map, one reply per tile."""
         replies = self.session.get("gripmap/v1/map/**", consolidation=zenoh.ConsolidationMode.NONE, timeout=10.0)
         return pa.concat_tables([read_tile(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None])

@@ -1,4 +1,4 @@
-"""The map beside the truth as one HTML file that opens offline: point at a cell and read its interval."""
+"""The map next to the truth as one HTML file that opens offline and shows the interval of a cell."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAMES = (
 
 
 def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
-    """Two maps and the table of figures; nothing is loaded from elsewhere."""
+    """Write two maps and the table of figures; nothing is loaded from elsewhere."""
     cells = comparison.cells
     boxes = np.stack([cells[side].to_numpy() for side in ("west", "south", "east", "north")], axis=1)
     sector: Any = cells["sector"].to_pylist()
@@ -37,7 +37,7 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     panels = {"truth": truth, "map": [mu if np.isfinite(mu) else None for mu in found]}
     lines = [_words(one, true) for one, true in zip(cells.to_pylist(), truth, strict=True)]
     drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
-    several = int(comparison.several.sum())
+    several = int(comparison.has_several_vehicles.sum())
     about = (
         f"{cells.num_rows} cells and directions that have a truth; {several} of them seen by two or more vehicles, "
         "and the figures below judge these."

@@ -1,4 +1,4 @@
-"""A client that uses nothing of GripMap: only Zenoh and what every Python has.
+"""Client without GripMap code: only Zenoh and the standard library.
 
 python -m deploy.demo.plain_client ENDPOINT WEST,SOUTH,EAST,NORTH
 """
@@ -10,7 +10,7 @@ import zenoh
 
 
 def main() -> int:
-    """Ask for the map of a box as GeoJSON and print its first cells."""
+    """Query the map of a box as GeoJSON and print its first cells."""
     endpoint, bbox = sys.argv[1:3]
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')

@@ -1,4 +1,4 @@
-"""The parts as a user would start them: each its own process, with its log in the demo's folder."""
+"""Parts of the system as separate processes, each with a log in the demo's folder."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ SHOWN = {"snapshot_s": 10.0, "metrics_port": 0}  # for the page: a past within m
 
 
 class DemoError(RuntimeError):
-    """A part did not start, or ended before its time; says where its log is."""
+    """A part did not start, or ended early; the message names its log."""
 
 
 class ManagedProcess:
-    """One process of the demo; what it prints goes to `folder/NAME.log`."""
+    """One process of the demo; its output goes to `folder/NAME.log`."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
         self.name, self.log = name, folder / f"{name}.log"
@@ -30,11 +30,11 @@ class ManagedProcess:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def lines(self) -> list[str]:
-        """What it has printed so far."""
+        """Return the lines printed so far."""
         return self.log.read_text().splitlines()
 
     def line_with(self, start: str, patience_s: float = START_S) -> str:
-        """The first line that begins with `start`; waits for it.
+        """Wait for the first line that begins with `start`, and return it.
 
         Raises:
             DemoError: the process ended, or did not print it in time.
@@ -50,7 +50,7 @@ class ManagedProcess:
         raise DemoError(f"{self.name} did not say {start!r}; see {self.log}")
 
     def wait(self, every_s: float, tick: Callable[[], None]) -> int:
-        """Wait for the end, calling `tick` now and then; returns the exit code."""
+        """Wait for the end, calling `tick` now and then; return the exit code."""
         while True:
             try:
                 return self.process.wait(every_s)
@@ -58,7 +58,7 @@ class ManagedProcess:
                 tick()
 
     def stop(self) -> None:
-        """Ask it to end, and make it end."""
+        """Ask it to end, then force it."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -68,10 +68,10 @@ class ManagedProcess:
                 self.process.wait()
 
     def report(self) -> dict[str, float]:
-        """The counts in its last line, which is JSON.
+        """Return the counts in its last line, which is JSON.
 
         Raises:
-            DemoError: the last line is none.
+            DemoError: the last line is not JSON.
         """
         try:
             counts: dict[str, float] = json.loads(self.lines()[-1])
@@ -106,7 +106,7 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 @contextmanager
 def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
-    """The live page; yields its address. Truth that comes to lie in `folder/overlay.parquet` can be laid over."""
+    """Run the live page; yield its address. The truth in `folder/overlay.parquet` can be drawn over the map."""
     metrics = service.line_with("ready").rpartition(", ")[2]
     options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port,
                "--metrics": metrics, "--overlay": folder / "overlay.parquet"}  # fmt: skip
@@ -119,7 +119,8 @@ def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Ite
 
 
 def fleet(folder: Path, vehicles: int, duration_s: float, seed: int, warned: float) -> ManagedProcess:
-    """The simulated vehicles: one process, a session and an identity for each; a share of the drivers is warned."""
+    """Return the process of the simulated vehicles, with one session and identity each; a share of the drivers is
+    warned."""
     scripts = Path(sys.executable).parent
     options = {
         "--vehicles": vehicles,

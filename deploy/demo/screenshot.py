@@ -1,4 +1,4 @@
-"""A picture of the live page as a browser shows it, for the README."""
+"""Screenshot of the live page for the README."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SETTLED_MS: Final = 2_000  # for what is still on its way after the first pictur
 
 
 def take(address: str, path: Path) -> None:
-    """Open the page in the system's Chromium and keep what it shows.
+    """Open the page in the system's Chromium and save a screenshot.
 
     Raises:
         InputError: Chromium or Playwright is missing.

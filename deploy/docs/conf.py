@@ -1,8 +1,21 @@
-"""The documentation site: the READMEs as they stand, and the pages of this folder. `make docs` builds it."""
+"""Configuration of the documentation site; `make docs` builds it.
+
+The source is the whole repository, because room READMEs are part of the site. Reference pages of commands, settings,
+tables and metrics are generated here, before Sphinx reads the pages.
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from tests import reference_pages  # noqa: E402
+
+reference_pages.write(Path(__file__).parent / "reference" / "generated")
 
 project = "GripMap"
 author = "GripMap maintainers"
@@ -11,14 +24,22 @@ release = importlib.metadata.version("gripmap")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "deploy/docs/index"
 include_patterns = [
-    "*.md", "schemas/README.md", "edge_agent/**.md", "fleet_service/**.md", "deploy/**.md", "tests/**/README.md"
-]  # fmt: skip
+    "CHANGELOG.md",
+    ".github/CODE_OF_CONDUCT.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "schemas/README.md",
+    "edge_agent/**.md",
+    "fleet_service/**.md",
+    "deploy/**.md",
+    "tests/**.md",
+]
 exclude_patterns = ["edge_agent/inputs/profiles/NOTICE.md"]
 source_suffix = {".md": "markdown"}
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-suppress_warnings = ["myst.xref_missing"]  # links to source files and folders lead out of the site
+suppress_warnings = ["myst.xref_missing"]  # links to source files lead out of the site; a test checks that they exist
 
 napoleon_use_ivar = True  # attributes that a docstring explains are fields already
 autodoc_typehints = "description"

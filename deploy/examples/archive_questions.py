@@ -1,4 +1,4 @@
-"""The archive in pandas, DuckDB and GeoPandas, beside the same question asked by GripMap.
+"""The archive in pandas, DuckDB and GeoPandas, and the same question asked by GripMap.
 
 python deploy/examples/archive_questions.py ARCHIVE FOLDER
 """
@@ -16,7 +16,7 @@ import fleet_service
 
 
 def main(archive: Path, folder: Path) -> None:
-    """Three ways to the median of the values per cell, and a map for a GIS."""
+    """Compute the median of the values per cell in three ways, and write a map for a GIS."""
     folder.mkdir(parents=True, exist_ok=True)
     files = f"{archive}/observations/*/*/*.parquet"
     # A row whose `value` is false says only that mu is at least mu_utilised: it is left out.

@@ -1,11 +1,11 @@
-"""An estimator of one's own: friction is at least what was used, and nothing more is said.
+"""Estimator of your own: it only reports that friction is at least what was used.
 
-As a plug-in, a package of yours says in its pyproject.toml
+As a plug-in, your package states in its pyproject.toml
 
     [project.entry-points."gripmap.estimators"]
     at-least = "my_package:AtLeast"
 
-and `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used directly:
+Then `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used directly:
 
 python deploy/examples/own_estimator.py
 """
@@ -26,7 +26,7 @@ PRIOR = (0.11, 0.63, 1.14)  # 5 %, 50 %, 95 % of what is believed before anythin
 
 
 class AtLeast:
-    """A bank: N vehicles side by side; what is kept from call to call is the largest grip used.
+    """Bank of N vehicles; its only state is the largest grip used.
 
     Args:
         vehicles: nominal vehicles, N of them.
@@ -39,7 +39,8 @@ class AtLeast:
     def advance(
         self, t: np.ndarray[Any, Any], signals: np.ndarray[Any, Any], closes: object = None, *, threads: int = 1
     ) -> edge_agent.Estimates:
-        """t (T, N) [s], signals (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading."""
+        """Estimate samples: t (T, N) [s], signals (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is
+        missing."""
         del closes, threads  # no visits, one thread
         values = np.zeros((*t.shape, ONE_FRICTION))
         pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY

@@ -1,4 +1,4 @@
-"""Ask the map and decode what comes: as a table, and by hand from one tile as any client sees it.
+"""Query of the map: as a table, and one tile decoded by hand as in any client.
 
 python deploy/examples/query_map.py tcp/127.0.0.1:7447
 """
@@ -13,7 +13,7 @@ import fleet_service
 
 
 def main(endpoint: str) -> int:
-    """Print what is known, the worst first; returns how many cells there are."""
+    """Print the known cells, the worst first; return their number."""
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
     measured = cells[cells["basis"] == "measured"]  # of the others only lower bounds are known: their mu is null
     columns = ["latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "vehicles"]

@@ -1,1 +1,1 @@
-"""What the map says in front of the car: horizon, warnings, safe speed, and the map as a prior."""
+"""The map in front of the car: horizon, warnings, safe speed, and the map as a prior."""

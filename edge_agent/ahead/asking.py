@@ -1,7 +1,8 @@
-"""What to ask the map for, and when: pieces of the way ahead, so that a day costs megabytes and not gigabytes. Pure.
+"""Choice of map requests: boxes along the way ahead, so that a day costs megabytes and not gigabytes. Pure.
 
-A tile that changes is put whole, each second: some 50 kB in a busy town. A car needs what lies along its way, now and
-then, and hears of ice at once by alerts: it asks for narrow boxes along the way, and hears alerts of the tiles there.
+A changed tile is published whole, each second: about 50 kB in a busy town. A car needs only what lies along its way,
+and not every second, while it must learn of ice at once. It therefore requests narrow boxes along its way and
+subscribes to the alerts of the tiles there.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.path import Path, Pose, degrees
+from edge_agent.ahead.path import Path, Pose, to_degrees
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS
@@ -28,7 +29,7 @@ LEAVE_S: Final = 20.0  # a tile that is not ahead any more is heard for so long:
 
 
 class Box(NamedTuple):
-    """A piece of the map [deg]."""
+    """Piece of the map [deg]."""
 
     west: float
     south: float
@@ -36,22 +37,22 @@ class Box(NamedTuple):
     north: float
 
 
-class Asked:
-    """Boxes that were asked for, and when; the last MOST_BOXES of them."""
+class RequestLog:
+    """The last MOST_BOXES requested boxes, with the time of the request."""
 
     def __init__(self) -> None:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def forget(self) -> None:
-        """Ask for everything anew: a session has come back."""
+        """Request everything again, because a session has come back."""
         self._boxes.clear()
 
     def wanting(self, path: Path, pose: Pose, within: float) -> list[Box]:
-        """Boxes that are to be asked for now, along a path; they count as asked.
+        """Return the boxes to request now, along a path; they count as requested.
 
-        Nothing is asked for before something nearer than `within` [m] is wanting; then all of the path is.
+        Nothing is requested until something nearer than `within` [m] is missing; then all of the path is.
         """
-        latitude, longitude = degrees(path.x[::STEP], path.y[::STEP], pose)
+        latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
         for box, at in self._boxes:
             if pose.time - at < REFRESH_S * NS:
@@ -65,22 +66,22 @@ class Asked:
 
 
 class Tiles:
-    """Whose alerts are heard: the tiles ahead, and for a while those that were."""
+    """Tiles whose alerts are subscribed to: those ahead, and for a while those that were."""
 
     def __init__(self) -> None:
         self._wanted: dict[int, int] = {}  # tile -> when it was wanted last [ns]
 
     @property
     def heard(self) -> list[int]:
-        """The tiles."""
+        """Return the tiles."""
         return list(self._wanted)
 
     def follow(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
-        """Tiles to begin and to cease hearing."""
+        """Return the tiles to subscribe to and to unsubscribe from."""
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
         for path in paths:
-            ahead += _in_order(grid.tile_of(grid.cell_of(*degrees(path.x[::STEP], path.y[::STEP], pose))))
+            ahead += _in_order(grid.tile_of(grid.cell_of(*to_degrees(path.x[::STEP], path.y[::STEP], pose))))
         wanted = list(dict.fromkeys(ahead))[:MOST_TILES]
         fresh = [tile for tile in wanted if tile not in self._wanted]
         self._wanted |= dict.fromkeys(wanted, pose.time)
@@ -94,7 +95,7 @@ class Tiles:
 
 
 def keys_of(box: Box) -> list[int]:
-    """Regions (z10) that a box touches, each once."""
+    """Return the regions (z10) that a box touches, each once."""
     corners = grid.cell_of(
         np.array([box.south, box.south, box.north, box.north]), np.array([box.west, box.east, box.west, box.east])
     )
@@ -106,7 +107,7 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Runs of the path, first and last metre, whose boxes are small, and which hold every wanted point."""
+    """Return runs of the path, first and last metre, that have small boxes and contain every wanted point."""
     found: list[tuple[int, int]] = []
     first = last = -1
     for k in (np.flatnonzero(wanted) * STEP).tolist():
@@ -128,5 +129,5 @@ def _around(path: Path, first: int, last: int, pose: Pose) -> Box:
     x, y = path.x[first : last + 1], path.y[first : last + 1]
     east = np.array([x.min() - BESIDE_M, x.max() + BESIDE_M])
     north = np.array([y.min() - BESIDE_M, y.max() + BESIDE_M])
-    latitude, longitude = degrees(east, north, pose)
+    latitude, longitude = to_degrees(east, north, pose)
     return Box(float(longitude[0]), float(latitude[0]), float(longitude[1]), float(latitude[1]))

@@ -1,4 +1,4 @@
-"""What the network says, looked at before it is believed: tiles and alerts as bytes → cells and alerts, or refused."""
+"""Decoding and validation of received tiles and alerts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from edge_agent.ahead.known import BASES, BOUND, HeardCells, belief_of
+from edge_agent.ahead.known import BASES, BOUND, ReceivedCells, belief_of
 from schemas import grid, keys, mugrid, wire
 from schemas.errors import InputError, WireError
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -22,11 +22,11 @@ SLACK: Final = 1e-3  # single precision, and quantiles to the ends of their bins
 _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
-def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
-    """Tile and cells of a message about the map.
+def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells]:
+    """Return tile and cells of a message about the map.
 
     Raises:
-        WireError: it is not what a service sends; nothing of it is believed.
+        WireError: it is not a valid message of a service; it is ignored completely.
     """
     tile = _tile(key, "map")
     if len(payload) > MOST_TILE_BYTES:
@@ -57,25 +57,25 @@ def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
     if len(np.unique(place)) < len(place):
         raise WireError("cell", "is there twice", "send each place once")
     heard = np.minimum(last + (age * NS).astype(np.int64), now)  # when the tile was made: somebody may have kept it
-    return tile, HeardCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
+    return tile, ReceivedCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
 
 
-def heard_alert(key: str, payload: bytes, now: int) -> Alert:
-    """An alert that was put.
+def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
+    """Return a published alert.
 
     Raises:
-        WireError: it is not what a service sends.
+        WireError: it is not a valid message of a service.
     """
     if len(payload) > wire.MAX_BYTES:
         raise WireError("alert", f"{len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
     return _checked(wire.decode_alert(payload), _tile(key, "alert"), now)
 
 
-def heard_standing(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
-    """Tile, and the alerts that stand in it.
+def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
+    """Return a tile and its standing alerts.
 
     Raises:
-        WireError: it is not what a service sends.
+        WireError: it is not a valid message of a service.
     """
     tile = _tile(key, "alert")
     return tile, [_checked(alert, tile, now) for alert in wire.decode_standing(payload)]

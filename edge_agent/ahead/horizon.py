@@ -1,6 +1,6 @@
-"""The horizon: what is known of each metre ahead, and how fast one may go there. Pure.
+"""Horizon: knowledge of each metre ahead, and the safe speed there. Pure.
 
-A metre of which nothing is known stays unknown: it limits no speed and warns of nothing.
+A metre without knowledge stays unknown: it limits no speed and causes no warning.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.known import MEASURED, UNKNOWN, HeardMap, PlaceBelief
+from edge_agent.ahead.known import MEASURED, UNKNOWN, LocalMap, PlaceBelief
 from edge_agent.ahead.path import NONE, Path
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -30,18 +30,18 @@ LEAST_VEHICLES: Final = 2  # as for an alert: one bad sensor warns nobody
 
 
 class Horizon(NamedTuple):
-    """What lies ahead on one path, each (M,); NaN where unknown.
+    """Knowledge of one path ahead, each (M,); NaN where unknown.
 
     Attributes:
         path: the metres.
-        key: the place that is spoken of, NONE where nothing is known.
+        key: the place, NONE where nothing is known.
         mu: median; NaN also where only lower bounds are known. mu_lower, mu_upper: 5 and 95 %.
         p_slippery: P(mu < 0.4).
         age_s: since the last observation.
         basis: known.UNKNOWN, BOUND, MEASURED, BORROWED.
-        slippery: worth a warning.
-        alerted: an alert stands.
-        safe_speed: [m/s]; NaN where nobody knows: an unknown road is no fast one.
+        slippery: True if it justifies a warning.
+        alerted: True if an alert stands.
+        safe_speed: [m/s]; NaN where unknown, because an unknown road does not allow any speed.
     """
 
     path: Path
@@ -58,13 +58,13 @@ class Horizon(NamedTuple):
 
 
 def horizon_length(speed: float) -> float:
-    """How far to look [m]: as far as it takes to stop on a road of which nothing is known."""
+    """Return how far to look [m]: the stopping distance on an unknown road."""
     stop = speed * (REACTION_S + 2.0) + MARGIN_M + speed**2 / (2.0 * UNKNOWN_LOWER * GRAVITY)
     return float(min(max(stop, SHORTEST_M), LONGEST_M))
 
 
-def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
-    """The horizon along a path, now [ns]."""
+def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
+    """Return the horizon along a path, now [ns]."""
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
@@ -74,7 +74,7 @@ def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
     column = rank.argmin(axis=1)
     row = inverse[np.arange(len(column)), column]
     nothing = rank.min(axis=1) == 3
-    slippery = worth_a_warning(found)
+    slippery = justifies_warning(found)
     values = (
         np.where(nothing, np.nan, column[row])
         for column in (found.mu, found.mu_lower, found.mu_upper, found.p_slippery, found.age_s)
@@ -88,17 +88,19 @@ def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
     )  # fmt: skip
 
 
-def worth_a_warning(found: PlaceBelief) -> BoolArray:
-    """Which places (n,) are slippery enough, and surely enough, to warn of."""
+def justifies_warning(found: PlaceBelief) -> BoolArray:
+    """Return which places (n,) are slippery and certain enough for a warning."""
     firm = (found.basis == MEASURED) & (found.p_slippery >= WARN_ABOVE) & (found.vehicles >= LEAST_VEHICLES)
     return np.asarray(found.alerted | firm)
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Speed [m/s] at each metre (M,) at which bends are held and one can stop within SIGHT_M, on the lower end of grip.
+    """Return the speed [m/s] at each metre (M,) that allows bends and stopping within SIGHT_M with the lower end of
+    grip.
 
-    Before a slower place it falls with a comfortable deceleration, or with what the road bears beside cornering. Where
-    nothing is measured (NaN) none is advised (NaN) but before a slower place, with no more braking than it may bear.
+    Before a slower place it falls with a comfortable deceleration, or with the grip that cornering leaves. Where
+    nothing is measured (NaN) there is no advice (NaN), except before a slower place, with no more braking than an
+    unknown road allows.
     """
     measured, bend = np.isfinite(mu_lower), np.abs(np.nan_to_num(curvature))
     expected = np.where(measured, mu_lower, UNKNOWN_LOWER)
@@ -115,9 +117,9 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Half the square of the speed that can be braked away from the car to each metre, (M,) [m^2/s^2].
+    """Return half the square of the speed that can be braked away from the car to each metre, (M,) [m^2/s^2].
 
-    On the lower end of grip, comfortably at the most; an unknown road bears what one must expect of any.
+    It uses the lower end of grip, at most comfortably; an unknown road allows what must be expected of any road.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

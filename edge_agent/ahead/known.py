@@ -1,7 +1,7 @@
-"""What a car has heard of the map, with ages: bounded, and fading to unknown. Pure: time comes in.
+"""Local copy of the map around one car, with ages: bounded, and fading to unknown. Pure; time is an argument.
 
-A cell's belief is made from what a tile says of it: the share of μ below lower, median and upper end, and P(slippery).
-From then on it fades as it does in the map: a road may have changed since, and then nothing is known of it.
+A cell's belief is built from the values of a tile: the share of μ below lower, median and upper end, and P(slippery).
+It then fades as in the map: the road may have changed since, and is unknown in that case.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ SLIPPERY_BINS: Final[FloatArray] = np.clip(
 )  # share of each bin that is slippery
 
 
-class HeardCells(NamedTuple):
-    """Cells as heard, (n,); belief (n, 32) on the friction grid."""
+class ReceivedCells(NamedTuple):
+    """Received cells, (n,); belief (n, 32) on the friction grid."""
 
     key: IntArray
     belief: FloatArray
@@ -41,7 +41,7 @@ class HeardCells(NamedTuple):
 
 
 class PlaceBelief(NamedTuple):
-    """What is known of places, each (n,); NaN and UNKNOWN where nothing is."""
+    """Knowledge of places, each (n,); NaN and UNKNOWN where there is none."""
 
     key: IntArray
     mu: FloatArray
@@ -55,9 +55,9 @@ class PlaceBelief(NamedTuple):
 
 
 def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray) -> FloatArray:
-    """Probabilities on the friction grid (n, 32) of what is said of n cells; `mu` may be NaN.
+    """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be NaN.
 
-    The distribution function goes straight from one known value to the next.
+    The distribution function is linear between the known values.
     """
     n = len(lower)
     measured = np.isfinite(mu)
@@ -78,32 +78,32 @@ def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: Fl
     return out
 
 
-NOTHING: Final = HeardCells(
+NOTHING: Final = ReceivedCells(
     np.zeros(0, np.int64), np.zeros((0, mugrid.BINS)), *(np.zeros(0, np.int64) for _ in range(4))
 )
 
 
-class HeardMap:
-    """The cache of one car: tiles that were heard, the latest with MOST_CELLS cells, and alerts that stand."""
+class LocalMap:
+    """Cache of one car: received tiles, the latest with up to MOST_CELLS cells, and standing alerts."""
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
         self._most = most_cells
-        self._tiles: OrderedDict[int, HeardCells] = OrderedDict()
+        self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        self._all: HeardCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
+        self._all: ReceivedCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
 
     @property
     def cells(self) -> int:
-        """Cells that are held."""
+        """Number of held cells."""
         return sum(len(cells.key) for cells in self._tiles.values())
 
     @property
     def alerts(self) -> list[Alert]:
-        """Alerts that stand, as far as the car has heard."""
+        """Return the standing alerts known to the car."""
         return [alert for alert, _ in self._alerts.values()]
 
-    def take(self, tile: int, cells: HeardCells, now: int) -> None:
-        """Cells of a tile were heard: what is said of them replaces what was known of them, if it is no older."""
+    def take(self, tile: int, cells: ReceivedCells, now: int) -> None:
+        """Store received cells of a tile; they replace older knowledge only."""
         before = self._tiles.pop(tile, NOTHING)
         both = _joined([_some(before, now - before.heard < HELD_S * NS), cells])
         latest_first = np.lexsort((both.heard, both.key))[::-1]
@@ -114,7 +114,7 @@ class HeardMap:
             self._tiles.popitem(last=False)
 
     def alert(self, alert: Alert, now: int) -> bool:
-        """An alert was heard; whether that is news."""
+        """Store a received alert; return True if it is new."""
         key = alert.cell * grid.SECTORS + alert.sector
         before = self._alerts.get(key)
         if alert.raised:
@@ -127,7 +127,7 @@ class HeardMap:
         return self._alerts.pop(key, None) is not None
 
     def standing(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
-        """All alerts that stand in a tile were heard; the places of which that is news."""
+        """Store all standing alerts of a tile; return the places where this is new."""
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
         news = [key for key in self._alerts if key not in stand and int(grid.tile_of(key // grid.SECTORS)) == tile]
         for key in news:
@@ -135,7 +135,7 @@ class HeardMap:
         return news + [key for key, alert in stand.items() if self.alert(alert, now)]
 
     def forget(self, now: int) -> None:
-        """Drop what is too old to say anything."""
+        """Drop data that is too old."""
         for tile in [tile for tile, cells in self._tiles.items() if now - cells.heard.max(initial=0) > HELD_S * NS]:
             del self._tiles[tile]
             self._all = None
@@ -143,10 +143,10 @@ class HeardMap:
             del self._alerts[key]
 
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
-        """What is known now of places (n,).
+        """Return the current knowledge of places (n,).
 
-        An alert for who comes the other way is one for this side too, as long as nobody found better here since: ice
-        and water do not keep to a lane.
+        An alert for the opposite direction counts for this side too, as long as no better grip was found here since:
+        ice and water are not limited to a lane.
         """
         belief, basis, last, at, vehicles = self._rows(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -175,7 +175,7 @@ class HeardMap:
         )  # fmt: skip
 
     def belief(self, key: int, now: int) -> FloatArray | None:
-        """What is believed now of one place, (32,); None where nothing is known, or only a bound."""
+        """Return the current belief about one place, (32,); None if nothing or only a bound is known."""
         belief, basis, last, at, _ = self._rows(np.array([key]))
         if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
             return None
@@ -183,10 +183,10 @@ class HeardMap:
         return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
 
     def keys(self) -> IntArray:
-        """Places that were heard of, sorted."""
+        """Return the known places, sorted."""
         return self._whole().key
 
-    def _whole(self) -> HeardCells:
+    def _whole(self) -> ReceivedCells:
         if self._all is None:
             found = _joined(list(self._tiles.values()))
             order = np.argsort(found.key)
@@ -194,7 +194,7 @@ class HeardMap:
         return self._all
 
     def _rows(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Belief, basis, last_time, heard and vehicles of places (n,)."""
+        """Return belief, basis, last_time, time of receipt and vehicles of places (n,)."""
         whole = self._whole()
         if not len(whole.key):
             zero = np.zeros(len(key), np.int64)
@@ -208,9 +208,9 @@ class HeardMap:
         return belief, basis, last, heard, vehicles
 
 
-def _some(cells: HeardCells, rows: IntArray | BoolArray) -> HeardCells:
-    return HeardCells._make(column[rows] for column in cells)
+def _some(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:
+    return ReceivedCells._make(column[rows] for column in cells)
 
 
-def _joined(parts: list[HeardCells]) -> HeardCells:
-    return HeardCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))
+def _joined(parts: list[ReceivedCells]) -> ReceivedCells:
+    return ReceivedCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))

@@ -1,6 +1,6 @@
-"""The lookout: what vehicles hear and see ahead, once a second in a thread of its own, and at once when alerts change.
+"""Lookout: updates what vehicles see ahead once a second in a thread of its own, and at once when alerts change.
 
-The estimation loop only says where it is (`see`), which cannot block.
+The estimation loop only reports its position (`see`), which never blocks.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import zenoh
 from edge_agent.ahead.asking import FURTHER_M
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
 from edge_agent.ahead.map_subscriber import MapSubscriber
-from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.roads import ways_on
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
@@ -50,7 +50,7 @@ class _Watcher:
 
 @dataclass
 class LookoutCounts:
-    """What the lookouts did."""
+    """Counters of the lookout."""
 
     looks: int = 0
     warnings: int = 0
@@ -58,18 +58,18 @@ class LookoutCounts:
     busy_s: float = 0.0  # of the processor, by the thread that looks
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
-    def heard(self, what: str) -> int:
-        """Sum of a count of all subscribers."""
+    def total_of(self, what: str) -> int:
+        """Return the sum of a counter over all subscribers."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
-        """For the last line of a drive."""
+        """Return the counters for the last line of a drive."""
         refused = sum(
             n for one in self.subscribers.values() for name, n in one.counts.items() if name.startswith("refused")
         )
         return {
             "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
-            "heard_bytes": self.heard("bytes"), "heard_alerts": self.heard("alerts"), "heard_refused": refused,
+            "heard_bytes": self.total_of("bytes"), "heard_alerts": self.total_of("alerts"), "heard_refused": refused,
         }  # fmt: skip
 
 
@@ -78,9 +78,9 @@ class Lookout:
 
     Args:
         names: the vehicles; row k of the poses is vehicle k.
-        hear: takes each warning with the vehicle's name, on the lookout's thread.
-        route_of: the given route of vehicle k; None: the road as the map shows it.
-        listening: which of them look ahead; all of them by default.
+        hear: called with each warning and the vehicle's name, on the lookout's thread.
+        route_of: the given route of vehicle k; None for the roads visible in the map.
+        listening: vehicles that look ahead; all by default.
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class Lookout:
         self.counts = LookoutCounts()
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start to look ahead."""
         self._thread.start()
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """A vehicle's session is open: it can hear from now on."""
+        """Use a vehicle's session, which is open now."""
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]
@@ -110,11 +110,11 @@ class Lookout:
             watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
-        """Where the vehicles are now; row k is vehicle k."""
+        """Update the positions of the vehicles; row k is vehicle k."""
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
-        """What the vehicles' filters believe at the places that they are in, for what they believe with the map.
+        """Update the beliefs of the vehicles' filters at their places, for the map as a prior.
 
         Args:
             places: (N,) cell * 4 + sector, -1 where unknown.
@@ -136,11 +136,11 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """What a vehicle saw last."""
+        """Return a vehicle's last view."""
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
-        """Look no more; the sessions stay open."""
+        """Stop; the sessions stay open."""
         self._stop.set()
         self._wake.set()
         if self._thread.ident is not None:
@@ -195,7 +195,7 @@ class Lookout:
         with subscriber.looking():
             paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
             horizons = [look_ahead(path.near(length), subscriber.known, pose.time) for path in paths]
-            watcher.active, issued = warn(watcher.active, horizons, pose, subscriber.known)
+            watcher.active, issued = update_warnings(watcher.active, horizons, pose, subscriber.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
         for warning in issued:
@@ -213,15 +213,16 @@ class Lookout:
 
 
 def paths_ahead(pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float) -> list[Path]:
-    """The ways on: the given route, else the roads that the map shows, else straight on; hold the subscriber's lock."""
+    """Return the ways on: the given route, else the roads visible in the map, else straight on; hold the subscriber's
+    lock."""
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]
-    return ways_on(pose, subscriber.known.keys(), length) or [corridor(pose, length)]
+    return ways_on(pose, subscriber.known.keys(), length) or [straight_path(pose, length)]
 
 
 def runs(horizon: Horizon) -> Runs:
-    """A horizon as runs of metres in the same place."""
+    """Return a horizon as runs of metres in the same place."""
     key = horizon.key
     starts = np.append(0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1)
     ends = np.append(starts[1:], len(key))

@@ -1,6 +1,6 @@
-"""What one vehicle subscribes to and asks for: alerts of the tiles ahead, the map along the way, over its own session.
+"""Subscriptions and queries of one vehicle over its own session: alerts of the tiles ahead, the map along the way.
 
-Zenoh's threads call back; what was heard lies behind one lock. What is not possible is refused and counted.
+Zenoh's threads call back; one lock protects the received data. Invalid messages are refused and counted.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import zenoh
 
-from edge_agent.ahead.asking import Asked, Box, Tiles, keys_of
-from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.asking import Box, RequestLog, Tiles, keys_of
+from edge_agent.ahead.hearing import decode_alert_message, decode_cells, decode_standing_alerts
+from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import Path, Pose
 from schemas import grid, keys
 from schemas.errors import WireError
@@ -32,11 +32,11 @@ _TOPIC: Final = keys.TOPICS["ahead"]
 
 
 class MapSubscriber:
-    """What one vehicle hears.
+    """Subscriber of one vehicle.
 
     Args:
         vehicle: its name.
-        session: its open session; stays the caller's.
+        session: its open session; owned by the caller.
         urgent: called with the places whose alerts have changed.
         clock: [ns UTC].
     """
@@ -47,7 +47,7 @@ class MapSubscriber:
     ) -> None:  # fmt: skip
         self._session, self._urgent, self._clock = session, urgent, clock
         self._lock = threading.Lock()
-        self._map, self._asked, self._tiles = HeardMap(), Asked(), Tiles()
+        self._map, self._asked, self._tiles = LocalMap(), RequestLog(), Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
         self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
@@ -58,28 +58,28 @@ class MapSubscriber:
         self.counts: Counter[str] = Counter()
 
     def looking(self) -> threading.Lock:
-        """The lock under which `known` is read."""
+        """Return the lock under which `known` is read."""
         return self._lock
 
     @property
-    def known(self) -> HeardMap:
-        """What was heard; hold the lock."""
+    def known(self) -> LocalMap:
+        """Return the local copy of the map; hold the lock."""
         return self._map
 
     @property
     def tiles(self) -> list[int]:
-        """Tiles whose alerts are heard."""
+        """Return the tiles whose alerts are subscribed to."""
         return self._tiles.heard
 
     @property
     def connected(self) -> bool:
-        """Whether a router was there at the last look."""
+        """True if a router was connected at the last check."""
         return bool(self._routers)
 
     def follow(self, paths: list[Path], pose: Pose, within: float) -> None:
-        """Hear and ask for what lies along the ways on, the likeliest first; never waits for an answer.
+        """Subscribe and query along the ways on, the likeliest first; never waits for an answer.
 
-        Alerts are heard for the metres `within`; the map is asked for further on, see `Asked.wanting`.
+        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see `RequestLog.wanting`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back, self._routers = bool(routers - self._routers), routers
@@ -107,13 +107,13 @@ class MapSubscriber:
             self._map.forget(pose.time)
 
     def tell(self, payload: Callable[[], bytes]) -> None:
-        """Put what lies ahead on the vehicle's own key, if anybody listens."""
+        """Publish the view ahead on the vehicle's own key, if somebody listens."""
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
             self.counts["told"] += 1
 
     def close(self) -> None:
-        """Hear no more; the session stays open."""
+        """Stop; the session stays open."""
         for subscriber in self._subscribers.values():
             subscriber.undeclare()
         self._subscribers.clear()
@@ -153,7 +153,7 @@ class MapSubscriber:
 
     def _hear_alert(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        alert = heard_alert(key, payload, now)
+        alert = decode_alert_message(key, payload, now)
         self.counts["alerts"] += 1
         with self._lock:
             news = self._map.alert(alert, now)
@@ -162,7 +162,7 @@ class MapSubscriber:
 
     def _on_standing(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        tile, alerts = heard_standing(key, payload, now)
+        tile, alerts = decode_standing_alerts(key, payload, now)
         with self._lock:
             news = self._map.standing(tile, alerts, now)
         if news:
@@ -170,7 +170,7 @@ class MapSubscriber:
 
     def _on_cells(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        tile, cells = heard_cells(key, payload, now)
+        tile, cells = decode_cells(key, payload, now)
         self.counts["cells"] += len(cells.key)
         with self._lock:
             self._map.take(tile, cells, now)

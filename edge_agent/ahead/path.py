@@ -1,12 +1,12 @@
-"""The way ahead as metres: which cells and sectors of the map each metre lies in. Pure.
+"""Way ahead in metres, with the cells and sectors of the map for each metre. Pure.
 
 Legend
     s        distance ahead of the car                                             [m]     (M,)  1, 2, 3 …
     key      cell·4 + sector: a place of the map                                   int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE where there is none
 
-A car of the fleet may have been a lane beside, and its fix 1.5 m off; so the metres ask a little to the left and right
-too, and near the edge of a sector in both.
+A car of the fleet may have driven one lane aside, with a position error of 1.5 m. So each metre also covers places a
+little to the left and right, and both sectors near the border of a sector.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
 
 class Pose(NamedTuple):
-    """Where a car is: [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
+    """State of a car: [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
 
     latitude: float
     longitude: float
@@ -44,13 +44,13 @@ class Pose(NamedTuple):
 
 
 class Path(NamedTuple):
-    """One way on, from the car.
+    """One way on from the car.
 
     Attributes:
-        kind: route: given; road: as the map shows it; corridor: straight on.
+        kind: route: given; road: visible in the map; corridor: straight on.
         distance: (M,) [m].
         places: (M, C) keys.
-        curvature: (M,) [1/m], positive to the left; NaN where nobody knows.
+        curvature: (M,) [1/m], positive to the left; NaN where unknown.
         x, y: (M,) [m] east and north of the car.
     """
 
@@ -62,27 +62,27 @@ class Path(NamedTuple):
     y: FloatArray
 
     def near(self, length: float) -> Path:
-        """Its first metres."""
+        """Return its first metres."""
         n = max(int(length), 1)
         return Path(self.kind, self.distance[:n], self.places[:n], self.curvature[:n], self.x[:n], self.y[:n])
 
 
-def plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
-    """East and north [m] of the car; exact to a centimetre within a kilometre."""
+def to_plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """Return east and north [m] of the car; exact to a centimetre within a kilometre."""
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (np.asarray(latitude) - pose.latitude) * METRES_PER_DEGREE
 
 
-def degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
-    """Latitude and longitude [deg] of points [m] beside the car."""
+def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """Return latitude and longitude [deg] of points [m] relative to the car."""
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
 
 
-def along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
-    """The way along a line (n, 2) [m] that begins at the car, at most `length` [m].
+def path_along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
+    """Return the way along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
-    `first` (n,) are keys that are known at the line's points; they come before those that follow from the position.
+    `first` (n,) are known keys at the line's points; they precede those that follow from the position.
     """
     run = _run(line)
     count = max(int(min(run[-1], length)), 1)
@@ -99,18 +99,18 @@ def along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArra
     return Path(kind, s, places, curvature, x, y)
 
 
-def corridor(pose: Pose, length: float) -> Path:
-    """Straight on along the heading."""
+def straight_path(pose: Pose, length: float) -> Path:
+    """Return the way straight on along the heading."""
     reach = min(length, CORRIDOR_M)
     end = [reach * np.cos(pose.yaw), reach * np.sin(pose.yaw)]
-    return along("corridor", np.array([[0.0, 0.0], end]), pose, length)
+    return path_along("corridor", np.array([[0.0, 0.0], end]), pose, length)
 
 
 class GivenRoute:
-    """A given route, and how far the car has come on it.
+    """Given route, and the car's progress on it.
 
     Args:
-        latitude: (n,) [deg] of its points, two at the least.
+        latitude: (n,) [deg] of its points, at least two.
         longitude: (n,) [deg].
     """
 
@@ -119,8 +119,8 @@ class GivenRoute:
         self._metre = 0.0
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
-        """The way on along the route; None when the car has left it."""
-        x, y = plane(self._latitude, self._longitude, pose)
+        """Return the way on along the route; None if the car has left it."""
+        x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
         run = _run(line)
         place = self._match(line, run, pose)
@@ -130,10 +130,10 @@ class GivenRoute:
         rest = run > place
         here = [np.interp(place, run, x), np.interp(place, run, y)]
         ahead = np.concatenate([[here], line[rest]])
-        return along("route", ahead, pose, length) if len(ahead) > 1 else None
+        return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
-        """Metre of the route at which the car is: the next one on from the last, heading the same way."""
+        """Return the metre of the route at which the car is: the next one after the last, with the same heading."""
         step, start = np.diff(line, axis=0), line[:-1]
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
         share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
@@ -156,7 +156,7 @@ def _places(x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | f
     sectors = [np.asarray(sector, np.int64) for sector in grid.sectors_touched(yaw)]
     columns = []
     for side in (0.0, 1.0, -1.0):
-        cell = grid.cell_of(*degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
+        cell = grid.cell_of(*to_degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
         columns += [np.where(sector >= 0, cell * grid.SECTORS + sector, NONE) for sector in sectors]
     return np.column_stack(columns)
 

@@ -1,4 +1,4 @@
-"""The map as what a vehicle already knows of the cell that it is in; what it publishes never contains it. Pure.
+"""The map as prior knowledge about the vehicle's current cell; it never enters what the vehicle publishes. Pure.
 
 The estimator runs as if there were no map: its recursion, and the evidence of a visit that is published, are the same
 bit for bit. Beside it stands what it would believe had it begun the visit with the map's belief:
@@ -39,7 +39,7 @@ NOWHERE: Final = -1
 
 
 class MapPrior:
-    """The map's part in what N vehicles believe."""
+    """Influence of the map on the beliefs of N vehicles."""
 
     def __init__(self, vehicles: int) -> None:
         self._key = np.full(vehicles, NOWHERE)
@@ -51,19 +51,19 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # now
 
     def enters(self, keys: IntArray) -> list[int]:
-        """Vehicles that are in another place than at the last step: those whose map belief is wanted."""
+        """Return the vehicles that entered another place since the last step: their map beliefs are needed."""
         return np.flatnonzero(keys != self._key).tolist()
 
     def step(
         self, keys: IntArray, own: FloatArray, visit: FloatArray, map_beliefs: dict[int, FloatArray | None]
     ) -> FloatArray:
-        """What the vehicles believe with the map's help, (N, 32) probabilities.
+        """Return the beliefs of the vehicles with the map's help, (N, 32) probabilities.
 
         Args:
-            keys: (N,) place that each is in, NOWHERE where it is unknown.
+            keys: (N,) current place of each, NOWHERE where unknown.
             own: (N, 32) log of the filter's posterior over uniform.
             visit: (N, 32) log-likelihood of the visit so far.
-            map_beliefs: the map's belief for those who `enters`; None where it knows nothing.
+            map_beliefs: the map's belief for the vehicles in `enters`; None where it knows nothing.
         """
         now = _normal(np.exp(own))
         out = now.copy()

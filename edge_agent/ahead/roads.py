@@ -1,8 +1,9 @@
-"""The road as the map shows it: from cell to cell and sector to sector, as vehicles visited them one after the other.
+"""Roads visible in the map: sequences of cells and sectors that vehicles visited one after the other.
 
-Two places of the map follow each other when the second lies within two cells, in front, and vehicles head there as they
-must to come from the first. Where a road forks all ways are followed, the straightest first. Behind its last place that
-one goes straight on, as far as a corridor: a car has heard of no more than it asked for, and it asks along its way.
+Two places of the map follow each other if the second lies within two cells, in front, and vehicles head there as they
+must when they come from the first. All ways at a fork are followed, the straightest first. After its last known place
+that way continues straight on, as far as a corridor: the car requests the map along its way, so a shorter way would
+never grow.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, along, plane
+from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_plane
 from schemas import grid
 from schemas.numeric import IntArray
 
@@ -30,9 +31,10 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """The ways on among known places `keys` (n,), at most `length` [m] long; none where the map shows no road here."""
+    """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map shows no road
+    here."""
     latitude, longitude = grid.centre(keys // grid.SECTORS)
-    x, y = plane(latitude, longitude, pose)
+    x, y = to_plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
     places = dict(zip(keys[near].tolist(), zip(x[near].tolist(), y[near].tolist(), strict=True), strict=True))
     west, _, east, _ = (float(side) for side in grid.bounds(grid.cell_of(pose.latitude, pose.longitude)))
@@ -47,7 +49,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     ways = [[begin[0]]]
     done: list[list[int]] = []
     while ways and len(done) < MOST_WAYS:
-        done.append(_followed(graph, ways.pop(0), pose, length, ways))
+        done.append(_follow_way(graph, ways.pop(0), pose, length, ways))
     for way in (
         done[::-1] if len(done) > 1 else []
     ):  # one that joins another, or ends where another bends, is no way of its own
@@ -63,7 +65,7 @@ class _Neighbours:
         self.places, self._by_cell, self.side = places, by_cell, side
 
     def onward(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Places that may come next, the likeliest first; one of each road."""
+        """Return places that may come next, the likeliest first; one per road."""
         reach, found = cells * self.side, []
         column, row = math.floor(here[0] / self.side), math.floor(here[1] / self.side)
         wide = math.ceil(cells)
@@ -85,8 +87,8 @@ class _Neighbours:
         return [key for key, _ in chosen]
 
 
-def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
-    """Follow a way to its end; what forks off is put on `forks`."""
+def _follow_way(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
+    """Follow a way to its end; put branches on `forks`."""
     run, passed = 0.0, set(way)
     for _ in range(MOST_STEPS):
         here = graph.places[way[-1]]
@@ -103,7 +105,7 @@ def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, for
 
 
 def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Of the last three links: centres of cells along a slanting road zigzag."""
+    """Return the heading of the last three links, because the cell centres of a slanting road zigzag."""
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx, dy = last[-1][0] - last[0][0], last[-1][1] - last[0][1]
     return math.atan2(dy, dx) if math.hypot(dx, dy) > 1.0 else pose.yaw
@@ -121,7 +123,7 @@ def _as_path(
         straight = smooth[-1] + metres[:, None] * [math.cos(heading), math.sin(heading)]
         smooth = np.concatenate([smooth, straight])
         known = np.concatenate([known, np.full(len(straight), NONE)])
-    return along("road", smooth, pose, length, known)
+    return path_along("road", smooth, pose, length, known)
 
 
 def _apart(a: float, b: float) -> float:

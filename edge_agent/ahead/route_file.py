@@ -1,4 +1,4 @@
-"""A route as people have it: GPX (track, route or way points) or GeoJSON (a LineString, or what holds one).
+"""Route files: GPX (track, route or way points) and GeoJSON (a LineString, or an object that contains one).
 
 XML is read by events; a document that declares a type is refused before anything in it is expanded.
 """
@@ -22,7 +22,7 @@ _POINTS: Final = ("trkpt", "rtept", "wpt")  # what a GPX file may hold, in this 
 
 
 def read_route(path: Path) -> GivenRoute:
-    """The route of a .gpx, .geojson or .json file.
+    """Return the route of a .gpx, .geojson or .json file.
 
     Raises:
         InputError: the file cannot be read, or holds no line of at least two points on earth.
@@ -38,7 +38,7 @@ def read_route(path: Path) -> GivenRoute:
 
 
 def route_of(points: list[tuple[float, float]]) -> GivenRoute:
-    """The route through points (latitude, longitude) [deg].
+    """Return the route through points (latitude, longitude) [deg].
 
     Raises:
         InputError: they are no route.
@@ -92,7 +92,7 @@ def _geojson(data: bytes) -> list[tuple[float, float]]:
 
 
 def _line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
-    """Coordinates of the first line in a document."""
+    """Return the coordinates of the first line in a document."""
     kind = document["type"]
     if kind == "LineString":
         return list(document["coordinates"])

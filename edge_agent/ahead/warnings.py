@@ -1,7 +1,7 @@
-"""Warnings: one when a slippery stretch comes within reach, updated when it changes, ended when it is over. Pure.
+"""Warnings: issued when a slippery stretch comes within reach, updated when it changes, ended when it is over. Pure.
 
-Reach is the way that it takes to stop before the stretch at the present speed: reaction, a margin, and braking at the
-lower end of grip on the road up to it.
+Reach is the stopping distance before the stretch at the present speed: reaction, a margin, and braking at the lower end
+of grip on the road up to it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, worth_a_warning
-from edge_agent.ahead.known import MEASURED, HeardMap
+from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, justifies_warning
+from edge_agent.ahead.known import MEASURED, LocalMap
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray
@@ -32,7 +32,7 @@ SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
 
 @dataclass(frozen=True)
 class Active:
-    """A warning that stands: what was told of it, its places, and where and when it was seen last."""
+    """Standing warning: what was reported, its places, and where and when it was last confirmed."""
 
     warning: GripWarning
     places: frozenset[int]
@@ -50,16 +50,16 @@ class _Stretch:
     horizon: Horizon
 
 
-def warn(
-    active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: HeardMap
+def update_warnings(
+    active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
-    """The warnings that stand after a look ahead, and what is to be told.
+    """Return the standing warnings after an update, and the ones to report.
 
     Args:
-        active: those that stood before.
+        active: standing warnings before.
         horizons: of every way on; the likeliest first.
         pose: of the car.
-        known: what the car has heard, ahead or not.
+        known: the local copy of the map, ahead or not.
     """
     issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
@@ -91,7 +91,7 @@ def warn(
     for name, last in list(kept.items()):
         if name in here:
             continue
-        stands = worth_a_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
+        stands = justifies_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:
             issued.append(_ended(last, pose, stands=bool(stands)))
             del kept[name]
@@ -99,7 +99,7 @@ def warn(
 
 
 def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
-    """Runs of slippery metres of a horizon; those that are less than LINK_M apart are one."""
+    """Return runs of slippery metres of a horizon; runs less than LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
     begins = math.ceil(speed * (REACTION_S + UPDATE_S) + MARGIN_M)  # where the brakes bite at the latest
     found = []
@@ -120,7 +120,7 @@ def _runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Stretches of several ways that have places in common are the same."""
+    """Join stretches of several ways that have places in common."""
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:
         same = [group for group in groups if group[0] & stretch.places]

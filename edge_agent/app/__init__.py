@@ -1,1 +1,1 @@
-"""What the commands run: the live loop, backfill of logs, estimators by name, metrics."""
+"""Programs behind the commands: live loop, replay of logs, estimators by name, metrics."""

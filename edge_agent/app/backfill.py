@@ -1,7 +1,7 @@
-"""Many recorded drives to estimates, several at a time: here, or on Spark.
+"""Replay of many recorded drives to estimates, several at a time: here, or on Spark.
 
-Threads and not processes: the kernels and Parquet release the interpreter's lock, and the compiled code is loaded once.
-Either engine runs the same function for each drive, and what it writes is the same, byte for byte.
+It uses threads, because the kernels and Parquet release the interpreter lock, and the compiled code is loaded once.
+Both engines run the same function for each drive and write the same bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from schemas.vehicle import load_vehicle
 
 
 class Task(NamedTuple):
-    """A signal log, the vehicle that recorded it, and where its estimates go."""
+    """Signal log, the vehicle that recorded it, and the file of its estimates."""
 
     log: Path
     vehicle: Path
@@ -33,7 +33,7 @@ class Task(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a task: samples estimated, and why it could not be done."""
+    """Result of a task: samples estimated, or the reason of a failure."""
 
     task: Task
     samples: int
@@ -41,12 +41,13 @@ class Outcome(NamedTuple):
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
-    """One task per log, its estimates under the log's name in `folder`; its vehicle file beside it unless one is given.
+    """Return one task per log, with its estimates under the log's name in `folder`; the vehicle file is next to the log
+    unless one is given.
 
     Raises:
         InputError: two logs have one name, or estimates would replace a log.
     """
-    tasks = [Task(log, vehicle or beside(log), folder / f"{log.stem}.parquet") for log in logs]
+    tasks = [Task(log, vehicle or vehicle_file_of(log), folder / f"{log.stem}.parquet") for log in logs]
     seen: dict[Path, Path] = {}
     for task in tasks:
         if (other := seen.setdefault(task.out, task.log)) is not task.log:
@@ -56,15 +57,15 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
     return tasks
 
 
-def beside(log: Path) -> Path:
-    """The vehicle file of a log: the same name, ending in .json."""
+def vehicle_file_of(log: Path) -> Path:
+    """Return the vehicle file of a log: the same name, ending in .json."""
     return log.with_suffix(".json")
 
 
 def backfill(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all drives, `jobs` at a time; outcomes as they come. A bad drive stops no other.
+    """Estimate all drives, `jobs` at a time; yield outcomes as they arrive. A bad drive stops no other.
 
     Raises:
         InputError: jobs is below 1.
@@ -79,19 +80,22 @@ def backfill(
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:  # fmt: skip
-    """As `backfill`, on the machines that Spark has, all of which see the same files; outcomes in the tasks' order.
+    """Estimate like `backfill`, on the machines of Spark, all of which see the same files; outcomes in the tasks'
+    order.
 
     Raises:
-        InputError: Spark is not there or gave up, or the folder of the estimates cannot be made.
+        InputError: Spark is not available or gave up, or the folder of the estimates cannot be created.
     """
     folders = {writable("out", task.out).parent for task in tasks}
-    yield from spark.spread(spark.session(), tasks, partial(tried, estimator=estimator, memberships=memberships))
+    yield from spark.spread(
+        spark.session(), tasks, partial(estimate_atomically, estimator=estimator, memberships=memberships)
+    )
     for folder in folders:
         sweep_drafts(folder)
 
 
-def tried(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive such that its file is there whole, whoever else is at the same drive."""
+def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
+    """Estimate one drive and write its file atomically, also if another process estimates the same drive."""
     folder = task.out.parent
     with own_drafts(folder) as drafts:
         outcome = estimate(task._replace(out=drafts / task.out.name), estimator, memberships)

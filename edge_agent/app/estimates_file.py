@@ -1,4 +1,4 @@
-"""Estimates of one vehicle as the Parquet of the contract, one row per sample."""
+"""Estimates of one vehicle as a file with the columns of the contract, one row per sample."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.signals import per_wheel
 from schemas.tables import ESTIMATES_SCHEMA
 
@@ -27,7 +27,7 @@ WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("
 
 
 def writable(field: str, path: Path) -> Path:
-    """The path, whose folder now exists.
+    """Return the path after creating its folder.
 
     Raises:
         InputError: it is a folder, or its folder cannot be written.
@@ -43,12 +43,12 @@ def writable(field: str, path: Path) -> Path:
 
 
 def write_table(field: str, path: Path, table: pa.Table) -> None:
-    """Write a table as the ending of the path says, whole or not at all.
+    """Write a table in the format of the path's ending, atomically.
 
     Raises:
-        InputError: the path cannot be written, or has an ending that is none of ENDINGS.
+        InputError: the path cannot be written, or its ending is not one of ENDINGS.
     """
-    with written(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
+    with open_durably(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
         writer.write_table(table)
 
 
@@ -60,16 +60,16 @@ def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a clas
 
 
 class EstimatesFile:
-    """Writes estimates block by block, as the ending says; the file appears under its name when it is whole.
+    """Writer of estimates block by block; the file appears under its name when it is complete.
 
     Raises:
-        InputError: the path cannot be written, or has an ending that is none of ENDINGS.
+        InputError: the path cannot be written, or its ending is not one of ENDINGS.
     """
 
     def __init__(self, path: Path) -> None:
         with ExitStack() as opened:
             writer = _table_writer(path)
-            file = opened.enter_context(written(writable("out", path)))
+            file = opened.enter_context(open_durably(writable("out", path)))
             self._writer = opened.enter_context(writer(file, ESTIMATES_SCHEMA))
             self._opened = opened.pop_all()
 
@@ -87,7 +87,7 @@ class EstimatesFile:
 
 
 def table(t: FloatArray, estimates: Estimates) -> pa.Table:
-    """Estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null where the bank has one mu."""
+    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null if the bank has one mu."""
     wheels = estimates.mu_wheel
     columns: list[Any] = []
     for field in ESTIMATES_SCHEMA:

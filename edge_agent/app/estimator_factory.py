@@ -1,4 +1,4 @@
-"""Estimator banks as the commands make them: by name, tuned as shipped or as a file says, or from another package."""
+"""Estimator banks by name, with the shipped or given memberships, also from other packages."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from schemas.runtime import plugins
 from schemas.vehicle import Vehicle
 
 
-def known() -> dict[str, str]:
-    """All estimators by name with a line about each, those of other packages too."""
-    others = {name: f"from {point.value}" for name, point in plugins.found(plugins.ESTIMATORS).items()}
+def known_estimators() -> dict[str, str]:
+    """Return all estimators by name with one line about each, those of other packages too."""
+    others = {name: f"from {point.value}" for name, point in plugins.entry_points_of(plugins.ESTIMATORS).items()}
     return others | ESTIMATORS
 
 
 def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None) -> EstimatorBank:
-    """A bank of estimators by name, one per vehicle.
+    """Return a bank of estimators by name, one per vehicle.
 
     Args:
-        estimator: a key of `known()`; NAME@CURVE with the tyre curve of another package.
+        estimator: a key of `known()`; NAME@CURVE for the tyre curve of another package.
         vehicles: nominal vehicles, N of them.
-        memberships: fuzzy sets in place of the shipped ones.
+        memberships: fuzzy sets instead of the shipped ones.
 
     Raises:
-        InputError: no such estimator, no vehicle, memberships for an estimator that has none, or its tuned ones cannot
-            be read.
+        InputError: there is no such estimator, no vehicle, memberships for an estimator that has none, or its tuned
+            ones
+            cannot be read.
     """
     estimator, _, own = estimator.partition("@")
-    if own and own not in plugins.found(plugins.TYRE_CURVES):
-        others = ", ".join(plugins.found(plugins.TYRE_CURVES)) or "none is installed"
+    if own and own not in plugins.entry_points_of(plugins.TYRE_CURVES):
+        others = ", ".join(plugins.entry_points_of(plugins.TYRE_CURVES)) or "none is installed"
         raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of these: {others}")
-    curve = plugins.loaded(plugins.TYRE_CURVES, own) if own else None
-    if estimator not in ESTIMATORS and estimator in plugins.found(plugins.ESTIMATORS):
+    curve = plugins.load_entry_point(plugins.TYRE_CURVES, own) if own else None
+    if estimator not in ESTIMATORS and estimator in plugins.entry_points_of(plugins.ESTIMATORS):
         if memberships is not None:
             raise InputError("memberships", f"{estimator} has no fuzzy sets to replace", "leave them out")
-        bank: EstimatorBank = plugins.loaded(plugins.ESTIMATORS, estimator)(vehicles)
+        bank: EstimatorBank = plugins.load_entry_point(plugins.ESTIMATORS, estimator)(vehicles)
         return bank
     if estimator not in ESTIMATORS:
-        raise InputError("estimator", f"{estimator!r} is unknown", f"choose one of {', '.join(known())}")
+        raise InputError("estimator", f"{estimator!r} is unknown", f"choose one of {', '.join(known_estimators())}")
     if memberships is None and estimator in TUNED:
         memberships = shipped(TUNED[estimator])
     return create(estimator, vehicles, memberships=memberships, curve=curve)

@@ -1,4 +1,4 @@
-"""What a program does with the agent in a few lines: estimate a log, and have the result as a table or a plot."""
+"""Library functions: estimate a log, and return the result as a table or a plot."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ DEFAULT = "aco-fckf"
 
 
 def read_log(path: Path | str) -> SignalLog:
-    """A signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of schemas.signals.CHANNELS, SI units.
+    """Return a signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of schemas.signals.CHANNELS, SI units.
 
     Raises:
-        InputError: it cannot be read, or lacks what is needed; names column, row and fix.
+        InputError: it cannot be read, or lacks a required column; names column, row and fix.
     """
     return signal_log.read_log(Path(path))
 
 
 def load_vehicle(path: Path | str) -> Vehicle:
-    """A vehicle file (JSON); InputError names the field that is wrong."""
+    """Return a vehicle file (JSON); InputError names the invalid field."""
     return load_vehicle_file(Path(path))
 
 
 def load_memberships(path: Path | str) -> Memberships:
-    """The fuzzy sets that `edge-agent tune` wrote; InputError names the field that is wrong."""
+    """Return the fuzzy sets that `edge-agent tune` wrote; InputError names the invalid field."""
     return tuned_memberships.load(path).memberships
 
 
 def make_bank(estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
-    """N estimators side by side, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals (T, N, 18).
+    """Return N estimators, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals (T, N, 18).
 
     Raises:
-        InputError: no such estimator, no vehicle, or memberships for an estimator that has none.
+        InputError: there is no such estimator, no vehicle, or memberships for an estimator that has none.
     """
     return bank_of(estimator, vehicles, memberships)
 
@@ -62,9 +62,9 @@ def make_bank(estimator: str, vehicles: Sequence[Vehicle], *, memberships: Membe
 def estimate(
     log: SignalLog, vehicle: Vehicle, estimator: str = DEFAULT, *, memberships: Memberships | None = None
 ) -> pa.Table:
-    """Estimates of a whole log, a row per sample, as schemas.tables.ESTIMATES has them.
+    """Return the estimates of a log, one row per sample, with the columns of schemas.tables.ESTIMATES.
 
-    What a calibrated vehicle file knows of its devices is taken off the signals first, as `edge-agent replay` does.
+    Known device errors of a calibrated vehicle file are corrected in the signals first, as in `edge-agent replay`.
     """
     bank = bank_of(estimator, [vehicle], memberships)
     log = replace(log, signals=corrected(log.t, log.signals, vehicle))
@@ -73,7 +73,7 @@ def estimate(
 
 
 def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
-    """Estimates (T, N) of one of the vehicles as a table; t (T, N) or (T,) [s].
+    """Return estimates (T, N) of one of the vehicles as a table; t (T, N) or (T,) [s].
 
     Raises:
         InputError: there is no such vehicle.
@@ -86,7 +86,7 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
 
 
 def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = "") -> Figure:
-    """Speed and friction with its 90 % band over time, of several estimators by name; `truth`: a simulated log.
+    """Plot speed and friction with its 90 % band over time, for several estimators by name; `truth` is a simulated log.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -115,7 +115,7 @@ def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title
 
 
 def known_estimators() -> Iterator[tuple[str, str]]:
-    """Names of all estimators, those of other packages too, with a line about each."""
-    from edge_agent.app.estimator_factory import known
+    """Return names of all estimators, those of other packages too, with one line about each."""
+    from edge_agent.app.estimator_factory import known_estimators
 
-    yield from known().items()
+    yield from known_estimators().items()

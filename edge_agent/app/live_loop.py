@@ -1,7 +1,7 @@
-"""The live loop: blocks of samples in real time through the pipeline to the publisher, until it is stopped.
+"""Live loop: blocks of samples in real time through the pipeline to the publisher, until it is stopped.
 
-The clock paces the loop. A block that is worked off more than its own length too late counts as behind; nothing is
-skipped: a loop that fell behind catches up as fast as it can, and counts it.
+The clock paces the loop. A block that is finished more than its own length too late counts as behind. Nothing is
+skipped: a loop that fell behind catches up as fast as it can.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest and the last lag [s].
+    """Progress of the loop: seconds of signals, blocks, late blocks, the longest and the last lag [s].
 
-    `held` counts records that were not published, since nobody vouches for the signals that they were made of.
+    `held` counts records that were not published, because their signals were not verified.
     """
 
     signals_s: float = 0.0
@@ -56,8 +56,8 @@ def drive(
 ) -> Progress:
     """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
 
-    `progress` is kept up to date while it runs, for others to look at, and returned. Records of blocks that are not
-    `admitted` are held back, and counted. `after` is called after each block.
+    `progress` is updated while it runs, and returned. Records of blocks that are not `admitted` are held back and
+    counted. `after` is called after each block.
     """
     progress, status_at = progress or Progress(), STATUS_EVERY_S
     doubted: set[tuple[int, str]] = set()
@@ -80,7 +80,7 @@ def drive(
         if clock() - started >= status_at:
             status_at += STATUS_EVERY_S
             if not publisher.broken:
-                watchdog.alive()
+                watchdog.notify_alive()
             on_status(progress)
     if (last := pipeline.finish()) is not None:
         _offer(publisher, progress, admitted(), last)
@@ -103,7 +103,8 @@ def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: R
 
 
 def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Counts of records at the end, all kinds together and observations alone; lags and blocks of the loop."""
+    """Return the final counts of records, all kinds together and observations alone, and lags and blocks of the
+    loop."""
     counts, seen = publisher.counts, Kind.OBSERVATION
     return {
         "published": sum(counts.published.values()),

@@ -1,4 +1,4 @@
-"""What an operator sees of an agent in numbers, and what counts as trouble."""
+"""Metrics and health problems of an agent."""
 
 from __future__ import annotations
 
@@ -17,52 +17,53 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
 def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
-    """All values, now; records are counted by kind."""
+    """Return all current values; records are counted by kind."""
     counts = publisher.counts
     return [
         Metric("published_records", "counter", "put on disk and sent", _named(counts.published), "kind"),
         Metric("acknowledged_records", "counter", "held by a service", _named(counts.acknowledged), "kind"),
-        Metric("rejected_records", "counter", "refused by a service for good", _named(counts.rejected), "kind"),
-        Metric("dropped_records", "counter", "given up for want of room", {"": publisher.dropped}),
-        Metric("late_batches", "counter", "when the map had gone on: old news", _named(counts.late), "kind"),
+        Metric("rejected_records", "counter", "rejected by a service", _named(counts.rejected), "kind"),
+        Metric("dropped_records", "counter", "dropped for lack of room", {"": publisher.dropped}),
+        Metric("late_batches", "counter", "batches that arrived after the "
+                                          "map had moved on", _named(counts.late), "kind"),
         Metric(
-            "unanswered_records", "counter", "given up: no service answers them, only later ones",
+            "unanswered_records", "counter", "given up because only later batches were answered",
             {"": publisher.unanswered},
         ),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
         Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
         Metric("damaged_spools", "counter", "times that the outbox was found damaged", {"": publisher.damage[0]}),
-        Metric("damaged_records", "counter", "known to be lost by damage of the outbox", {"": publisher.damage[1]}),
-        Metric("sender_failures", "counter", "rounds of the sending thread that failed", {"": counts.failures}),
-        gauge("stranded_records", "in the outbox under a name that is no longer used", publisher.stranded),
-        gauge("unanswered_seconds", "since something was put that nobody answers", publisher.unanswered_s),
-        gauge("clock_behind_seconds", "of the service's clock", publisher.clock_behind_s),
+        Metric("damaged_records", "counter", "lost by damage of the outbox", {"": publisher.damage[1]}),
+        Metric("sender_failures", "counter", "failed rounds of the sending thread", {"": counts.failures}),
+        gauge("stranded_records", "records in the outbox under a former name", publisher.stranded),
+        gauge("unanswered_seconds", "time for which sent batches have not been answered", publisher.unanswered_s),
+        gauge("clock_behind_seconds", "lag of the vehicle's clock behind the service's", publisher.clock_behind_s),
         gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
-        gauge("unsettled_records", "neither acknowledged nor rejected yet", publisher.unsettled()),
-        gauge("sessions", "sessions that are open", publisher.links),
-        gauge("blocks_behind", "blocks that were worked off too late", progress.behind),
-        gauge("lag_seconds", "behind real time, at the last block", progress.now_s),
-        gauge("longest_lag_seconds", "behind real time, at the most", progress.lag_s),
+        gauge("unsettled_records", "records neither acknowledged nor rejected yet", publisher.unsettled()),
+        gauge("sessions", "open sessions", publisher.links),
+        gauge("blocks_behind", "blocks that were processed too late", progress.behind),
+        gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
+        gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
     ]  # fmt: skip
 
 
-def troubles(publisher: Publisher, progress: Progress) -> list[str]:
-    """What is not as it should be."""
+def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
+    """Return one message per problem."""
     found = [] if publisher.links else ["no session is open"]
     if publisher.cut_off:
         found.append("a session has no router")
     if publisher.unanswered_s > UNANSWERED_S:
         found.append(f"nothing was acknowledged for {publisher.unanswered_s:.0f} s")
     if publisher.fill > FULL:
-        found.append("the outbox is full: the oldest states go first")
+        found.append("the outbox is full: the oldest states are dropped first")
     if abs(publisher.clock_behind_s) > CLOCK_OFF_S:
         found.append(
-            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports come late or not at all"
+            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive late or are refused"
         )
     if publisher.stranded:
-        found.append(f"{publisher.stranded} records are kept under a former name; run once with --name as it was")
+        found.append(f"{publisher.stranded} records are stored under a former name; run once with the former --name")
     if publisher.broken:
-        found.append("the thread that sends has died; start the agent again")
+        found.append("the sending thread has died; restart the agent")
     if progress.now_s > BEHIND_S:
         found.append(f"{progress.now_s:.1f} s behind real time")
     return found

@@ -1,4 +1,4 @@
-"""Whether a replay's estimates are believable on the face of them: one honest line, and an exit code of its own."""
+"""Plausibility check of a replay's estimates: one summary line, and an exit code of its own."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ MOST_RESETS_PER_S: Final = 0.2
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
-    """Grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where they are silent.
+    """Return the grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where they are missing.
 
-    Not `mu_utilised`, which looks a second back: on a road that has just become slippery more was used than there is.
+    `mu_utilised` would not do, because it looks back a second: on a road that has just become slippery more was used
+    than is available.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -36,7 +37,7 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counts over the blocks of one replay."""
+    """Counters over the blocks of one replay."""
 
     radius: float
     first: float = np.inf
@@ -49,7 +50,7 @@ class Plausibility:
     away: list[FloatArray] = field(default_factory=list)
 
     def add(self, t: FloatArray, signals: FloatArray, estimates: Estimates) -> None:
-        """The next block: t (T, 1), signals (T, 1, 18) and what was said of them."""
+        """Add a block: t (T, 1), signals (T, 1, 18) and their estimates."""
         wheels = signals[:, 0, S.OMEGA : S.OMEGA + 4]
         some = np.isfinite(wheels).any(axis=1)
         speed = np.full(len(wheels), np.nan)
@@ -72,28 +73,28 @@ class Plausibility:
         return max(self.last - self.first, 0.0)
 
     @property
-    def off(self) -> float:
-        """Median of |v_x − wheels| over the wheels' speed; 0 of a car that stood."""
+    def median_speed_error(self) -> float:
+        """Median of |v_x − wheels| over the wheels' speed; 0 for a car that stood."""
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0
 
-    def troubles(self) -> list[str]:
-        """What is not believable."""
+    def problems(self) -> list[str]:
+        """Return one message per implausible finding."""
         n = max(self.samples, 1)
         found = {
-            "speed far off the wheels": self.off > FURTHEST_SPEED,
+            "speed far off the wheels": self.median_speed_error > FURTHEST_SPEED,
             "an upper bound below the grip in use": self.violations / n > MOST_VIOLATION,
             "started anew again and again": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
         }
         return [words for words, bad in found.items() if bad]
 
     def line(self) -> str:
-        """All of it in a line."""
+        """Return the summary line."""
         n = max(self.samples, 1)
         summary = (
-            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.off:.1%} off the wheels, "
+            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} off the wheels, "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"violations {self.violations / n:.1%}, resets {self.resets}"
         )
-        bad = self.troubles()
+        bad = self.problems()
         return f"{summary}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else summary

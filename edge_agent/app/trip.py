@@ -1,8 +1,9 @@
-"""A live trip: vouched for by the signal doctor, and learned from; what is known of the car lies beside the outbox.
+"""Live trip: verified by the signal doctor, and learned from; the knowledge of the car is stored next to the outbox.
 
-Nothing is published before the doctor has passed the signals, in this trip or in one before with the same vehicle file
-and profile. A trip is looked over in parts of PART_S; each part that passes teaches, one that shows a fault takes the
-doctor's word back. What was learned holds from the next trip on: an estimator's vehicle does not change under way.
+Nothing is published before the doctor has passed the signals, in this trip or in an earlier one with the same vehicle
+file and profile. A trip is examined in parts of PART_S. Each part that passes is learned from; one that shows a fault
+revokes the approval. Learned values are used from the next trip on, because an estimator's vehicle does not change
+during a trip.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """What is remembered of a car: whether its signals passed, and the estimates of each part of a trip."""
+    """Stored knowledge of a car: whether its signals passed, and the estimates of each part of a trip."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -53,9 +54,9 @@ class Trip:
 
     Args:
         vehicle: its file.
-        profile: by which its signals are read.
-        path: of what is known; it need not exist.
-        trusted: publish whatever the doctor says.
+        profile: name of the profile by which its signals are read.
+        path: of the stored knowledge; it need not exist.
+        trusted: True to publish whatever the doctor finds.
     """
 
     def __init__(self, vehicle: Vehicle, profile: Profile, path: Path, *, trusted: bool = False) -> None:
@@ -71,19 +72,19 @@ class Trip:
         self._looking: Future[None] | None = None
 
     def admitted(self) -> bool:
-        """Whether the signals are vouched for."""
+        """True if the signals are verified."""
         return self._trusted or self._known.passed
 
     def troubles(self) -> list[str]:
-        """Why nothing is published, if so."""
+        """Return the reasons why nothing is published, if any."""
         if self.admitted():
             return []
         return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
 
     def blocks(self, source: Generator[Block], ground: Callable[[], FloatArray]) -> Generator[Block]:
-        """The blocks of a source, less what is known of its devices; they are kept for the doctor as they came.
+        """Yield the blocks of a source with known device errors corrected; the raw ones are kept for the doctor.
 
-        `ground` tells the speed over ground (T,) of the last block.
+        `ground` returns the speed over ground (T,) of the last block.
         """
         if not self.admitted():
             log.info("nothing is published until the signal doctor has passed half a minute of turns and braking")
@@ -95,11 +96,11 @@ class Trip:
                 yield replace(block, signals=mended[:, None])
 
     def end(self) -> None:
-        """Begin to learn from what is left."""
+        """Start to learn from the rest."""
         self._look(final=True)
 
     def close(self) -> None:
-        """Wait a moment for what is being learned."""
+        """Wait shortly for the learning to end."""
         if self._looking is not None:
             try:
                 self._looking.result(LEAVE_S)
@@ -119,7 +120,7 @@ class Trip:
             self._look(final=False)
 
     def _look(self, *, final: bool) -> None:
-        """Have the part examined beside the loop; the last look at a part ends it."""
+        """Examine the part next to the loop; the last examination of a part ends it."""
         if not self._blocks:
             return
         if not final and self._looking is not None and not self._looking.done():
@@ -151,8 +152,8 @@ class Trip:
             _write(self._path, self._known)
 
 
-def beside(spool: Path, name: str) -> Path:
-    """Where what is known of a car lies: beside its outbox."""
+def state_path_for(spool: Path, name: str) -> Path:
+    """Return the path of a car's stored knowledge, next to its outbox."""
     return spool.with_name(f"{spool.stem}.{name}.json")
 
 
@@ -162,7 +163,7 @@ def _identity(vehicle: Vehicle, profile: Profile) -> str:
 
 
 def _read(path: Path, identity: str) -> Known:
-    """What is known of the car; nothing where the file is missing, broken, or of another car."""
+    """Return the stored knowledge of the car; empty if the file is missing, broken, or of another car."""
     try:
         known = Known.model_validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -177,7 +178,7 @@ def _read(path: Path, identity: str) -> Known:
 
 
 def _write(path: Path, known: Known) -> None:
-    """Whole or not at all."""
+    """Write the knowledge atomically."""
     part = path.with_suffix(".part")
     try:
         with part.open("w", encoding="utf-8") as file:

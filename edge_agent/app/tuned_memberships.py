@@ -1,4 +1,4 @@
-"""Tuned memberships as files: what was found, how it compares, and the command that finds it again."""
+"""Files of tuned memberships: the result, its comparison, and the command that reproduces it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Record(BaseModel):
 
 
 class Score(Record):
-    """How one set of memberships does on one set of drives; null where nobody knows the true friction."""
+    """Scores of one set of memberships on one set of drives; null if the true friction is unknown."""
 
     interval_score: Annotated[Finite | None, Field(description="of the 90 % friction interval, less is better [1]")]
     coverage: Annotated[Finite | None, Field(description="share of true frictions inside it [1]")]
@@ -36,14 +36,14 @@ class Score(Record):
 
 
 class SplitScores(Record):
-    """One row of the table: the drives that were searched on, and drives that were not."""
+    """One row of the table: the drives of the search, and other drives."""
 
     train: Score
     held_out: Score
 
 
 class Budget(Record):
-    """What the search was allowed, and how many vectors each way evaluated."""
+    """Limits of the search, and the number of vectors that each search evaluated."""
 
     ants: Count
     iterations: Count
@@ -51,7 +51,7 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Enough to find the same numbers again."""
+    """Everything needed to reproduce the numbers."""
 
     command: str
     seed: Annotated[int, Field(ge=0)]
@@ -63,7 +63,7 @@ class Provenance(Record):
 
 
 class Document(Record):
-    """The file as it lies on the disk."""
+    """Content of the file."""
 
     estimator: str
     memberships: dict[str, list[Finite]]
@@ -78,14 +78,14 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """A file whose memberships have been accepted."""
+    """File with valid memberships."""
 
     memberships: Memberships
     document: Document
 
 
 def parse(text: str | bytes, where: str) -> Tuned:
-    """The tuned memberships in a document.
+    """Return the tuned memberships in a document.
 
     Raises:
         InputError: a field is missing, unknown, not a finite number, or a vertex is out of order or out of range.
@@ -104,7 +104,7 @@ def parse(text: str | bytes, where: str) -> Tuned:
 
 
 def load(path: Path | str) -> Tuned:
-    """Read a tuned file; InputError names the field that is wrong, or the file if it cannot be read."""
+    """Read a tuned file; InputError names the invalid field, or the file if it cannot be read."""
     try:
         text = Path(path).read_bytes()
     except OSError as error:
@@ -113,7 +113,7 @@ def load(path: Path | str) -> Tuned:
 
 
 def shipped(estimator: str) -> Memberships:
-    """The memberships that come with the package for an estimator.
+    """Return the memberships that come with the package for an estimator.
 
     Raises:
         InputError: there are none for that estimator.
@@ -121,14 +121,14 @@ def shipped(estimator: str) -> Memberships:
     return load(FOLDER / f"{estimator}.json").memberships
 
 
-def candidates(estimator: str) -> dict[str, list[Memberships]]:
-    """What every search behind the shipped file found, by way; empty where the file does not tell."""
+def search_results(estimator: str) -> dict[str, list[Memberships]]:
+    """Return the results of every search behind the shipped file, by search; empty if the file does not have them."""
     document = load(FOLDER / f"{estimator}.json").document
     return {way: [Memberships.from_json(one) for one in found] for way, found in document.candidates.items()}
 
 
 def save(path: Path, document: Document) -> None:
-    """Write a document after reading it back, so that no file is written that `load` would refuse."""
+    """Write a document after parsing it, so that no file is written that `load` would refuse."""
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
     parse(text, f"tuned file {path}")
     try:

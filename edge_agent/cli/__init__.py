@@ -1,7 +1,7 @@
 """`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
-it is chosen, so that help is quick.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
+needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Final
 
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 FAILED: Final = commandline.FAILED
@@ -23,44 +23,46 @@ LIVE: Final = ("run", "fleet")  # commands that drive for hours
 COMMANDS: Final = (
     Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth",
             "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet --vehicle-out drive.json"),
-    Command("import", "edge_agent.cli.import_", "any car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
+    Command("import", "edge_agent.cli.import_", "convert a car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
             "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out drive.parquet"),
-    Command("check", "edge_agent.cli.check", "the signal doctor: units, signs, clocks, offsets, by physics",
+    Command("check", "edge_agent.cli.check", "run the signal doctor: units, signs, clocks, offsets, by physics",
             "edge-agent check drive.parquet --vehicle car.json --out check.html"),
-    Command("calibrate", "edge_agent.cli.calibrate", "a vehicle file learned from a car's own drives",
+    Command("calibrate", "edge_agent.cli.calibrate", "learn a vehicle file from a car's own drives",
             "edge-agent calibrate monday.parquet tuesday.parquet --vehicle car.json --out better.json"),
-    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request",
+    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive; publish it with --publish",
             "edge-agent replay drive.parquet --vehicle car.json --out estimates.parquet"),
-    Command("run", "edge_agent.cli.run", "one vehicle, live, in real time",
+    Command("run", "edge_agent.cli.run", "run one vehicle live, in real time",
             "edge-agent run --source simulated --name car-one --config agent.json"),
-    Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session",
+    Command("fleet", "edge_agent.cli.fleet", "run many simulated vehicles in real time, each with its own session",
             "edge-agent fleet --vehicles 36 --duration 150 --config agent.json"),
-    Command("tune", "edge_agent.cli.tune", "tune the fuzzy memberships by ant colony",
+    Command("tune", "edge_agent.cli.tune", "search the fuzzy memberships by ant colony and by random search",
             "edge-agent tune --seed 1 --out memberships.json"),
-    Command("evaluate", "edge_agent.cli.evaluate", "the papers' manoeuvres for every estimator, with figures",
+    Command("evaluate", "edge_agent.cli.evaluate", "run every estimator on the papers' manoeuvres, with figures",
             "edge-agent evaluate --quick --out evaluation"),
-    Command("completion", "edge_agent.cli.completion", "print what completes these commands in a shell",
+    Command("completion", "edge_agent.cli.completion", "print the completion script for a shell",
             "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent"),
 )  # fmt: skip
 LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.", COMMANDS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code."""
-    arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
+    """Run a command line; return the exit code."""
+    arguments = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
-    talk.speak(quiet=commandline.wants_quiet(arguments))
-    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(arguments))
+    with (
+        nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
+    ):  # what it loads takes a second
         code, left = _run(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
     if left:
-        from schemas.runtime.process import end_now
+        from schemas.runtime.process import force_exit
 
-        end_now(code)
+        force_exit(code)
     return code
 
 
 def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tuple[int, bool]:
-    """The exit code, and whether something was left behind that would keep the process from ending."""
+    """Return the exit code, and whether a remaining thread would keep the process from ending."""
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
@@ -71,7 +73,7 @@ def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tupl
         limit_memory()
     code = FAILED
     try:
-        code = commandline.guarded(lambda: int(args.run(args)))
+        code = commandline.run_guarded(lambda: int(args.run(args)))
     except Exception:
         if not left_behind.is_set():
             raise

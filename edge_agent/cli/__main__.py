@@ -1,6 +1,6 @@
 """`python -m edge_agent.cli`."""
 
 from edge_agent.cli import main
-from schemas.runtime.process import leave
+from schemas.runtime.process import exit_fast
 
-leave(main())
+exit_fast(main())

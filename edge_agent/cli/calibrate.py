@@ -1,4 +1,4 @@
-"""`edge-agent calibrate`: a vehicle file that knows what its devices are off by, learned from the car's drives."""
+"""`edge-agent calibrate`: learn the device errors of a car from its drives; writes a vehicle file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn and write; 0."""
+    """Learn and write; return 0."""
     from edge_agent.app.estimates_file import writable
     from edge_agent.calibration.learn import learn
     from edge_agent.inputs.doctor.findings import diagnose

@@ -1,4 +1,4 @@
-"""`edge-agent check`: the signal doctor; what of a log is sound, what is wrong with the rest, and its correction."""
+"""`edge-agent check`: run the signal doctor on a log; lists sound and faulty signals with their corrections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     add_json(parser, "what was found")
-    parser.add_argument("--out", type=Path, help="page with the evidence and its plots (HTML)")
+    parser.add_argument("--out", type=Path, help="HTML page with the evidence and plots")
     parser.add_argument(
         "--fix",
         type=Path,
@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check; 0 when the log has passed, 1 when something is wrong or unknown."""
-    from edge_agent.app.backfill import beside
+    """Check; return 0 if the log has passed, 1 if something is wrong or unknown."""
+    from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
 
-    file = args.vehicle or beside(args.log)
+    file = args.vehicle or vehicle_file_of(args.log)
     vehicle, log = load_vehicle(file), read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     doubts = _doubted(log)

@@ -1,4 +1,4 @@
-"""What the commands share: estimators by name, the closing of a publisher, signals, vehicle names."""
+"""Shared parts of the commands: estimators by name, closing of a publisher, signals, vehicle names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from schemas.config import NAME_PATTERN, AgentConfig
 from schemas.errors import InputError
-from schemas.runtime.process import Line, print_line
+from schemas.runtime.process import LogLine, print_line
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -30,7 +30,7 @@ FLEET = "fleet"  # what {name} in the path of an outbox is for many vehicles
 
 
 def checked_name(name: str) -> str:
-    """A name that may stand in a key.
+    """Return a name that may be part of a key.
 
     Raises:
         InputError: it may not.
@@ -48,7 +48,7 @@ def publisher_of(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """A started publisher on the configured outbox; `on_open` is told of each vehicle's session.
+    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's session.
 
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
@@ -67,11 +67,11 @@ def publisher_of(
     return publisher
 
 
-def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
-    """Let only a log pass whose signals agree with each other.
+def require_valid_signals(log: SignalLog, vehicle: Vehicle) -> None:
+    """Raise unless the signals of a log agree with each other.
 
     Raises:
-        InputError: the signal doctor finds a fault, or cannot tell.
+        InputError: the signal doctor finds a fault, or cannot decide.
     """
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.report import advice, lines
@@ -82,8 +82,8 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
         raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
 
 
-def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
-    """Say on stderr what the signal doctor finds wrong with a log that is only estimated."""
+def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> None:
+    """Print on stderr the faults that the signal doctor finds in a log that is only estimated."""
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.fix import small_lags
 
@@ -102,7 +102,7 @@ def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """An event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
+    """Yield an event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
@@ -124,10 +124,10 @@ def stop_on_signal() -> Iterator[threading.Event]:
 left_behind = threading.Event()
 
 
-def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
-    """Wait for acknowledgements, close, print the counts, and what else is given, as one line of JSON on stdout.
+def close_publisher(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
+    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on stdout.
 
-    What is unsettled stays in the outbox for the next start.
+    Unsettled records stay in the outbox for the next start.
     """
     from edge_agent.app.live_loop import summary
 
@@ -138,8 +138,8 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: floa
     print(json.dumps(summary(progress, publisher) | more), flush=True)
 
 
-def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
-    """One line on how it goes."""
+def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
+    """Print one line of progress."""
     from edge_agent.app.live_loop import summary
 
     counts = publisher.counts
@@ -148,4 +148,4 @@ def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], N
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
         f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
     )
-    log_line(Line(text, event="status", **summary(progress, publisher)))
+    log_line(LogLine(text, event="status", **summary(progress, publisher)))

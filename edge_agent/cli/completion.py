@@ -1,4 +1,4 @@
-"""`edge-agent completion`: the script that completes its commands and options in a shell."""
+"""`edge-agent completion`: print the completion script for a shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`edge-agent evaluate`: the campaign, its figures.json, its Markdown table and its plots."""
+"""`edge-agent evaluate`: run the evaluation; writes figures.json, a Markdown table and plots."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--out", type=Path, required=True, help="folder for figures.json, report.md and the plots")
-    parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
+    parser.add_argument(
+        "--quick", action="store_true", help="three scenarios, two estimators, two seeds, to check that it runs"
+    )
     parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
     parser.add_argument(
         "--only",
@@ -42,15 +44,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
     )
-    parser.add_argument("--recorded", type=Path, help="CAN log whose frames are decoded too (--only inputs)")
+    parser.add_argument("--recorded", type=Path, help="CAN log to decode as well (--only inputs)")
     parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; 0 when all bars hold that were measured, else 1.
+    """Evaluate; return 0 if all measured bars hold, else 1.
 
     Raises:
-        InputError: too few seeds, the folder cannot be made, or matplotlib is not installed.
+        InputError: too few seeds, the folder cannot be created, or matplotlib is not installed.
     """
     from edge_agent.lab.evaluation.bars import figures as figures_of
     from edge_agent.lab.evaluation.campaign import run as campaign

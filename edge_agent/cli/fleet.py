@@ -16,24 +16,24 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
+    parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7")
     parser.add_argument(
-        "--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7"
+        "--rough", type=float, default=0.0, help="share of them with the sensor errors of real cars (default 0)"
     )
-    parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
     parser.add_argument(
         "--winter", type=float, default=0.0, help="share of them with winter tyres and controllers (default 0)"
     )
-    parser.add_argument("--warned", type=float, default=0.0, help="share of them that hear the map and are warned")
+    parser.add_argument("--warned", type=float, default=0.0, help="share of them that receive the map and are warned")
     add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
+    parser.add_argument("--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
     parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the duration has passed or a signal comes; write the truth before leaving."""
+    """Drive until the duration has passed or a signal arrives; write the truth before the end."""
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.estimates_file import writable
     from edge_agent.cli.live import drive_live, warm_up_simulation, warning_lines

@@ -1,4 +1,4 @@
-"""`edge-agent import`: any car's recording to a signal log, by a profile; a profile is drafted where none is named."""
+"""`edge-agent import`: convert a car's recording to a signal log by a profile; without one, a profile is drafted."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help="CSV, Parquet, BLF, ASC, candump, TRC, MF4, VBO, ROS bag, MCAP, NMEA, gpsd JSON",
     )
-    parser.add_argument("--profile", help="which signal is which channel: a file, or a shipped one (--list)")
-    parser.add_argument("--list", action="store_true", help="list the shipped profiles and leave")
+    parser.add_argument("--profile", help="profile that maps signals to channels: a file, or a shipped one (--list)")
+    parser.add_argument("--list", action="store_true", help="list the shipped profiles and exit")
     add_json(parser, "the list")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio")
-    parser.add_argument("--draft", type=Path, help="where to write a drafted profile (default: beside the log)")
+    parser.add_argument("--draft", type=Path, help="where to write a drafted profile (default: next to the log)")
     parser.add_argument(
-        "--clock", action="append", default=[], metavar="FILE=SECONDS", help="add to the clock of a source"
+        "--clock", action="append", default=[], metavar="FILE=SECONDS", help="seconds to add to the clock of a source"
     )
     parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import; 0 when the log was written."""
+    """Import; return 0 if the log was written."""
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
     from edge_agent.inputs.merge import merge

@@ -1,4 +1,4 @@
-"""What `run` and `fleet` share: bank, pipeline and publisher around the live loop."""
+"""Shared part of `run` and `fleet`: bank, pipeline and publisher around the live loop."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.live_loop import ENDED_DRAIN_S, STATUS_EVERY_S, STOPPED_DRAIN_S, Progress, drive
-from edge_agent.app.metrics import metrics, troubles
-from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
+from edge_agent.app.metrics import health_problems, metrics
+from edge_agent.cli.common import close_publisher, print_status, publisher_of, stop_on_signal
 from edge_agent.inputs.block import Block
 from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
-from schemas.runtime import talk
-from schemas.runtime.metrics import serving
-from schemas.runtime.process import Line, line_logger, log_as, print_line
+from schemas.runtime import progress_messages
+from schemas.runtime.metrics import serve_metrics
+from schemas.runtime.process import LogLine, line_logger, log_as, print_line
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
 from schemas.wire.ahead import GripWarning
 
 
 def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None) -> None:
-    """Load or compile the kernels before the clock runs, on a vehicle that is thrown away."""
+    """Load or compile the kernels before the clock runs, on a temporary vehicle."""
     t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
-    with talk.busy("starting the estimator"):
+    with progress_messages.show_status("starting the estimator"):
         Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(Block(t, time, signals))
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
-    """The same for the simulation: else its first step is silent for as long as its kernels take."""
+    """Load or compile the kernels of the simulation before its first step."""
     from edge_agent.lab.simulation import SimulatedFleet
 
-    with talk.busy("starting the simulation"):
+    with progress_messages.show_status("starting the simulation"):
         SimulatedFleet(scenario, 1, 0, rate_hz, rough=rough).step(1)
 
 
@@ -61,11 +61,11 @@ def drive_live(
     vss: RoadFrictionOutput | None = None,
     memberships: Memberships | None = None,
 ) -> int:
-    """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
+    """Drive in real time, call `at_end`, and shut down; print a line of counts and return 0.
 
-    What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources. A `lookout`
-    hears the map over the vehicles' sessions. `vss` tells the friction where they are, of signals that are admitted.
-    `memberships` stand in for the estimator's own.
+    Records made while not `admitted` are not published; `troubled` returns the problems of the sources. A `lookout`
+    receives the map over the vehicles' sessions. `vss` reports the friction at the vehicles if their signals are
+    admitted. `memberships` replace the estimator's own.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
@@ -73,11 +73,11 @@ def drive_live(
     progress, running = Progress(), list[Publisher]()
     with (
         stop_on_signal() as stop,
-        serving(
+        serve_metrics(
             config.metrics_host,
             config.metrics_port,
             lambda: [metric for publisher in running for metric in metrics(publisher, progress)],
-            lambda: [*troubles(running[0], progress), *troubled()] if running else ["the agent is starting"],
+            lambda: [*health_problems(running[0], progress), *troubled()] if running else ["the agent is starting"],
         ) as address,
     ):
         if address:
@@ -100,9 +100,11 @@ def drive_live(
         log_line = line_logger(config.log, sys.stderr)
         who = names[0] if len(names) == 1 else f"{len(names)} vehicles"
         log_line(
-            Line(f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s", event="ready", vehicles=len(names))
+            LogLine(
+                f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s", event="ready", vehicles=len(names)
+            )
         )
-        report = partial(status, publisher=publisher, log_line=log_line)
+        report = partial(print_status, publisher=publisher, log_line=log_line)
         if lookout is not None:
             lookout.start()
         drive(
@@ -114,23 +116,24 @@ def drive_live(
             lookout.close()
             heard = lookout.counts.values()
         at_end()
-        leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard)
+        close_publisher(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard)
     return 0
 
 
 def _show(lookout: Lookout, pipeline: Pipeline) -> None:
-    """Tell a lookout where the vehicles are and what their filters believe."""
+    """Pass the vehicles' positions and their filters' beliefs to a lookout."""
     if pipeline.seen is not None:
         lookout.see([Pose(*row) for row in zip(*(column.tolist() for column in pipeline.seen), strict=True)])
         lookout.believe(pipeline.places, pipeline.beliefs())
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
-    """Prints warnings on stdout: lines for people, or JSON where the log is JSON; an infinite time is null there."""
+    """Return a function that prints warnings on stdout: text, or JSON if the log is JSON; an infinite time is null
+    there."""
     say = line_logger(config.log, sys.stdout)
 
     def tell(vehicle: str, warning: GripWarning) -> None:
         values = {name: None if value == math.inf else value for name, value in vars(warning).items() if name != "time"}
-        say(Line(f"{vehicle}: {warning.line()}", event="warning", vehicle=vehicle, at=warning.time, **values))
+        say(LogLine(f"{vehicle}: {warning.line()}", event="warning", vehicle=vehicle, at=warning.time, **values))
 
     return tell

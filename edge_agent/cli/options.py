@@ -1,4 +1,4 @@
-"""Options that several commands have; light, for every help needs them."""
+"""Options that several commands share; light, because every help text needs them."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ if TYPE_CHECKING:
 
 
 def add_estimator(parser: argparse.ArgumentParser) -> None:
-    """Declare which estimator, and with which fuzzy sets."""
+    """Declare the options for estimator and fuzzy sets."""
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
     parser.add_argument("--memberships", type=Path, metavar="FILE", help="fuzzy sets that tune wrote")
 
 
 def memberships_of(args: argparse.Namespace) -> Memberships | None:
-    """The fuzzy sets of the option; None where it was not given."""
+    """Return the fuzzy sets of the option; None if it was not given."""
     from edge_agent.app.tuned_memberships import load
 
     return load(args.memberships).memberships if args.memberships else None
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:
-    """Declare that a program reads what is said."""
+    """Declare the option for machine-readable output."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
 
 
 def print_list(entries: Mapping[str, str], *, as_json: bool) -> None:
-    """Names with a line about each: for people, or one JSON object."""
+    """Print names with one line about each, as text or as one JSON object."""
     if as_json:
         print(json.dumps(dict(entries)))
     else:

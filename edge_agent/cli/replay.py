@@ -1,4 +1,4 @@
-"""`edge-agent replay`: recorded drives through an estimator, as fast as it goes; one onto the map with --publish."""
+"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one to the map."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when all was written and acknowledged, 1 when something was left or refused, 3 when not plausible."""
-    from edge_agent.app.backfill import backfill, backfill_on_spark, beside, tasks_of
+    """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused, 3 if not plausible."""
+    from edge_agent.app.backfill import backfill, backfill_on_spark, tasks_of, vehicle_file_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.cli.common import insist_on_sound, warn_of_faults
+    from edge_agent.cli.common import require_valid_signals, warn_about_faults
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
@@ -76,17 +76,17 @@ def run(args: argparse.Namespace) -> int:
             return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
         return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
     path = args.log[0]
-    commandline.not_an_input("out", args.out, [path, args.vehicle or beside(path)])
-    vehicle = load_vehicle(args.vehicle or beside(path))
+    commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
+    vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
     bank = bank_of(estimator, [vehicle], memberships)
     log = read_log(path)
     start_ns = _start(args.start, log)
     log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
-        insist_on_sound(log, vehicle)
+        require_valid_signals(log, vehicle)
     else:
-        warn_of_faults(log, vehicle)
+        warn_about_faults(log, vehicle)
     with EstimatesFile(args.out) as file:
         code = 0
 
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
             for block in log.blocks(start_ns):
                 keep(block, bank.advance(block.t, block.signals))
     print(plausibility.line(), file=sys.stderr)
-    return code or (IMPLAUSIBLE if plausibility.troubles() else 0)
+    return code or (IMPLAUSIBLE if plausibility.problems() else 0)
 
 
 def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
@@ -113,7 +113,7 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Say how it goes on stderr; 2 where a log could not be read, else 0."""
+    """Print progress on stderr; return 2 if a log could not be read, else 0."""
     bad, samples, began, last = 0, 0, time.monotonic(), 0.0
     for done, outcome in enumerate(outcomes, 1):
         samples += outcome.samples
@@ -137,7 +137,7 @@ def _published(
     keep: Callable[[Block, Estimates], None],
 ) -> int:
     from edge_agent.app.live_loop import Progress
-    from edge_agent.cli.common import checked_name, leave, publisher_of
+    from edge_agent.cli.common import checked_name, close_publisher, publisher_of
     from edge_agent.observe.pipeline import Pipeline
 
     pipeline = Pipeline(bank, 1, config)
@@ -152,7 +152,7 @@ def _published(
         if (last := pipeline.finish()) is not None:
             publisher.offer(last)
     finally:
-        leave(publisher, progress, DRAIN_S)
+        close_publisher(publisher, progress, DRAIN_S)
     if refused := sum(publisher.counts.rejected.values()):
         old = time.time_ns() - start_ns > OLD_NS
         fix = "it is older than a month: --start now drives it today" if old else "the reasons stand above"
@@ -161,7 +161,7 @@ def _published(
 
 
 def _start(given: str | None, log: SignalLog) -> int:
-    """The ns UTC of t = 0."""
+    """Return the time of t = 0 [ns UTC]."""
     from schemas.config import moment
 
     if given is not None and given != NOW:

@@ -1,4 +1,4 @@
-"""`edge-agent run`: one vehicle, live; its signals come from its buses, a simulation, or a log paced in real time."""
+"""`edge-agent run`: drive one vehicle live; signals come from its buses, a simulation, or a log paced in real time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_estimator, memberships_of
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
@@ -31,25 +31,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
         "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
     )  # fmt: skip
-    parser.add_argument("--profile", help="which live signal is which channel: a file, or a shipped one")
+    parser.add_argument("--profile", help="profile that maps live signals to channels: a file, or a shipped one")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
-    parser.add_argument("--trust", action="store_true", help="publish what the signal doctor did not pass")
-    parser.add_argument("--ahead", action="store_true", help="hear the map, and warn of slippery road ahead")
-    parser.add_argument("--route", type=Path, help="where it drives to, for --ahead (GPX or GeoJSON)")
-    parser.add_argument("--vss", action="store_true", help="tell the friction here as VSS signals, a line of JSON each")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
+    parser.add_argument(
+        "--trust", action="store_true", help="publish although the signal doctor did not pass the signals"
+    )
+    parser.add_argument("--ahead", action="store_true", help="receive the map and warn of slippery road ahead")
+    parser.add_argument("--route", type=Path, help="route for --ahead (GPX or GeoJSON)")
+    parser.add_argument("--vss", action="store_true", help="report the friction as VSS signals, one line of JSON each")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); required except for simulated")
     add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--scenario", default="demo", help="where the simulated vehicle drives (default demo)")
+    parser.add_argument("--scenario", default="demo", help="scenario of the simulated vehicle (default demo)")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second of the simulation")
     parser.add_argument("--seed", type=int, default=0, help="of the simulation")
     parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped or the log ends")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the source ends, the duration has passed, or a signal comes."""
-    with talk.busy("loading"):
+    """Drive until the source ends, the duration has passed, or a signal arrives."""
+    with progress_messages.show_status("loading"):
         from edge_agent.cli.common import checked_name
         from edge_agent.cli.live import drive_live
         from edge_agent.inputs.live.sources import KINDS, is_live
@@ -67,10 +69,10 @@ def run(args: argparse.Namespace) -> int:
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
     kind, colon, address = sources[0].partition(":")
-    others = plugins.found(plugins.SOURCES)
+    others = plugins.entry_points_of(plugins.SOURCES)
     if kind in others:
         vehicle = load_vehicle(_vehicle_file(args))
-        name, blocks = args.name or vehicle.name, plugins.loaded(plugins.SOURCES, kind)(address)
+        name, blocks = args.name or vehicle.name, plugins.load_entry_point(plugins.SOURCES, kind)(address)
     elif colon and not Path(sources[0]).exists():
         known = ", ".join(sorted([*KINDS, *others]))
         raise InputError("source", f"{sources[0]!r} is no file, and {kind!r} no kind of source", f"kinds are {known}")
@@ -103,7 +105,7 @@ def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFricti
 
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
-    from edge_agent.app.trip import Trip, beside
+    from edge_agent.app.trip import Trip, state_path_for
     from edge_agent.cli.common import checked_name, left_behind
     from edge_agent.cli.live import drive_live
     from edge_agent.inputs.live.rows import LiveRows
@@ -114,7 +116,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
     name = checked_name(args.name or vehicle.name)
     feeds, profile, clock = open_sources(sources, args.profile, args.dbc)
     rows = LiveRows(feeds, profile, vehicle, clock)
-    trip = Trip(vehicle, profile, beside(config.spool_of(name), name), trusted=args.trust)
+    trip = Trip(vehicle, profile, state_path_for(config.spool_of(name), name), trusted=args.trust)
     blocks = trip.blocks(rows.blocks(), lambda: rows.ground)
     try:
         return drive_live(
@@ -148,7 +150,7 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
 
 
 def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Iterator[Block]]:
-    from edge_agent.cli.common import insist_on_sound
+    from edge_agent.cli.common import require_valid_signals
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.thresholds import NS
@@ -158,6 +160,6 @@ def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Itera
     log = read_log(source)
     log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     if not args.trust:
-        insist_on_sound(log, vehicle)
+        require_valid_signals(log, vehicle)
     first_ns = time.time_ns() - round(float(log.t[0]) * NS)
     return vehicle, args.name or vehicle.name, log.blocks(first_ns, LIVE_ROWS)

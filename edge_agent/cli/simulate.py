@@ -1,4 +1,4 @@
-"""`edge-agent simulate`: the signal log of a manoeuvre."""
+"""`edge-agent simulate`: write the signal log of a manoeuvre."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROADS = ("level", "rolling", "stepped", "banked", "hilly")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
-    parser.add_argument("--list", action="store_true", help="list the manoeuvres and leave")
+    parser.add_argument("--list", action="store_true", help="list the manoeuvres and exit")
     add_json(parser, "the list")
     parser.add_argument("--mu", type=float, help="peak friction of the road; else the manoeuvre's own")
     parser.add_argument("--speed", type=float, help="[m/s]; else the manoeuvre's own")
@@ -22,9 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
     parser.add_argument("--sensors", choices=SENSORS, default="mems", help="quality (default mems); rough: real cars'")
-    parser.add_argument("--no-torque", action="store_true", help="no wheel torque is recorded, as by most cars")
+    parser.add_argument("--no-torque", action="store_true", help="record no wheel torque, like most cars")
     parser.add_argument("--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)")
-    parser.add_argument("--slope", type=float, default=0.0, help="metres up per metre ahead, added to it (default 0)")
+    parser.add_argument(
+        "--slope", type=float, default=0.0, help="additional slope, metres up per metre ahead (default 0)"
+    )
     parser.add_argument("--out", type=Path, help="signal log to write (.parquet, .csv)")
     parser.add_argument("--vehicle-out", type=Path, help="vehicle file to write (JSON)")
 

@@ -1,6 +1,7 @@
-"""`edge-agent tune`: search the memberships, beside a random search of equal budget, and write what was found.
+"""`edge-agent tune`: search the memberships by ant colony and by a random search of equal budget; write the best
+result.
 
-With --study: paper 004's own filter under right and wrong R, several searches each way, as figures, table and plot.
+With --study: run paper 004's own filter under right and wrong R, several searches each, with figures, table and plot.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.backfill import beside
+from edge_agent.app.backfill import vehicle_file_of
 from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
-from edge_agent.cli.common import warn_of_faults
+from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import (
@@ -47,9 +48,9 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `edge-agent tune`."""
-    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own in place of simulated drives")
+    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own instead of simulated drives")
     parser.add_argument("--vehicle", type=Path, help="vehicle file of the logs (default: LOG.json beside LOG.parquet)")
-    parser.add_argument("--seed", type=int, default=0, help="of the ants and of the random search (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of both searches (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
     parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
     parser.add_argument(
@@ -58,13 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="interval score of friction (needs the truth: simulated drives' default), log-likelihood of the"
         " innovations, or that with a price on wrong calibration (default with logs: predictive)",
     )
-    parser.add_argument("--repeats", type=int, default=1, help="searches each way (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=1, help="number of searches of each kind (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
     parser.add_argument(
         "--study", type=Path, metavar="DIR",
         help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="a few ants on short drives: tries the way, tunes nothing")
+    parser.add_argument("--quick", action="store_true", help="a few ants on short drives, to check that it runs")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -111,28 +112,29 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tuple[TuningSet, TuningSet]:
-    """What is searched on, and what judges: simulated drives, or parts of one's own."""
+    """Return the drives to search on and to judge by: simulated ones, or parts of the given logs."""
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
     if objective == "interval":
         raise InputError("objective", "interval wants the true friction, which no log tells", "use predictive")
     logs = []
     for path in args.log:
-        vehicle = load_vehicle(args.vehicle or beside(path))
+        vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
         logs.append((read_log(path), vehicle))
-        warn_of_faults(*logs[-1])
+        warn_about_faults(*logs[-1])
     return own_drives(logs, duration_s)
 
 
 def _worth(score: Score, objective: str) -> float:
-    """What decides between the ways: the interval score where there is a truth, else the objective."""
+    """Return the score that decides between the searches: the interval score if the truth is known, else the
+    objective."""
     if score.interval_score is not None:
         return -score.interval_score
     return OBJECTIVES[objective](TuningScores(math.nan, math.nan, score.log_likelihood, score.nis_ratio))
 
 
 def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
-    """The study, written into a folder."""
+    """Run the study and write it into a folder."""
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:
@@ -167,7 +169,7 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 
 def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
-    """Random search and ant colony from the same start, with the same positions and budget."""
+    """Run random search and ant colony from the same start, with the same positions and budget."""
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
     for stream, (way, search) in enumerate((("random", random_search.optimise), ("colony", colony.optimise))):
@@ -187,7 +189,8 @@ def print_line(line: str) -> None:
 
 
 def reporter(way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]) -> Progress:
-    """Progress as one line per iteration: best, mean, elapsed and expected remaining time by `clock` [s]."""
+    """Return a function that prints one line per iteration: best, mean, elapsed and expected remaining time by `clock`
+    [s]."""
     began = clock()
 
     def log_line(line: Iteration) -> None:
@@ -229,7 +232,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def table(scores: dict[str, SplitScores]) -> str:
-    """The comparison as plain text, a row per way and set of drives."""
+    """Return the comparison as plain text, one row per search and set of drives."""
     lines = [f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"]
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):

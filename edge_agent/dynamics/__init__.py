@@ -1,1 +1,1 @@
-"""Vehicle and tyre equations as compiled scalar functions; they know no filter, no file and no clock."""
+"""Vehicle and tyre equations as compiled scalar functions, independent of filters, files and clocks."""

@@ -1,8 +1,4 @@
-"""Body and four tyres together: what the vehicle would feel in a state, for given steering, wheel speeds and friction.
-
-Legend: v_x, v_y velocity of the centre of gravity [m/s], r yaw rate [rad/s], a_x, a_y accelerations [m/s^2], mu peak
-adhesion per wheel [1], delta steering [rad], omega wheel speed [rad/s], F_x, F_y forces in the wheel's frame [N].
-"""
+"""Body and four tyres together: the accelerations of a vehicle for given state, steering, wheel speeds and friction."""
 
 from __future__ import annotations
 
@@ -67,7 +63,7 @@ def tyre_forces(
 
 
 class PlanarMotion(NamedTuple):
-    """How the body moves."""
+    """Motion of the body."""
 
     vx: float
     vy: float
@@ -77,7 +73,7 @@ class PlanarMotion(NamedTuple):
 
 
 class WheelInputs(NamedTuple):
-    """What acts on the four wheels."""
+    """Inputs of the four wheels."""
 
     cos: Four  # of the steering
     sin: Four

@@ -1,7 +1,4 @@
-"""A vehicle as one row of numbers for the compiled kernels.
-
-Legend of the row (index, meaning, unit): see `Parameter`. All values are nominal.
-"""
+"""Parameters of a vehicle as one row of numbers for the compiled kernels."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
 
 
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
-    """One row per vehicle, shape (N, 12); a fleet of one model is looked at once."""
+    """Return one row per vehicle, shape (N, 12); a repeated vehicle is converted once."""
     models = {id(vehicle): vehicle for vehicle in vehicles}
     place = {model: k for k, model in enumerate(models)}
     rows = np.stack([parameter_row(vehicle) for vehicle in models.values()])
@@ -69,7 +66,7 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 
 class Body(NamedTuple):
-    """What body and tyres take of a row, as numbers and not in an array: see `inlined`."""
+    """Parameters that body and tyres use, as numbers and not as an array: see `inlined`."""
 
     mass: float
     yaw_inertia: float

@@ -47,7 +47,7 @@ from edge_agent.filters.sigma import cubature
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-from schemas.runtime.records import Nothing, records
+from schemas.runtime.records import EmptyRecord, records
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
@@ -70,17 +70,17 @@ class JointMemory(FederatedMemory):
 
 def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
     """N of these filters."""
-    return EstimatorBank(new_filters(JointMemory, vehicles), records(Nothing, 1), KERNEL, columns=FOUR_FRICTIONS)
+    return EstimatorBank(new_filters(JointMemory, vehicles), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS)
 
 
 @compiled
-def _begin(memory: JointMemory, nothing: Nothing) -> None:  # noqa: ARG001 as of all filters
+def _begin(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
     begin_motion(memory)
     memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5
 
 
 @compiled
-def _step(memory: JointMemory, nothing: Nothing, dt: float) -> bool:  # noqa: ARG001
+def _step(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     motion = memory.motion
     memory.yaw_rate = motion.mean[PlanarState.YAW_RATE]
     step_motion(memory, memory.mean, dt)
@@ -157,7 +157,7 @@ def _measure(
 
 
 @compiled
-def _report(memory: JointMemory, nothing: Nothing, output: FloatArray) -> float:  # noqa: ARG001
+def _report(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
     write_states(output, memory.motion.mean, memory.motion.root, PlanarState.YAW_RATE)
     for wheel in range(WHEELS):
         std = math.sqrt(variance(memory.root, wheel))

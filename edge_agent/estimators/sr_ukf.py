@@ -58,7 +58,7 @@ from edge_agent.filters.sigma import unscented
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-from schemas.runtime.records import Nothing, records
+from schemas.runtime.records import EmptyRecord, records
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
@@ -94,11 +94,13 @@ class UnscentedMemory(PaperMemory):
 
 def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
     """N of these filters."""
-    return EstimatorBank(new_filters(UnscentedMemory, vehicles), records(Nothing, 1), KERNEL, columns=FOUR_FRICTIONS)
+    return EstimatorBank(
+        new_filters(UnscentedMemory, vehicles), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS
+    )
 
 
 @compiled
-def _begin(memory: UnscentedMemory, nothing: Nothing) -> None:  # noqa: ARG001 as of all filters
+def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
     mean, root, X = memory.mean, memory.root, WheelFrictionState
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
@@ -130,7 +132,7 @@ def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> 
 
 
 @compiled
-def _step(memory: UnscentedMemory, nothing: Nothing, dt: float) -> bool:  # noqa: ARG001
+def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     row, track, mean, root = memory.row, memory.track, memory.mean, memory.root
     use, first = track.inputs, WheelFrictionState.MU
     count = XI.shape[0]
@@ -201,7 +203,7 @@ def _measure(memory: UnscentedMemory, dt: float, share: float, points: FloatArra
 
 
 @compiled
-def _report(memory: UnscentedMemory, nothing: Nothing, output: FloatArray) -> float:  # noqa: ARG001
+def _report(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
     mean, root, first = memory.mean, memory.root, WheelFrictionState.MU
     write_states(output, mean, root, WheelFrictionState.YAW_RATE)
     for wheel in range(4):

@@ -1,1 +1,1 @@
-"""Sigma rules and square roots of covariances: the one core that every estimator is assembled from."""
+"""Sigma rules and square roots of covariances: the core of every estimator."""

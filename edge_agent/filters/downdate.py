@@ -1,8 +1,4 @@
-"""Taking a rank away from a covariance factor, and refusing where the covariance does not hold so much.
-
-Legend: L sqrt_cov, lower triangular (n, n); v a column (n,); wanted L_new*L_new' = L*L' - v*v'.
-The difference is positive definite exactly when |L^-1*v| < 1 (Golub and Van Loan, Matrix Computations, section 6.5.4).
-"""
+"""Removal of a rank from a covariance factor, refused if the covariance does not contain it."""
 
 from __future__ import annotations
 

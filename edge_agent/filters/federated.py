@@ -1,17 +1,4 @@
-"""The federated filter's two acts: the master shares its information out, and fuses what the sub-filters make of it.
-
-Legend
-    P, L        covariance and its factor sqrt_cov, P = L*L'         (n, n)
-    beta        share of the information of one sub-filter [1]; the shares sum to one
-    x_i, L_i    estimate of sub-filter i                             (n,), (n, n)
-
-Shared: P_i = P/beta_i (papers 000 and 001, equation 16). Fused: P = (P_1^-1 + P_2^-1)^-1,
-x = P*(P_1^-1*x_1 + P_2^-1*x_2) (equations 49 and 50, the latter with P where its inverse is printed).
-Carlson's condition sum beta = 1 makes fuse(share) the identity.
-
-Fusing is done as an update of x_1 by a measurement x_2 of the whole state with noise P_2, which is the same and needs
-no inverse: [[L_1, L_2], [L_1, 0]] becomes [[S^1/2, 0], [P_1*S^-T/2, L]].
-"""
+"""The two operations of a federated filter: the master shares its information, and fuses the sub-filters' results."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Observations → batches → outbox on disk → Zenoh; acknowledgements."""
+"""Publication: observations → batches → outbox on disk → Zenoh; acknowledgements."""

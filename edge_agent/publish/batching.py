@@ -1,4 +1,4 @@
-"""Records -> batches: columns gathered per (vehicle, kind, region) until a batch is due. Pure; time comes in.
+"""Batching: records become columns per (vehicle, kind, region) until a batch is due. Pure; time is an argument.
 
 A batch is due when it is full, when its oldest record has waited long enough, or at once when a record is urgent.
 """
@@ -25,7 +25,7 @@ UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
 
 @dataclass(frozen=True)
 class Draft:
-    """A batch that has no name yet; `encode(seq, first_held)` gives its payload."""
+    """Batch without a number; `encode(seq, first_held)` returns its payload."""
 
     vehicle: str
     kind: Kind
@@ -49,7 +49,7 @@ class _Group:
 
 
 class Batcher:
-    """Gathers records of the named vehicles; `rows` at the most in a batch, `flush_s` the longest wait."""
+    """Collects records of the named vehicles; at most `rows` per batch, waiting at most `flush_s`."""
 
     def __init__(self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int) -> None:
         self._names, self._boot, self._estimator = tuple(names), boot, estimator
@@ -58,11 +58,11 @@ class Batcher:
 
     @property
     def records(self) -> int:
-        """Records that wait for their batch."""
+        """Return the number of waiting records."""
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:
-        """Take records; rows of one vehicle and region keep their order. IndexError for an unknown vehicle."""
+        """Add records; rows of one vehicle and region keep their order. IndexError for an unknown vehicle."""
         if not len(records.vehicle):
             return
         if records.vehicle.min() < 0 or records.vehicle.max() >= len(self._names):
@@ -82,7 +82,7 @@ class Batcher:
             group.urgent |= bool(records.urgent[chosen].any())
 
     def due(self, now: float, *, everything: bool = False) -> list[Draft]:
-        """Take out the batches that are due."""
+        """Remove and return the batches that are due."""
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
             whole = everything or group.urgent or now - group.since >= self._flush_s
@@ -101,11 +101,12 @@ class Batcher:
     def _draft(self, place: _Place, columns: Columns) -> Draft:
         name = self._names[place.vehicle]
         batch = Batch(place.kind, name, self._boot, place.region, UNNUMBERED, UNNUMBERED, columns, self._estimator)
-        return Draft(name, place.kind, place.region, batch.rows, partial(_encoded, batch))
+        return Draft(name, place.kind, place.region, batch.rows, partial(_encode_batch, batch))
 
 
 def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """First and last place of each batch: so many rows, and no longer a time, as a drive that is filled in has it."""
+    """Yield the first and last position of each batch, limited in rows and in time span (a replayed drive can be
+    long)."""
     first = 0
     for at in range(1, ready + 1):
         if at == ready or at - first == rows or abs(int(time[at]) - int(time[first])) > SPAN_NS:
@@ -117,6 +118,6 @@ def _slice(columns: Columns, first: int, last: int) -> Columns:
     return {name: column[first:last] for name, column in columns.items()}
 
 
-def _encoded(batch: Batch, seq: int, first_held: int) -> bytes:
-    """The bytes of a batch that the outbox has given its number."""
+def _encode_batch(batch: Batch, seq: int, first_held: int) -> bytes:
+    """Return the payload of a batch with the number from the outbox."""
     return encode(replace(batch, seq=seq, first_held=first_held))

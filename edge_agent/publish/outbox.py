@@ -1,14 +1,14 @@
-"""Batches on disk until they are acknowledged: the agent's half of "nothing lost, nothing twice".
+"""Outbox: batches on disk until they are acknowledged, so that no report is lost or counted twice.
 
-A batch is committed here before it is put on the network and leaves only when the service has settled it.
-A batch is named by its stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each stream;
-`boot` is random per start, so that a restarted agent opens new streams and never reuses a name.
-Batches that an earlier start left behind are resent under their old name.
+A batch is committed here before it is sent and is removed only when the service has settled it. It is identified by its
+stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each stream. `boot` is random per start, so a
+restarted agent opens new streams and never reuses a name. Batches of an earlier start are sent again under their old
+name.
 
-Bounded: when the payloads exceed the capacity the oldest states go first, then the oldest observations,
-and both are counted. SQLite in WAL mode with a sync per commit; the exclusive lock of the database file is
-held as long as the outbox is open, so that one file never serves two agents.
-Time is monotonic seconds and comes in as an argument.
+The size is bounded: when the payloads exceed the capacity, the oldest states are dropped first, then the oldest
+observations, and both are counted. SQLite runs in WAL mode with a sync per commit. The exclusive lock of the database
+file is held while the outbox is open, so that one file never serves two agents. Time is an argument, in monotonic
+seconds.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 
 class Stream(NamedTuple):
-    """What `seq` counts in: one vehicle, one start, one kind of record, one region (z10 quadint)."""
+    """Numbering scope of `seq`: one vehicle, one start, one kind of record, one region (z10 quadint)."""
 
     vehicle: str
     boot: int
@@ -51,7 +51,7 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """A batch that is on disk and not settled; `fresh` ones are to be put now, others wait for `due`."""
+    """Unsettled batch on disk; send `fresh` ones now, others when `due` returns them."""
 
     key: int
     stream: Stream
@@ -63,7 +63,7 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Records that went through, by what became of them."""
+    """Records by result."""
 
     stored: int = 0
     settled: int = 0
@@ -75,7 +75,7 @@ class OutboxCounts:
 
 @dataclass(slots=True)
 class _Entry:
-    """What is known of a batch without its payload; it flies while it is `due` at some time."""
+    """State of a batch without its payload; it is in flight while `due` has a time."""
 
     stream: Stream
     seq: int
@@ -87,7 +87,7 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Seqs of one stream: the next to give and those still held. All its entries share the stream's name."""
+    """Seqs of one stream: the next number and those still held. All its entries share the stream's name."""
 
     stream: Stream
     next: int = 1
@@ -95,14 +95,15 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Lowest seq still held, or the next one when nothing is; settled seqs are stepped over once."""
+        """Return the lowest seq still held, or the next one if none is; settled seqs are skipped once."""
         while self.first < self.next and self.first not in self.held:
             self.first += 1
         return self.first
 
 
 class Outbox:
-    """One agent process' unsettled batches. Raises InputError when the file is another agent's or no outbox."""
+    """Unsettled batches of one agent process. Raises InputError if the file belongs to another agent or is no
+    outbox."""
 
     def __init__(
         self,
@@ -130,7 +131,7 @@ class Outbox:
         self._restore()
 
     def _restore(self) -> None:
-        """Take up what an earlier start left; all of it is due at once."""
+        """Load the batches of an earlier start; all are due at once."""
         rows = self._database.execute(
             "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch ORDER BY id"
         )
@@ -139,14 +140,14 @@ class Outbox:
             self._pacer(self._entries[key]).wait(key)
         self._evict()
 
-    def mend(self) -> None:
-        """Go on in a new file with what can be read of the present one, which is damaged.
+    def recover(self) -> None:
+        """Continue in a new file with the readable content of the current, damaged one.
 
-        Raises sqlite3.Error or OSError when the disk refuses; then it can be done again.
+        Raises sqlite3.Error or OSError if the disk refuses; the call may then be repeated.
         """
         self._database.close()
         before = sum(entry.records for entry in self._entries.values())
-        self._database, _ = spool_file.mended(self._path)
+        self._database, _ = spool_file.recover_file(self._path)
         self.counts.damages += 1
         own = {stream: sequence for stream, sequence in self._streams.items() if stream.boot == self.boot}
         for sequence in own.values():
@@ -180,23 +181,23 @@ class Outbox:
         if not sequence.held and entry.stream.boot != self.boot:
             del self._streams[entry.stream]
         if entry.due is not None:
-            self._pacer(entry).settled()
+            self._pacer(entry).record_settled()
         self._bytes -= entry.size
         self._deletable.append(key)
         return entry
 
     @property
     def batches(self) -> int:
-        """Batches held."""
+        """Number of held batches."""
         return len(self._entries)
 
     def records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
-        """Records in the held batches of some vehicles, of one kind or of all."""
+        """Return the number of records in held batches of some vehicles, of one kind or of all."""
         held = list(self._entries.values())
         return sum(e.records for e in held if e.stream.vehicle in vehicles and kind in (None, e.stream.kind))
 
     def stranded(self, vehicles: Collection[str]) -> int:
-        """Records in held batches of other vehicles than these: of a former name, which nobody sends."""
+        """Return the number of records of other vehicles than these: of a former name, which is not sent."""
         return sum(e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles)
 
     @property
@@ -205,14 +206,14 @@ class Outbox:
         return self._bytes
 
     def unanswered_s(self, now: float) -> float:
-        """For how long nothing was answered that was put, in the region that waits longest [s]."""
+        """Return for how long nothing sent was answered, in the region that waits longest [s]."""
         since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
         return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Name the drafts and commit them in one transaction; nothing changes when the commit fails.
+        """Number the drafts and commit them in one transaction; nothing changes if the commit fails.
 
-        Raises sqlite3.Error when the disk refuses.
+        Raises sqlite3.Error if the disk refuses.
         """
         ahead: dict[Stream, int] = {}
         with self._database:
@@ -228,7 +229,7 @@ class Outbox:
                 pacer.wait(batch.key)
                 held[place] = replace(batch, fresh=False)
             else:
-                self._fly(batch.key, now)
+                self._mark_in_flight(batch.key, now)
         self._evict()
         return [batch for batch in held if batch.key in self._entries]
 
@@ -248,23 +249,23 @@ class Outbox:
             raise sqlite3.DatabaseError("an insert gave no row id")
         return StoredBatch(key, stream, seq, draft.records, payload)
 
-    def _fly(self, key: int, now: float) -> None:
-        """A batch is put now; how long its answer is waited for."""
+    def _mark_in_flight(self, key: int, now: float) -> None:
+        """Mark a batch as in flight, and set the time of its next resend."""
         entry = self._entries[key]
         delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
         entry.attempts += 1
         entry.due = now + delay * self._jitter()
         heapq.heappush(self._later, (entry.due, key))
-        self._pacer(entry).fly(now)
+        self._pacer(entry).record_sent(now)
 
     def _jitter(self) -> float:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def reoffer(self, vehicle: str, now: float) -> None:
-        """What a vehicle had put is lost: it has just found a router again."""
+        """Treat everything a vehicle had in flight as lost: it has just found a router again."""
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
-                pacer.reconnected(now)
+                pacer.record_reconnect(now)
         for _, key in self._later:
             entry = self._entries.get(key)
             if entry is not None and entry.stream.vehicle == vehicle and entry.due is not None:
@@ -272,7 +273,7 @@ class Outbox:
                 self._pacer(entry).wait(key)
 
     def _evict(self) -> None:
-        """Keep within the capacity: oldest state first, then oldest observation."""
+        """Keep within the capacity: drop the oldest state first, then the oldest observation."""
         for kind in EVICTION_ORDER:
             while self._bytes > self.capacity_bytes and self._oldest[kind]:
                 key = self._oldest[kind].popleft()
@@ -283,41 +284,42 @@ class Outbox:
         self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable])
 
     def delete_settled(self) -> None:
-        """Take what has left off the disk too, without waiting for the next `store`. Raises sqlite3.Error."""
+        """Delete settled batches from the disk now, without waiting for the next `store`. Raises sqlite3.Error."""
         if self._deletable:
             with self._database:
                 self._delete()
             self._deletable.clear()
 
     def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
-        """Drop the batches of inclusive seq ranges; returns the records settled. Unknown seqs are ignored.
+        """Remove the batches of inclusive seq ranges; return the number of records. Unknown seqs are ignored.
 
-        The rows go with the next `store` or `delete_settled`, so that an acknowledgement costs no sync of its own; a
-        batch that a crash brings back is sent again, and the service knows it.
+        The rows are deleted with the next `store` or `delete_settled`, so that an acknowledgement costs no sync. A
+        batch that a crash restores is sent again, and the service recognises it.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
             return 0
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
-            pacer.answered()
+            pacer.record_answer()
         keys = {key for first, last in ranges for key in _within(sequence.held, first, last)}
         records = sum(self._forget(key).records for key in keys)
         self.counts.settled += records
         return records
 
     def due(self, now: float, limit: int, vehicles: Collection[str] | None = None) -> list[StoredBatch]:
-        """At most `limit` batches to be put now, oldest first, of these vehicles or of all; `pacing` says how many.
+        """Return at most `limit` batches to send now, oldest first, of these vehicles or of all; `pacing` decides how
+        many.
 
-        Raises sqlite3.Error when the disk refuses.
+        Raises sqlite3.Error if the disk refuses.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)
             entry = self._entries.get(key)
             if entry is not None and entry.due == at:
                 entry.due = None
-                self._pacer(entry).unanswered(now, self._jitter())
-                if self._passed_over(entry):
+                self._pacer(entry).record_timeout(now, self._jitter())
+                if self._is_passed_over(entry):
                     self.counts.unanswered += self._forget(key).records
                 else:
                     self._pacer(entry).wait(key)
@@ -326,23 +328,23 @@ class Outbox:
             if vehicles is None or vehicle in vehicles:
                 taken = pacer.take(now, self._jitter(), limit - len(keys), self._entries)
                 for key in taken:
-                    self._fly(key, now)
+                    self._mark_in_flight(key, now)
                 keys += taken
         self._pacers = {name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent}
         return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
 
-    def _passed_over(self, entry: _Entry) -> bool:
-        """Whether PASSED_OVER later batches of the stream were settled, and this one, the oldest, was not."""
+    def _is_passed_over(self, entry: _Entry) -> bool:
+        """Return True if PASSED_OVER later batches of the stream were settled and this one, the oldest, was not."""
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)
         return later >= PASSED_OVER and sequence.first_held() == entry.seq
 
-    def held(self) -> list[StoredBatch]:
-        """All batches that are held, oldest first. Raises sqlite3.Error."""
+    def held_batches(self) -> list[StoredBatch]:
+        """Return all held batches, oldest first. Raises sqlite3.Error."""
         return [batch for key in list(self._entries) if (batch := self._read(key)) is not None]
 
     def _read(self, key: int) -> StoredBatch | None:
-        """A batch with its payload; None, and counted, where damage took its row."""
+        """Return a batch with its payload; None, and count it, if damage removed its row."""
         entry = self._entries[key]
         query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
@@ -352,7 +354,7 @@ class Outbox:
         return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
 
     def close(self) -> None:
-        """Release the file. Raises sqlite3.Error when the disk refuses the last deletions."""
+        """Release the file. Raises sqlite3.Error if the disk refuses the last deletions."""
         try:
             self.delete_settled()
         finally:
@@ -360,7 +362,7 @@ class Outbox:
 
 
 def _within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Keys of the held seqs in [first, last], without walking a hostile range."""
+    """Return the keys of held seqs in [first, last], without iterating over a hostile range."""
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]
     return [key for seq, key in held.items() if first <= seq <= last]

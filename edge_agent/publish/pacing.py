@@ -1,11 +1,10 @@
-"""How fast one vehicle's batches for one region may be put: what nobody answers is not put again and again. Pure.
+"""Pacing of one vehicle's batches for one region, so that unanswered batches do not flood the network. Pure.
 
-Open, while acknowledgements come: fresh batches go at once, and of those that wait so many are in flight as a window
-allows, which grows with each that is settled and is halved when one is not answered in time (slow start and congestion
-avoidance as in Jacobson, 1988: what is lost on the way shows that somebody is overrun).
-Silent, when nothing was answered for SILENT_S: fresh batches stay on disk, and a single one is put now and then as a
-probe, after waits that double up to LONGEST_PROBE_S. The first acknowledgement opens the route again.
-Time is monotonic seconds.
+Open, while acknowledgements arrive: fresh batches are sent at once. Of waiting batches, as many are in flight as a
+window allows. The window grows with each settled batch and is halved when one is not answered in time (slow start and
+congestion avoidance, Jacobson 1988: loss indicates overload). Silent, when nothing was answered for SILENT_S: fresh
+batches stay on disk, and a single one is sent as a probe at intervals that double up to LONGEST_PROBE_S. The first
+acknowledgement opens the route again. Time is monotonic seconds.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ HALVED_S: Final = 2.0  # all that is lost at once is one sign
 
 
 class Pacer:
-    """One vehicle's way to the service of one region.
+    """Pacing of one vehicle towards the service of one region.
 
     Attributes:
-        flying: batches that were put and neither answered nor given up.
-        silent: whether nothing answers.
+        flying: batches in flight, neither answered nor given up.
+        silent: True if nothing answers.
     """
 
     __slots__ = (
@@ -61,39 +60,39 @@ class Pacer:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing flies and nothing waits."""
+        """True if nothing is in flight and nothing waits."""
         return not self.flying and not self._waiting
 
     @property
     def unanswered_since(self) -> float | None:
-        """Since when something was put and nothing answered; None: nothing is owed."""
+        """Return since when sent batches are unanswered; None if none are."""
         return self._unanswered_since
 
     def wait(self, key: int) -> None:
-        """Let a batch wait for its turn; lower keys are older and go first."""
+        """Queue a batch; lower keys are older and are sent first."""
         heapq.heappush(self._waiting, key)
 
-    def fly(self, now: float) -> None:
-        """A batch is put."""
+    def record_sent(self, now: float) -> None:
+        """Record that a batch was sent."""
         self.flying += 1
         if self._unanswered_since is None:
             self._unanswered_since = now
 
-    def settled(self) -> None:
-        """A batch that flew was answered."""
+    def record_settled(self) -> None:
+        """Record that a batch in flight was answered."""
         self.flying -= 1
         grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
         self._window = min(grown, LARGEST_WINDOW)
 
-    def answered(self) -> None:
-        """An acknowledgement came, of whatever batch."""
+    def record_answer(self) -> None:
+        """Record that any acknowledgement arrived."""
         self._answered = True
         if self.silent:
             self.silent, self._window, self._sure = False, FIRST_WINDOW, LARGEST_WINDOW
             self._stale = self.flying
 
-    def unanswered(self, now: float, jitter: float) -> None:
-        """A batch that flew was not answered in time."""
+    def record_timeout(self, now: float, jitter: float) -> None:
+        """Record that a batch in flight was not answered in time."""
         self.flying -= 1
         if self.silent:
             return
@@ -106,13 +105,13 @@ class Pacer:
             self._halved, self._window = now, max(self._window / 2.0, LEAST_WINDOW)
             self._sure = self._window
 
-    def reconnected(self, now: float) -> None:
-        """A router is there again: what flew is lost, and a silent route is tried at once."""
+    def record_reconnect(self, now: float) -> None:
+        """Record that a router is available again: batches in flight are lost, and a silent route is probed at once."""
         self.flying, self._unanswered_since = 0, None
         self._probe_at, self._probe_s = now, FIRST_PROBE_S
 
     def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
-        """Keys of the batches to be put now, at most so many, oldest first; those not `held` are gone."""
+        """Return the keys of at most `most` batches to send now, oldest first; keys that are not `held` are dropped."""
         if self._answered:
             self._answered, self._unanswered_since = False, now if self.flying else None
         if self.silent:
@@ -126,7 +125,7 @@ class Pacer:
         return out
 
     def _probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """The oldest batch and the newest in turn: one that nobody can read must not stand for all."""
+        """Return the oldest or the newest batch in turn, so that an unreadable one does not block the route."""
         if now < self._probe_at:
             return []
         self._waiting = sorted({key for key in self._waiting if key in held})

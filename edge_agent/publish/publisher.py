@@ -1,8 +1,8 @@
-"""The thread between the estimation loop and the network: batch, outbox, put, settle, resend.
+"""Publisher: the thread between the estimation loop and the network: batch, store, send, settle, resend.
 
-The loop only ever does `offer`, which cannot block: disk and network are touched by the sender thread alone.
-Every batch is on disk before it is put, and stays there until the service has settled it.
-Sessions are opened by a second thread, which waits for the routers as long as it takes.
+The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every batch is on disk
+before it is sent, and stays there until the service has settled it. A second thread opens the sessions and waits for
+the routers as long as necessary.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Counts:
-    """Records by kind and by what became of them."""
+    """Records by kind and by result."""
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     published: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
@@ -55,9 +55,9 @@ class Counts:
 
 
 class Publisher:
-    """Publishes records of the named vehicles; row `vehicle` of the records is an index into `names`.
+    """Publishes records of the named vehicles; column `vehicle` of the records is an index into `names`.
 
-    `on_open` is called with each vehicle's session once it is open, for what else the vehicle has to say or to hear.
+    `on_open` is called with each vehicle's session when it is open, for other publications and subscriptions.
     """
 
     def __init__(
@@ -88,63 +88,63 @@ class Publisher:
         self.counts = Counts()
 
     def start(self) -> None:
-        """Begin to open sessions and to send."""
+        """Start to open sessions and to send."""
         self._connector.start()
         self._sender.start()
 
     @property
     def links(self) -> int:
-        """Sessions that are open."""
+        """Number of open sessions."""
         return len(self._links)
 
     @property
     def cut_off(self) -> bool:
-        """Whether a session that is open has no router."""
+        """True if an open session has no router."""
         return not all(list(self._connected.values()))
 
     @property
     def unanswered_s(self) -> float:
-        """For how long nothing was answered that was put [s]."""
+        """Time for which nothing sent was answered [s]."""
         return self._outbox.unanswered_s(self._clock())
 
     @property
     def stranded(self) -> int:
-        """Records in the outbox under names that are not these vehicles': of a former name."""
+        """Records in the outbox under names of other vehicles: of a former name."""
         return self._outbox.stranded(self._names)
 
     @property
     def fill(self) -> float:
-        """Share of the outbox that is full."""
+        """Used share of the outbox."""
         return self._outbox.bytes / self._outbox.capacity_bytes
 
     @property
     def unanswered(self) -> int:
-        """Records of batches that were given up: only later ones were answered."""
+        """Records of batches that were given up, because only later ones were answered."""
         return self._outbox.counts.unanswered
 
     @property
     def damage(self) -> tuple[int, int]:
-        """How often the outbox was found damaged, and the records known to be lost by it."""
+        """Number of times that the outbox was found damaged, and records known to be lost by it."""
         return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
     def broken(self) -> bool:
-        """Whether the thread that sends has died: records are taken, and dropped once there is no room for more."""
+        """True if the sending thread has died: records are accepted, and dropped when there is no room."""
         return self._sender.ident is not None and not self._sender.is_alive() and not self._closing.is_set()
 
     def unsettled(self, kind: Kind | None = None) -> int:
-        """Records that are not settled yet: in the outbox, also of an earlier start, or on their way to it."""
+        """Return the number of unsettled records: in the outbox, also of an earlier start, or on their way to it."""
         counts, kinds = self.counts, Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
         return coming + self._outbox.records(self._names, kind)
 
     @property
     def dropped(self) -> int:
-        """Records given up for want of room, in the queue or in the outbox."""
+        """Records dropped for lack of room, in the queue or in the outbox."""
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def offer(self, *blocks: RecordBlock) -> None:
-        """Hand records over; never blocks. What does not fit is dropped and counted."""
+        """Queue records; never blocks. Records that do not fit are dropped and counted."""
         for records in blocks:
             if not len(records.vehicle):
                 continue
@@ -155,7 +155,7 @@ class Publisher:
                 self.counts.dropped[records.kind] += len(records.vehicle)
 
     def close(self, within_s: float) -> bool:
-        """Flush, wait for acknowledgements at most `within_s`, leave; False when something hung and was left behind."""
+        """Flush, wait at most `within_s` for acknowledgements, stop; False if something hung and was abandoned."""
         self._deadline = self._clock() + within_s
         self._closing.set()
         self._sender.join(within_s + CLOSE_GRACE_S)
@@ -193,7 +193,7 @@ class Publisher:
                 self._round()
             except sqlite3.Error as error:
                 if is_damage(error):
-                    self._mend()
+                    self._recover_outbox()
                 else:
                     log.warning("the outbox cannot be read or tidied (%s); trying again", error)
                 self._stopped.wait(TICK_S)
@@ -205,16 +205,16 @@ class Publisher:
     def _round(self) -> None:
         self._take()
         self._settle()
-        self._look()
+        self._check_connections()
         self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
         self._store()
         self._outbox.delete_settled()
         self._resend()
 
-    def _mend(self) -> None:
-        """The outbox is damaged while it is in use: save what can be read, and go on."""
+    def _recover_outbox(self) -> None:
+        """Save the readable content of an outbox that was damaged during use, and continue."""
         try:
-            self._outbox.mend()
+            self._outbox.recover()
         except (sqlite3.Error, OSError) as error:
             log.warning("the damaged outbox cannot be mended (%s); trying again", error)
 
@@ -240,7 +240,7 @@ class Publisher:
             log.exception("%d records that nobody can send are dropped", len(records.vehicle))
 
     def _store(self) -> None:
-        """Commit what waits, then put it. A disk that refuses is tried again with the next round."""
+        """Commit waiting records, then send them. A disk that refuses is tried again in the next round."""
         if not self._waiting:
             return
         try:
@@ -265,7 +265,7 @@ class Publisher:
                 self._links[batch.stream.vehicle].put(batch)
 
     def _drop_unwritable(self) -> None:
-        """Give up the drafts that protobuf refuses, and no other."""
+        """Drop only the drafts that protobuf refuses."""
         waiting, self._waiting = self._waiting, []
         for draft in waiting:
             try:
@@ -282,7 +282,7 @@ class Publisher:
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
     def _compare_clocks(self, reported: int) -> None:
-        """Hold our clock against that of a service [ns], 0 if it does not tell; an ack is some second old."""
+        """Compare our clock with that of a service [ns], 0 if unknown; an acknowledgement is about a second old."""
         if not reported:
             return
         behind = (reported - self._wall()) / NS
@@ -290,8 +290,9 @@ class Publisher:
             log.warning("the clock is %.0f s behind the service's: reports come late, or are refused", behind)
         self.clock_behind_s = behind
 
-    def _look(self) -> None:
-        """Who has a router: what was put while there was none is lost, and is put anew as soon as there is one."""
+    def _check_connections(self) -> None:
+        """Check for each vehicle whether it has a router. Batches sent without one are lost and are sent again when one
+        is found."""
         if self._clock() - self._checked_at < CHECK_S and len(self._connected) == len(self._links):
             return
         self._checked_at = self._clock()

@@ -1,7 +1,7 @@
-"""Rows of a damaged SQLite file, read page by page without its tree. Pure: bytes in, rows out.
+"""Recovery of rows from a damaged SQLite file, page by page without its tree. Pure: bytes in, rows out.
 
-After "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1 (write-ahead log). What
-is read may be torn, deleted or older than another copy; who calls checks it, which is why batches carry a checksum.
+After "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1 (write-ahead log). A
+recovered row may be torn, deleted or older than another copy. The caller must verify it, so batches have a checksum.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _LARGEST: Final = 1 << 20  # bytes of a row; a batch has less than a tenth
 Value = int | str | bytes | None
 
 
-def rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
-    """Row id and columns of every cell that is whole, those of the write-ahead log first, from its end on."""
+def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
+    """Yield row id and columns of every intact cell; the cells of the write-ahead log first, from its end on."""
     pages = {at // PAGE + 1: database[at : at + PAGE] for at in range(0, len(database), PAGE)}
     newer = [
         (int.from_bytes(log[at : at + 4], "big"), log[at + _FRAME : at + _FRAME + PAGE])

@@ -1,6 +1,6 @@
-"""The SQLite file of an outbox: opened for one agent alone; a damaged one is set aside, and what is readable saved.
+"""SQLite file of an outbox: opened exclusively; a damaged one is set aside, and its readable batches are saved.
 
-A batch carries a checksum of its name and its bytes, since SQLite does not notice a bit that changed within them.
+A batch has a checksum of its name and its bytes, because SQLite does not detect changed bits in them.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ Row = tuple[object, ...]
 
 
 def checksum(name: Row, payload: bytes) -> int:
-    """CRC-32 of a batch's name (the columns NAME) and bytes."""
+    """Return the CRC-32 of a batch's name (the columns NAME) and bytes."""
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Whether an error says that the file is damaged, and not that the disk is full or slow."""
+    """Return True if an error means a damaged file, and not a full or slow disk."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
 
 
 def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """The file, checked and for this process alone; and where a damaged one was set aside, from which it was saved.
+    """Return the file, checked and locked for this process, and the path to which a damaged one was set aside.
 
     Raises:
-        InputError: the file is another agent's or no outbox, or the place cannot be used.
+        InputError: the file belongs to another agent or is no outbox, or the path cannot be used.
     """
     try:
         make_folder(path.parent)
@@ -60,7 +60,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
             if not is_damage(error) or not _ours(path):
                 raise
             log.warning("the outbox %s is damaged (%s): set aside, and what can be read is saved", path, error)
-            return mended(path)
+            return recover_file(path)
     except (sqlite3.Error, OSError) as error:
         if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
             raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
@@ -68,10 +68,10 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
         raise InputError("spool", problem, "name a writable place, or move the file aside") from error
 
 
-def mended(path: Path) -> tuple[sqlite3.Connection, Path]:
-    """A new file with what can be read of a damaged one, which is set aside.
+def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
+    """Return a new file with the readable content of a damaged one, which is set aside.
 
-    Raises sqlite3.Error or OSError when the disk refuses.
+    Raises sqlite3.Error or OSError if the disk refuses.
     """
     aside = next(p for n in range(1, 10_000) if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists())
     for ending in ("-wal", "-shm", ""):  # its name last: a crash in between leaves it to be found damaged again
@@ -112,17 +112,17 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _ours(path: Path) -> bool:
-    """Whether a file was an outbox: its beginning is SQLite's but for a few bytes, or all of it is gone."""
+    """Return True if a file was an outbox: it begins like SQLite except for a few bytes, or is completely erased."""
     with path.open("rb") as file:
         begin = file.read(len(_MAGIC))
     return not any(begin) or sum(a == b for a, b in zip(begin, _MAGIC, strict=False)) >= _SIMILAR
 
 
 def _readable(path: Path) -> list[Row]:
-    """Batches of a damaged file by age, each once, whose checksum is right, or who are older than checksums."""
+    """Return the batches of a damaged file by age, each once, with a correct checksum or from before checksums."""
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}
-    for key, values in salvage.rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
+    for key, values in salvage.recover_rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
         values += [None] * (len(TYPES) - len(values))
         if len(values) != len(TYPES) or not all(isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)):
             continue

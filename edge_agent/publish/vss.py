@@ -1,9 +1,8 @@
-"""The friction where the car is, in the words of the Vehicle Signal Specification (COVESA VSS 4 and later).
+"""Friction at the car as signals of the Vehicle Signal Specification (COVESA VSS 4 and later).
 
 `Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion of 1: 50 %, 5 % and
-95 % quantiles, clipped at 100 as the standard wants. What is unknown is absent and never a default: a signal without a
-number is left out, and MostProbable also where less than EXCITED_SHARE of the grip was used within UTILISED_WINDOW_S,
-since then mu is mostly what was believed before.
+95 % quantiles, clipped at 100 as the standard requires. Unknown values are absent, never a default. MostProbable is
+also absent if less than EXCITED_SHARE of the grip was used within UTILISED_WINDOW_S, because mu is then mostly prior.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _TOPIC: Final = keys.TOPICS["vss"]
 
 
 def road_friction(mu: float, mu_lower: float, mu_upper: float, mu_utilised: float) -> dict[str, float]:
-    """The signals [%] that are known; {} where nothing is.
+    """Return the known signals [%]; {} if none is known.
 
     Args:
         mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
@@ -44,12 +43,12 @@ def road_friction(mu: float, mu_lower: float, mu_upper: float, mu_utilised: floa
 
 
 class RoadFrictionOutput:
-    """Tells the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh key.
+    """Reports the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh key.
 
     Args:
-        names: row k of what is told is vehicle k.
-        say: takes a line.
-        rate_hz: how often.
+        names: row k of the reported values is vehicle k.
+        say: called with a line.
+        rate_hz: reports per second.
     """
 
     def __init__(self, names: Sequence[str], say: Callable[[str], None], rate_hz: float) -> None:
@@ -58,14 +57,14 @@ class RoadFrictionOutput:
         self._due = 0
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """A vehicle's session is open."""
+        """Use a vehicle's session, which is open now."""
         self.publishers[name] = session.declare_publisher(
             keys.vss_key(name), encoding=ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
             congestion_control=zenoh.CongestionControl.DROP,
         )  # fmt: skip
 
     def tell(self, grip: Grip | None) -> None:
-        """What is believed now. Does not wait: a put that finds no room is dropped."""
+        """Report the current belief. Never waits: a message that finds no room is dropped."""
         if grip is None or int(grip.time.max()) < self._due:
             return
         now = int(grip.time.max())

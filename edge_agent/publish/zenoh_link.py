@@ -1,4 +1,4 @@
-"""One vehicle's Zenoh session: puts its batches, hears its acknowledgements, shows that it is alive."""
+"""Zenoh session of one vehicle: sends its batches, receives its acknowledgements, declares its liveliness token."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _QUALITY: Final = {
 
 
 class Link:
-    """An open `session` of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
+    """Open `session` of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
 
     def __init__(self, session: zenoh.Session, vehicle: str, on_ack: Callable[[str, bytes], None]) -> None:
         self.session = session
@@ -44,17 +44,17 @@ class Link:
     def open(
         settings: ZenohSettings, vehicle: str, on_ack: Callable[[str, bytes], None], stop: threading.Event
     ) -> Link | None:
-        """Wait for a router and open the session; None when `stop` was set before."""
+        """Wait for a router and open the session; None if `stop` was set before."""
         session = open_session(settings, stop, vehicle)
         return None if session is None else Link(session, vehicle, on_ack)
 
     @property
     def connected(self) -> bool:
-        """Whether a router is there now."""
+        """True if a router is connected now."""
         return bool(self.session.info.routers_zid())
 
     def put(self, batch: StoredBatch) -> bool:
-        """Put a batch; False when the session refuses. Nothing tells whether it arrives but the acknowledgement."""
+        """Send a batch; False if the session refuses. Only the acknowledgement proves that it arrived."""
         stream = batch.stream
         encoding, priority, congestion = _QUALITY[stream.kind]
         key = _KEY[stream.kind](stream.region, stream.vehicle)
@@ -66,5 +66,5 @@ class Link:
         return True
 
     def close(self) -> None:
-        """Close the session; an open one would hang the interpreter at its end."""
+        """Close the session; an open one would hang the interpreter at exit."""
         self.session.close()

@@ -1,4 +1,4 @@
-"""Where the questions run: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis tables."""
+"""Query engines: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis tables."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshot
 
 @dataclass
 class QueryEngine:
-    """A connection, and the files of one part of an archive.
+    """Connection to an engine, with the files of one part of an archive.
 
     Args:
         name: one of ENGINES.
         root: of the archive; only compacted files are read.
-        part: times and box wanted.
-        progress: whether the engine may draw its own progress bar.
+        part: selected times and box.
+        progress: True to let the engine draw its own progress bar.
 
     Raises:
         InputError: the engine is not installed.
@@ -62,7 +62,7 @@ class QueryEngine:
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
-        """Files of a table that may hold rows of the part; a snapshot counts until the day after its own."""
+        """Return the files of a table that may hold rows of the part; a snapshot counts until the day after its own."""
         before = 1 if table == "map" else 0
         first, last = self.part.since // layout.DAY_NS - before, self.part.until // layout.DAY_NS
         pattern = "*.parquet" if table == "map" else "*/*.parquet"
@@ -73,7 +73,7 @@ class QueryEngine:
         ]
 
     def observations(self) -> Table:
-        """Rows of observations of the part; `time` is in seconds since 1970, `day` a date.
+        """Return rows of observations of the part; `time` is in seconds since 1970, `day` a date.
 
         Raises:
             InputError: there are none.
@@ -91,7 +91,7 @@ class QueryEngine:
         return t
 
     def maps(self) -> Table:
-        """Rows of the snapshots of the map; `snapshot` is their time in seconds since 1970.
+        """Return rows of the snapshots of the map; `snapshot` is their time in seconds since 1970.
 
         Raises:
             InputError: there are none.
@@ -102,7 +102,7 @@ class QueryEngine:
         return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
 
     def rows(self) -> int:
-        """Rows of observations in the files, from their footers."""
+        """Return the number of rows of observations in the files, from their footers."""
         return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
 
     def answer(self, expression: Table) -> pa.Table:
@@ -111,7 +111,7 @@ class QueryEngine:
         return found
 
     def _read(self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*") -> Table:
-        """A table of files, with the whole seconds since 1970 of one column; the engines count them differently."""
+        """Return a table of files, with whole seconds since 1970 for one column; the engines count them differently."""
         texts = [str(path) for path in paths]
         if self._spark is None:
             quoted = ", ".join("'" + text.replace("'", "''") + "'" for text in texts)
@@ -129,9 +129,9 @@ class QueryEngine:
 
 
 def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Whether rows told a value of mu and not only a bound: they used EXCITED_SHARE of it (design of the wire).
+    """Return which rows give a value of mu and not only a bound: they used EXCITED_SHARE of it (see the contract).
 
-    NaN is larger than any number in both engines, so that it is asked for.
+    NaN is larger than any number in both engines, so it is checked explicitly.
     """
     share = ibis.literal(EXCITED_SHARE - _NEARLY, "float64")
     enough = t.mu_utilised.cast("float64") >= share * t.mu.cast("float64")

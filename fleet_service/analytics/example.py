@@ -1,7 +1,7 @@
-"""An example to start from: what a week of an archive says, in five figures.
+"""Example to start from: a week of an archive in five figures.
 
-python -m fleet_service.analytics.example --archive DIR --out FOLDER
-python -m fleet_service.analytics.example --out FOLDER            # of an archive that nobody drove
+python -m fleet_service.analytics.example --archive DIR --out FOLDER python -m fleet_service.analytics.example --out
+FOLDER            # of a synthetic archive
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ WORLD = synthetic.SyntheticFleet(rows=60_000, days=3, vehicles=60, roads=16, len
 
 
 def whole(root: Path) -> Extract:
-    """All days of an archive."""
+    """Return the selection of all days of an archive."""
     days = [layout.day_of(folder) for folder in layout.days(root, layout.TABLES[Kind.OBSERVATION])]
     return Extract(min(days) * layout.DAY_NS, (max(days) + 1) * layout.DAY_NS)
 
 
 def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
-    """Ask, draw, and return what was asked."""
+    """Ask, draw, and return the answers."""
     folder.mkdir(parents=True, exist_ok=True)
     engine = QueryEngine("duckdb", root, whole(root))
     middle = (engine.part.since + engine.part.until) // 2

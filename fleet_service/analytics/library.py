@@ -1,4 +1,4 @@
-"""The archive asked by a program: an answer is an Arrow table, and pandas, polars and DuckDB are one step away."""
+"""Questions to an archive from a program: an answer is an Arrow table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import map_at
 from fleet_service.analytics.questions import question_of
 from fleet_service.archive.export import Box, Extract
-from fleet_service.archive.layout import insist_on_archive
+from fleet_service.archive.layout import require_archive
 from schemas.config import moment
 
 
@@ -29,21 +29,21 @@ def ask_archive(
     """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO 8601, UTC.
 
     Raises:
-        InputError: no such question or archive, nothing in that part, or an option is missing.
+        InputError: there is no such question or archive, no data in that part, or an option is missing.
     """
     root = Path(archive)
-    insist_on_archive(root)
+    require_archive(root)
     asked = question_of(question)
     return asked.ask(QueryEngine(engine, root, _part(since, until, bbox)), options or Options(report=lambda _: None))
 
 
 def map_of_archive(archive: Path | str, *, at: str | None = None, bbox: Box | None = None) -> pa.Table:
-    """The map as it stood at a time, or now, replayed from the archive, as a GeoParquet table."""
+    """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
     root = Path(archive)
-    insist_on_archive(root)
+    require_archive(root)
     return map_at(root, _part(None, at, bbox))
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
-    """Write an answer as the ending says: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
+    """Write an answer in the format of the ending: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
     output.write(table, question_of(question), Path(path))

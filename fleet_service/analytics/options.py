@@ -1,4 +1,4 @@
-"""What questions may be asked with, beside the part of the archive."""
+"""Options of questions, in addition to the part of the archive."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Options:
-    """Options of all questions; a question takes those that it knows.
+    """Options of all questions; each question uses some of them.
 
     Attributes:
         at: moment of a treatment, or of a replay [ns].
         stations: table of station readings, CSV or Parquet.
-        least_vehicles: distinct vehicles behind a slippery stretch or spell.
+        least_vehicles: minimum number of vehicles of a slippery stretch or spell.
         step_s: time between the frames of an animated replay; None for one map.
         lateness_s: of the service whose map is replayed.
         roads: table of `fleet-service roads`.
-        level: of grip that was agreed.
-        within_s: in which it is to be restored.
-        report: takes lines of progress.
+        level: agreed grip.
+        within_s: time within which it must be restored.
+        report: called with lines of progress.
     """
 
     at: int | None = None

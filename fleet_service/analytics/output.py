@@ -1,4 +1,4 @@
-"""Answers as a table in the terminal, Parquet, GeoParquet, GeoJSON, CSV, a plot, or a map that needs no network."""
+"""Output of answers: terminal table, Parquet, GeoParquet, GeoJSON, CSV, plot, or a map that needs no network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fleet_service.archive import export, geo
 from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import commandline
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 SHOWN_ROWS: Final = 20
 PLOTS: Final = (".png", ".svg", ".pdf")
@@ -28,8 +28,8 @@ TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
 def text(table: pa.Table, question: Question) -> str:
-    """The first rows in the question's order, for the terminal."""
-    shown = ordered(table, question).slice(0, SHOWN_ROWS)
+    """Return the first rows in the question's order, for the terminal."""
+    shown = order_rows(table, question).slice(0, SHOWN_ROWS)
     names = [name for name in shown.schema.names if not pa.types.is_nested(shown.schema.field(name).type)]
     cells = [names, *([_text(name, row[name]) for name in names] for row in shown.select(names).to_pylist())]
     widths = [max(len(row[k]) for row in cells) for k in range(len(names))]
@@ -39,9 +39,9 @@ def text(table: pa.Table, question: Question) -> str:
 
 
 def lines(table: pa.Table, question: Question) -> str:
-    """All rows, in the question's order, as JSON, one a line; times are ISO 8601, UTC."""
+    """Return all rows in the question's order as JSON lines; times are ISO 8601, UTC."""
     return "\n".join(json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
-                     for row in ordered(table, question).to_pylist())  # fmt: skip
+                     for row in order_rows(table, question).to_pylist())  # fmt: skip
 
 
 def _json(name: str, value: object) -> object:
@@ -52,8 +52,8 @@ def _json(name: str, value: object) -> object:
     return value.isoformat() if isinstance(value, date) else value  # a datetime is a date
 
 
-def ordered(table: pa.Table, question: Question) -> pa.Table:
-    """Rows in the question's order; what it does not decide, the other columns do."""
+def order_rows(table: pa.Table, question: Question) -> pa.Table:
+    """Return the rows in the question's order; ties are ordered by the other columns."""
     name = question.order.removeprefix("-")
     others = [f.name for f in table.schema if f.name != name and not pa.types.is_nested(f.type)]
     keys: list[Any] = [(name, "descending" if question.order.startswith("-") else "ascending")]
@@ -75,42 +75,42 @@ def _text(name: str, value: object) -> str:
 
 
 def write(table: pa.Table, question: Question, path: Path) -> None:
-    """Write an answer as the ending of the name says.
+    """Write an answer in the format of the name's ending.
 
     Raises:
-        InputError: an unknown ending, an answer that has no place, or a file that cannot be written.
+        InputError: the ending is unknown, the answer has no place, or the file cannot be written.
     """
-    table = ordered(table, question)
-    with commandline.writing(path):
+    table = order_rows(table, question)
+    with commandline.report_write_errors(path):
         if path.suffix == ".parquet" and not path.name.endswith(".geo.parquet"):
-            with written(path) as file:
+            with open_durably(path) as file:
                 pq.write_table(table, file, compression="zstd")
         elif path.suffix in PLOTS:
             plot(table, question, path)
         elif path.suffix == ".html":
-            with written(path) as file:
+            with open_durably(path) as file:
                 file.write(page(table, question).encode())
         elif path.name.endswith(".geo.parquet") or path.suffix == ".geojson":
-            export.write(placed(table, question), path)
+            export.write(add_geometry(table, question), path)
         else:
             export.write(table, path)
 
 
-def placed(table: pa.Table, question: Question) -> pa.Table:
-    """An answer with the polygons of its cells, or of its boxes."""
+def add_geometry(table: pa.Table, question: Question) -> pa.Table:
+    """Return an answer with the polygons of its cells, or of its boxes."""
     if "cell" not in table.schema.names:
         raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
     return geo.with_stretches(table, _members(table)) if PARTS in table.schema.names else geo.with_cells(table)
 
 
 def _members(table: pa.Table) -> list[list[int]]:
-    """Cells of each row."""
+    """Return the cells of each row."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
 
 
 def plot(table: pa.Table, question: Question, path: Path) -> None:
-    """An answer as a picture.
+    """Write an answer as an image.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -123,7 +123,7 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
 
 
 def page(table: pa.Table, question: Question) -> str:
-    """A page that draws the answer's cells in colour, frame by frame where it has frames; it needs no network."""
+    """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs no network."""
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
     rest, table = max(table.num_rows - MAP_CELLS, 0), table.slice(0, MAP_CELLS)

@@ -1,6 +1,6 @@
-"""A map of cells as one HTML file that needs no network: panels side by side, frames that play, a scale with its ticks.
+"""Map of cells as one HTML file that needs no network: panels, frames that play, a scale with ticks.
 
-It works with mouse, finger and keyboard. What was not measured is hatched and has no colour.
+It works with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Value = float | None
 
 @dataclass(frozen=True)
 class Scale:
-    """What the colours mean.
+    """Meaning of the colours.
 
     Attributes:
         label: of the scale, with its unit.
         low, high: values at its ends.
-        ticks: values on it and what is written there.
-        dark_is_high: whether large values are the dark ones; else small ones.
-        unknown: what a hatched place says.
+        ticks: values and their labels.
+        dark_is_high: True if large values are dark; else small ones.
+        unknown: text of a hatched place.
     """
 
     label: str
@@ -45,14 +45,14 @@ GRIP_SCALE: Final = Scale(
 
 @dataclass(frozen=True)
 class DrawnCells:
-    """What is drawn: rows, each one or more squares of the map.
+    """Drawn content: rows, each with one or more squares of the map.
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
-        part: row of each square; None: row k has square k.
+        part: row of each square; None if row k has square k.
         sector: heading sector of each row, 0 east to 3 south.
         panels: name and value per row of each panel; None is 'not measured'.
-        names, rows: what is read out of a row.
+        names, rows: texts shown for a row.
         frames, frame: names of the frames, and the number of each row's.
         lasting: rows whose value still grows.
     """
@@ -71,7 +71,7 @@ class DrawnCells:
 def render(
     title: str, cells: DrawnCells, scale: Scale, *, about: str = "", table: Sequence[Sequence[str]] | None = None
 ) -> str:
-    """The page. `table`: lines of a table below the map, the first its heads."""
+    """Return the page. `table` holds the lines of a table below the map, the first its heads."""
     data: dict[str, Any] = {
         "title": title, "about": about, "table": table,
         "scale": {

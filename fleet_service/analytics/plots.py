@@ -1,4 +1,4 @@
-"""Plots of the answers, one way of drawing for each question: PNG for a page, SVG and PDF for print."""
+"""Plots of the answers, one kind per question: PNG for a page, SVG and PDF for print."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DARK, _LIGHT, _MARK = GRIP[2], GRIP[8], "#d0006f"
 
 
 def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
-    """Draw an answer and write it as the ending of the path says (png, svg, pdf)."""
+    """Draw an answer and write it in the format of the path's ending (png, svg, pdf)."""
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
     if table.num_rows:
         _DRAWN.get(name, _first_two)(figure, table)
@@ -42,7 +42,8 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
 
 
 def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
-    """Squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m from the south-west]."""
+    """Return squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m from the
+    south-west]."""
     west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
     x, y = grid.outline(cell, sector)
@@ -52,7 +53,7 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
 def paint(
     axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
 ) -> PolyCollection:
-    """Shapes in the colours of grip; those without a value are hatched and have none."""
+    """Draw shapes in the colours of grip; those without a value are hatched and have no colour."""
     known = np.isfinite(values)
     if not known.all():
         axes.add_collection(
@@ -110,7 +111,7 @@ def _worst(figure: Figure, table: pa.Table) -> None:
 
 
 def _panels(figure: Figure, count: int) -> list[Axes]:
-    """So many axes, three a row."""
+    """Return `count` axes, three per row."""
     columns, rows = min(count, 3) or 1, -(-count // 3) or 1
     if count > 1:
         figure.set_size_inches(4.2 * columns, 3.8 * rows)
@@ -210,7 +211,7 @@ def _replay(figure: Figure, table: pa.Table) -> None:
 
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
-    """Of a question that another package brings: its first two numbers against each other."""
+    """Plot the first two numeric columns of a plug-in's question against each other."""
     numbers = [f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)][:2]
     axes = figure.subplots()
     axes.plot(*(_floats(table, name) for name in numbers), "o", color=_DARK)

@@ -1,11 +1,11 @@
-"""The map and the roll-ups of an archive made anew from its raw observations, zone by zone: here, or on Spark.
+"""Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here, or on Spark.
 
     OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all visited cells
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all days
 
-Once the weights that were used are known no cell depends on others, so that a zone needs its own rows and those of a
-margin around it: what comes out is what a replay of everything at once would give. Either engine runs the same function
-for each zone, and what it writes is the same, byte for byte.
+Cells do not depend on each other once the weights are known. A zone therefore needs its own rows and those of a margin
+around it, and gives the same result as a replay of everything. Both engines run the same function for each zone and
+write the same bytes.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.analytics.past_map import LATENESS_S, kept, visited_cells
+from fleet_service.analytics.past_map import LATENESS_S, snapshot_table, visited_cells
 from fleet_service.archive import layout, rollup, snapshots
 from fleet_service.archive.files import MAP, ROLLUP, Encoding, sync_tree, write_table
-from fleet_service.archive.load import pass_over
-from fleet_service.replay.rebuild import past
+from fleet_service.archive.load import skip_damaged
+from fleet_service.replay.rebuild import past_fusion
 from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import spark
@@ -32,7 +32,7 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """What is to be rebuilt: archive, the folder that takes it, the moment of the map [ns], the service's lateness."""
+    """Task: archive, output folder, moment of the map [ns], the service's lateness."""
 
     root: Path
     out: Path
@@ -40,19 +40,19 @@ class Rebuild(NamedTuple):
     lateness_s: float = LATENESS_S
 
 
-class Rebuilt(NamedTuple):
-    """What came of a zone: cells of the map, parts of the roll-up."""
+class RebuildResult(NamedTuple):
+    """Result of a zone: cells of the map, parts of the roll-up."""
 
     zone: int
     cells: int
     parts: int
 
 
-def insist_on_empty(out: Path) -> None:
-    """Let only an empty folder pass, or a new one: parts of another archive would add up.
+def require_empty(out: Path) -> None:
+    """Raise unless a folder is empty or new, because parts of another archive would add up.
 
     Raises:
-        InputError: something lies there, or it cannot be made.
+        InputError: it has content, or cannot be created.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -63,11 +63,12 @@ def insist_on_empty(out: Path) -> None:
         raise InputError("out", f"{out} holds {something.name}", "give a new folder, or empty this one")
 
 
-def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
-    """Rebuild all zones; yields what came of each, in their order.
+def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
+    """Rebuild all zones; yield the result of each, in order.
 
     Raises:
-        InputError: there are no compacted observations, a file is of a newer version, the engine is none or not there.
+        InputError: there are no compacted observations, a file is of a newer version, the engine is unknown or not
+            installed.
         OSError: something cannot be read or written.
     """
     if engine not in ENGINES:
@@ -75,18 +76,18 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
     zones = zones_of(wanted.root)
     if not zones:
         raise InputError("archive", f"no compacted observations in {wanted.root}", "run fleet-service compact")
-    work = partial(rebuilt, wanted)
+    work = partial(rebuild_zone, wanted)
     yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
     sweep_drafts(wanted.out)
 
 
 def zones_of(root: Path) -> list[int]:
-    """Zones that an archive has compacted observations of."""
-    return sorted({layout.partition_of(path).zone for path in layout.compacted(root, Kind.OBSERVATION)})
+    """Return the zones that an archive has compacted observations of."""
+    return sorted({layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)})
 
 
-def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
-    """Rebuild one zone; done twice, at once too, its files are there once.
+def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
+    """Rebuild one zone; repeated or concurrent calls leave its files once.
 
     Raises:
         InputError: a file is of a newer version.
@@ -94,31 +95,31 @@ def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
     """
     west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
     box = (west, south, east, north)
-    cells = visited_cells(past(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
+    cells = visited_cells(past_fusion(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
     cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
     named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
     with own_drafts(wanted.out) as drafts:
-        place = partial(_placed, wanted.out, drafts)
+        place = partial(_write_atomically, wanted.out, drafts)
         if cells.num_rows:
             path = snapshots.path_of(wanted.out, wanted.until)
-            place(path.parent / named / path.name, kept(cells, wanted.until), MAP)
+            place(path.parent / named / path.name, snapshot_table(cells, wanted.until), MAP)
         parts = 0
-        for path in layout.compacted(wanted.root, Kind.OBSERVATION):
+        for path in layout.compacted_files(wanted.root, Kind.OBSERVATION):
             if layout.partition_of(path).zone == zone and (part := _part(path)) is not None:
                 place(rollup.part_of(path, wanted.out), part, ROLLUP)
                 parts += 1
-    return Rebuilt(zone, cells.num_rows, parts)
+    return RebuildResult(zone, cells.num_rows, parts)
 
 
 def _part(path: Path) -> pa.Table | None:
     try:
-        return rollup.computed(path, pass_over)
+        return rollup.compute_part(path, skip_damaged)
     except FileNotFoundError:
         return None  # its day was retired meanwhile
 
 
-def _placed(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
-    """Write a file such that it is there whole, whoever else writes the same one."""
+def _write_atomically(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
+    """Write a file atomically, also if another process writes the same one."""
     write_table(table, drafts / path.name, encoding, named=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     (drafts / path.name).rename(path)

@@ -1,6 +1,6 @@
-"""An archive that nobody drove: roads, trips, ice at night, biased vehicles. For the example, the tests and the bench.
+"""Synthetic archive for example, tests and benchmarks: roads, trips, ice at night, biased vehicles.
 
-Its rows are shaped like those of the real estimator: two visits in three only bound mu, a third tells a value.
+Its rows have the shape of the real estimator's: two visits in three only bound mu, a third gives a value.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.archive.segments import Rows, Writer, stepped
+from fleet_service.archive.segments import Rows, Writer, round_to_steps
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray, IntArray
 from schemas.thresholds import NS, Z_95
@@ -30,7 +30,7 @@ _STD: Final = 0.05
 
 @dataclass(frozen=True)
 class SyntheticFleet:
-    """How much of it: rows, days, vehicles, roads and cells of a road; one road in `icy` freezes at night."""
+    """Size: rows, days, vehicles, roads and cells per road; one road in `icy` freezes at night."""
 
     rows: int
     days: int = 7
@@ -55,7 +55,7 @@ def write(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None
 
 
 def chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
-    """Rows of a few hours each, in order of time."""
+    """Yield rows of a few hours each, in order of time."""
     rng = np.random.default_rng(world.seed)
     bias = rng.normal(0.0, 0.04, world.vehicles)
     spans = world.days * 24 // hours
@@ -108,11 +108,11 @@ def _chunk(
         "spread": np.ones(rows, np.float32), "slope": np.full(rows, 0.4, np.float32),
     }  # fmt: skip
     order = np.argsort(leave, kind="stable")
-    return {name: column[order] for name, column in stepped(found).items()}
+    return {name: column[order] for name, column in round_to_steps(found).items()}
 
 
 def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
+    """Return position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
     row, column = road // 2 % 20, road // 40
@@ -123,18 +123,18 @@ def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[
 
 
 def night(seconds: FloatArray) -> FloatArray:
-    """Between 0 by day and 1 at four in the morning."""
+    """Return a factor between 0 by day and 1 at four in the morning."""
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
 
 def truth_of(world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray) -> FloatArray:
-    """Friction: dry, and ice on the middle fifth of icy roads in the small hours."""
+    """Return the friction: dry, and ice on the middle fifth of icy roads in the small hours."""
     middle = np.abs(along - world.length // 2) < world.length // 10
     return np.where((road % world.icy == 0) & middle & (night(seconds) > 0.5), ICE, DRY)
 
 
 def _likelihoods(rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray) -> ByteArray:
-    """Likelihoods (n, 32): a flank on each side of a value, of its own steepness; up to the grip used for a bound."""
+    """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a bound."""
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)
     below = 0.5 * np.square(distance / flank[0]) * (distance < 0)

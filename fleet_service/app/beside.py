@@ -1,4 +1,4 @@
-"""Work in a process of its own: its memory goes with it, and the worker shares no interpreter with it."""
+"""Work in a separate process: its memory is returned at the end, and it shares no interpreter with the worker."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from schemas.errors import InputError
 LOOK_S: Final = 0.1  # between two looks whether it shall stop
 
 
-def run(what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None) -> str | None:
-    """What a module said that was run as a process, with `document` on its stdin; None if it was stopped. It may die at
-    any instant.
+def run_module(
+    what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None
+) -> str | None:
+    """Run a module as a process with `document` on its stdin; return its stdout, or None if it was stopped. The process
+    must tolerate a kill at any instant.
 
     Raises:
         InputError: it failed.

@@ -1,9 +1,9 @@
-"""The service's clock: neither a jump of the system's nor a wrong one at the start makes it lose or refuse anything.
+"""Clock of the service: neither a jump of the system clock nor a wrong one at the start loses or refuses data.
 
-A wall clock may jump: a time server corrects it, a machine wakes up, a hand slips. So time goes on evenly from the
-start, and a jump of more than JUMP_NS is only followed once reports say so: the vehicles that drive now tell the time,
-and the clock that more of them agree with is right. Until then nothing is refused for its time that may be right by the
-other one; it is not acknowledged either, so that its sender keeps it.
+A wall clock may jump: a time server corrects it, a machine wakes up, a person sets it. The service therefore runs on a
+monotonic clock from its start. It follows a jump of more than JUMP_NS only when reports confirm it: the clock that more
+of the current vehicles agree with is right. Until then nothing is refused for its time if it may be right by the other
+clock. It is not acknowledged either, so its sender keeps it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
 
 
 class TimeNow(NamedTuple):
-    """What the service takes for the time, all in ns.
+    """The service's time and its certainty, all in ns.
 
     Attributes:
         now: the time.
-        slack: how far beyond it a report may lie, by what the archive has seen.
-        doubt: how much further one may lie without being refused for good.
-        least: the true time is not before.
-        sure: whether so much is known that what is standing may end by time alone.
+        slack: how far beyond it a report may lie, given what the archive has seen.
+        doubt: how much further a report may lie without being refused for good.
+        least: lower bound of the true time.
+        sure: True if time alone may end standing alerts.
     """
 
     now: int
@@ -43,7 +43,7 @@ class SteadyClock:
     """Time of the service [ns UTC].
 
     Args:
-        seen: latest time that a report told before this start, 0 if none did.
+        seen: latest time of a report before this start, 0 if there was none.
         wall, steady: the system's clocks [ns]; `steady` never jumps, its zero does not matter.
     """
 
@@ -62,7 +62,7 @@ class SteadyClock:
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
-        """The time; follows small steps forward of the wall clock, and larger ones when reports agree."""
+        """Return the time. It follows small forward steps of the wall clock, and larger ones when reports agree."""
         even, wall = self._zero + self._steady(), self._wall()
         if abs(wall - even) <= JUMP_NS:
             self._doubted = None
@@ -74,15 +74,15 @@ class SteadyClock:
         return even
 
     def moment(self) -> TimeNow:
-        """The time, and how sure it is."""
+        """Return the time and its certainty."""
         now, wall, seen = self.now(), self._wall(), self._seen + self._steady() - self._began
         slack = max(0, seen - now) if self._seen else 0
         if self._confirmed:
             return TimeNow(now, slack, max(0, wall - now - slack), min(now, wall))
         return TimeNow(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
 
-    def heard(self, times: Mapping[str, int]) -> None:
-        """Vehicles that were just heard, and the times that they told [ns]."""
+    def record_reports(self, times: Mapping[str, int]) -> None:
+        """Record the times [ns] that vehicles just reported."""
         now, wall = self.now(), self._wall()
         if self._doubted is None:
             self._confirmed = self._confirmed or any(abs(reported - now) <= NEAR_NS for reported in times.values())
@@ -96,6 +96,7 @@ class SteadyClock:
             self._zero, self._confirmed = wall - self._steady(), True
 
     def lag(self) -> int:
-        """How far the wall clock is behind [ns], or ahead if negative: the length of a jump that is not followed."""
+        """Return how far the wall clock is behind [ns], or ahead if negative: the size of a jump that is not
+        followed."""
         now = self.now()
         return max(now, self._seen if self._seen > now else now) - self._wall()

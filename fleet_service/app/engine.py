@@ -1,7 +1,7 @@
-"""The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
+"""Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
-One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tile` and `fade_alerts`; queries come from other threads,
-so that a lock guards the map.
+One worker calls `ingest`, `begin_flush`, `end_flush`, `flush`, `tile` and `fade_alerts`. Queries come from other
+threads, so a lock guards the map.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
-from fleet_service.app.memory import SLOTS, Memory, remember, visited
-from fleet_service.app.past import PastMaps, PastQuery
+from fleet_service.app.memory import SLOTS, ServiceState, load_state, visitor_tables
+from fleet_service.app.past import HistoricalMaps, PastQuery
 from fleet_service.app.precompile import warm_up
 from fleet_service.app.tasks import Tasks
 from fleet_service.archive.bucket import CopyError
@@ -29,7 +29,7 @@ from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Rows
-from fleet_service.archive.witnesses import mend
+from fleet_service.archive.witnesses import remove_damaged_lines
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import UNCORRECTED
 from fleet_service.fusion.weather import Reports
@@ -46,7 +46,7 @@ from fleet_service.replay.restart import image_of
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer, size_asked
 from fleet_service.serve.tile_cache import TileCache
-from fleet_service.shards.holding import Holding, alone
+from fleet_service.shards.holding import Ownership, open_exclusive
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
@@ -64,21 +64,23 @@ ERASED = "what it was raised on was erased"
 
 
 class Engine:
-    """State of one service, rebuilt from its archive; `seen` is the latest time that a report told [ns].
+    """State of one service, rebuilt from its archive; `seen` is the latest time in a report [ns].
 
     Args:
         config: settings.
         root: of the archive; it is locked while the engine is open.
-        holding: of the archive, which is closed with the engine; None: it is taken now, without a lease.
+        holding: ownership of the archive, closed with the engine; None to open the archive now, without a lease.
 
     Raises:
         InputError: another service holds the archive.
         OSError: the archive cannot be read or written.
     """
 
-    def __init__(self, config: ServiceConfig, root: Path, holding: Holding | None = None) -> None:
-        self._config, self._root, self._past = config, root, PastMaps(root)
-        self.holding = holding or alone(config, root)  # before anything is read: an empty disk is filled from the copy
+    def __init__(self, config: ServiceConfig, root: Path, holding: Ownership | None = None) -> None:
+        self._config, self._root, self._past = config, root, HistoricalMaps(root)
+        self.holding = holding or open_exclusive(
+            config, root
+        )  # before anything is read: an empty disk is filled from the copy
         self.copy = self.holding.copy
         try:
             self._open(config, root)
@@ -87,30 +89,30 @@ class Engine:
             raise
 
     def _open(self, config: ServiceConfig, root: Path) -> None:
-        """Begin with what the archive holds."""
+        """Load the state from the archive."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
         self._tracks, self._places = Tracks(), NewCells()
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
-        self.counts["witnesses_damaged"] += mend(root / "keys")
+        self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
         self._guard = threading.Lock()
         self._acks, self._now = Acks(), 0
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy, self.holding.epoch)
         self._wanted = Tasks()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
-        memory = remember(root, config, set_aside)
+        memory = load_state(root, config, set_aside)
         self.counts["checkpoints_refused"] += memory.refused
         self.weather = WeatherInbox(root, config.name, memory.fusion, self.counts)
-        self._know(memory)
+        self._adopt(memory)
         self.seen = self._streams.newest
         self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:
             self._use(self.weather.begin(config.weather, memory.weather, time.time_ns()))
         warm_up()
 
-    def _know(self, memory: Memory) -> None:
-        """Go on with what is known of the archive."""
+    def _adopt(self, memory: ServiceState) -> None:
+        """Adopt a state loaded from the archive."""
         self._memory = memory
         self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
         self._visitors = memory.visitors
@@ -118,37 +120,38 @@ class Engine:
         self._intake = BatchIntake(self._streams, Pseudonyms(self._root / "keys"), self.counts, self._acks)
         self.weather.fusion = self.fusion
 
-    def recall(self, before: Callable[[], None]) -> None:
-        """Do something, and know what the archive tells then and nothing else; in `between`.
+    def reload_state(self, before: Callable[[], None]) -> None:
+        """Call `before`, then replace the state by what the archive holds; call it in `run_between_segments`.
 
         Raises:
-            OSError: the archive cannot be read; what was known stays.
+            OSError: the archive cannot be read; the state stays.
         """
-        stood = self._alerts.standing
+        stood = self._alerts.standing_alerts
         before()
-        memory = remember(self._root, self._config, set_aside)
+        memory = load_state(self._root, self._config, set_aside)
         with self._guard:
             self._tracks, self._places = Tracks(), NewCells()
-            self._know(memory)
-            still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
+            self._adopt(memory)
+            still = {(alert.cell, alert.sector) for alert in self._alerts.standing_alerts}
             ended = [alert for alert in stood if (alert.cell, alert.sector) not in still]
             self._ended += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def drop_old(self) -> int:
-        """Drop cells that are back at the prior and old; returns how many. In `between`."""
+        """Drop old cells that are back at the prior; return their number. Call it in `run_between_segments`."""
         with self._guard:
             return self._memory.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """What the service knows, and the segment up to which everything is in it; None if stopped meanwhile.
+        """Return the state and the last segment it includes; None if stopped meanwhile.
 
-        The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
+        The worker copies the state right after a segment, when every row in it is on disk. Another thread calls this.
         """
-        return self.between(self._image, stop)
+        return self.run_between_segments(self._image, stop)
 
-    def between(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker do something right after a segment, when every row that it took is on disk, and return what
-        that gave; None if stopped meanwhile. Called by another thread.
+    def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+        """Let the worker run `work` right after a segment, when every row it took is on disk; return the result.
+
+        None if stopped meanwhile. Another thread calls this.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -157,74 +160,75 @@ class Engine:
 
     def _image(self) -> Taken:
         with self._guard:
-            tables = image_of(self.fusion, self._alerts.standing, self._streams) | visited(self._visitors)
-        return Taken(tables, self.written_to, tuple(path.name for path in weather_files(self._root)))
+            tables = image_of(self.fusion, self._alerts.standing_alerts, self._streams) | visitor_tables(self._visitors)
+        return Taken(tables, self.newest_segment, tuple(path.name for path in weather_files(self._root)))
 
     @property
-    def written_to(self) -> Cut:
-        """The segment that was written last."""
+    def newest_segment(self) -> Cut:
+        """Return the last written segment."""
         return self._log.newest
 
-    def survived(self) -> None:
-        """It has run for a while with what it began from."""
-        checkpoints.survived(self._root)
+    def mark_survived(self) -> None:
+        """Record that the service has run for a while with the checkpoint it began from."""
+        checkpoints.mark_survived(self._root)
 
     def close(self) -> None:
-        """Give the archive free."""
+        """Release the archive."""
         self._past.close()
-        self.survived()
+        self.mark_survived()
         self._log.close()
         self.holding.close()
 
     @property
-    def full(self) -> bool:
-        """Whether too many rows wait for the disk, or batches for the copy."""
+    def is_full(self) -> bool:
+        """True if too many rows wait for the disk, or batches for the copy."""
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
     def unsettled(self) -> int:
-        """Batches that are admitted and not on disk yet."""
+        """Number of admitted batches that are not on disk yet."""
         return self._log.unsettled
 
     @property
     def newest(self) -> int:
-        """Latest time that a record told which was let in [ns]; a restart finds the same as `seen`."""
+        """Latest time of an admitted record [ns]; a restart finds the same as `seen`."""
         return self._streams.newest
 
     @property
     def hangs_s(self) -> float:
-        """For how long a segment that is being written has not ended [s]."""
+        """How long the current segment has been written [s]."""
         return self._log.hangs_s
 
     @property
     def alerts(self) -> int:
-        """Cells under an alert."""
-        return len(self._alerts.raised)
+        """Number of cells under alert."""
+        return len(self._alerts.slots)
 
     @property
-    def alerted(self) -> IntArray:
-        """Slots under an alert, (k,)."""
-        return np.array(sorted(self._alerts.raised), np.int64)
+    def alert_slots(self) -> IntArray:
+        """Return the slots under alert, (k,)."""
+        return np.array(sorted(self._alerts.slots), np.int64)
 
-    def standing(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        """Tile and payload of the alerts that stand, for the tiles that are wanted."""
+    def standing_alerts(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
+        """Return tile and payload of the standing alerts of selected tiles."""
         tiles: dict[int, list[Alert]] = {}
         with self._guard:
-            for alert in self._alerts.standing:
+            for alert in self._alerts.standing_alerts:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
-    def repeated(self, most: int) -> list[Alert]:
-        """Alerts that stand, so many at the most and in turn: who was away hears them too."""
+    def alerts_to_repeat(self, most: int) -> list[Alert]:
+        """Return at most `most` standing alerts, in turn, so that clients that were away receive them too."""
         with self._guard:
-            standing = self._alerts.standing
+            standing = self._alerts.standing_alerts
         self._turn = self._turn % max(len(standing), 1)
         out = standing[self._turn : self._turn + most]
         self._turn += len(out)
         return out
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Admit and fuse; returns the alerts that this raises or clears. `at`: the time, for sure if it is a number."""
+        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a number is
+        certain."""
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         now, ahead = at.now, int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
@@ -239,20 +243,20 @@ class Engine:
 
     @property
     def times(self) -> dict[str, int]:
-        """The newest time that each vehicle told in the last `ingest` [ns]."""
+        """Return the newest time that each vehicle reported in the last `ingest` [ns]."""
         return self._intake.times
 
     def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
         rows = accepted.rows
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
-            heard = np.flatnonzero(~self._beyond(rows))
+            heard = np.flatnonzero(~self._excluded_from_fusion(rows))
             taken = observations_of(rows, rows["witness"]).take(heard)
             updated = self.fusion.update(taken)
             if self._visitors is not None:
-                self._visitors.heard(taken)
-            self.map.changed(updated.slots)
-            raised = self._alerts.updated(updated.slots)
+                self._visitors.add(taken)
+            self.map.mark_changed(updated.slots)
+            raised = self._alerts.update(updated.slots)
             if raised:
                 self._tiles.acknowledge()
         n = len(rows["row"])
@@ -266,11 +270,12 @@ class Engine:
             missed = np.zeros(n, bool)
             missed[heard] = updated.late
             of_batch = np.logical_or.reduceat(missed, np.flatnonzero(rows["row"] == 0))
-            self._acks.late(compress(accepted.batches, of_batch.tolist()))
+            self._acks.record_late(compress(accepted.batches, of_batch.tolist()))
         return raised
 
-    def _beyond(self, rows: Rows) -> BoolArray:
-        """Which rows are archived and not fused: their vehicle cannot be there, or makes too many new places."""
+    def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
+        """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
+        places."""
         witness = rows["witness"]
         beyond = self._tracks.impossible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
         self.counts["implausible_moves"] += int(beyond.sum())
@@ -281,7 +286,7 @@ class Engine:
         return beyond
 
     def update_weather(self, now: int) -> None:
-        """Let the weather act that came since the last call."""
+        """Apply the weather that arrived since the last call."""
         self._use(self.weather.take(now))
 
     def _use(self, reports: Reports | None) -> None:
@@ -291,9 +296,9 @@ class Engine:
             self.counts["weather"] += len(reports.time)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write what waits as durable segments; returns vehicle and bytes of the acknowledgements to put after it.
+        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements to send.
 
-        A full disk is counted and tried again at the next call; nothing of it is acknowledged.
+        A full disk is counted, and the next call tries again; nothing of it is acknowledged.
         """
         acks = self._acknowledged(self._log.flush)
         if not self.failing:
@@ -301,23 +306,23 @@ class Engine:
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
-        """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
+        """Begin a flush; messages may be processed while segments are written. `end_flush` returns the acks.
 
-        If something is wanted in `between`, it is `flush`.
+        If work waits for `run_between_segments`, this is `flush`.
         """
         if self._wanted:
             return self.flush()
         self._log.begin()
         return []
 
-    def written(self) -> list[tuple[str, bytes]]:
-        """The acknowledgements to put after a flush that was begun, once it has ended."""
+    def end_flush(self) -> list[tuple[str, bytes]]:
+        """Return the acknowledgements of a flush that was begun and has ended."""
         return self._acknowledged(self._log.end) if self._log.ended else []
 
     def _acknowledged(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
         try:
             self._intake.sync()
-            self._intake.settled(durable())
+            self._intake.acknowledge(durable())
         except OSError as error:
             if isinstance(error, CopyError) and self.copy is not None:
                 self.counts["copy_failures"] = self.copy.failures
@@ -330,16 +335,16 @@ class Engine:
         return self._acks.messages(self._now) if self.holding.may_acknowledge else []
 
     def tile(self, tile: int, now: int) -> bytes:
-        """The Arrow stream of a tile as far as it is public; empty where nothing of it is."""
+        """Return the Arrow stream of the public cells of a tile; empty if there are none."""
         shown = self._tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Tile and `tile` of every one that changed since the last call and is not empty."""
+        """Return tile and payload of every tile that changed since the last call and is not empty."""
         return [(tile, stream) for tile in self.map.take_dirty() if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
-        """All public cells; the lock is held for a few at a time, so that ingest goes on."""
+        """Return all public cells; the lock is held for a few at a time, so that ingest continues."""
         tables = []
         for start in range(0, self.fusion.size, SLOTS):
             with self._guard:
@@ -349,18 +354,18 @@ class Engine:
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def fade_alerts(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared, or an erasure."""
+        """Return the alerts that expired or were erased."""
         with self._guard:
             ended, self._ended = [replace(alert, time=now) for alert in self._ended], []
-            return ended + self._alerts.faded(now)
+            return ended + self._alerts.expire(now)
 
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Tile and payload of every reply to a query, each made when it is taken; see `answer.answer`.
+        """Yield tile and payload of every reply to a query, computed on demand; see `serve.query.answer`.
 
         Raises:
-            InputError: a route too long, a time in the future, or an archive that cannot be read.
+            InputError: the route is too long, the time is in the future, or the archive cannot be read.
         """
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})
@@ -373,5 +378,5 @@ class Engine:
         return self._past.ask(past, wanted)
 
     def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
-        """What an answer may have at the most; errors as of `answer`."""
+        """Return the upper bound of an answer's size; errors as for `answer`."""
         return size_asked(self._tiles, query, wanted, only)

@@ -1,13 +1,13 @@
-"""Erasure beside a running service: what its owner asked for in `archive.requests`, done in the thread of the upkeep.
+"""Erasure in a running service: handles the requests of `archive.requests` in the thread of the background jobs.
 
-    a segment; what the service knows is on disk up to it
-    in a process of its own:  the vehicle's rows leave the files, and all others, read again, make a checkpoint
-    between two segments:     the service forgets all it knows and begins from that checkpoint and the log since
+    a segment; the service's state is on disk up to it
+    in a separate process:    the vehicle's rows leave the files, and all others, read again, make a checkpoint
+    between two segments:     the service drops its state and begins from that checkpoint and the log since
 
-Checkpoints, snapshots, retention and compaction are of the same thread, so that none of them meets a half of it; others
-wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. A service that dies amid
-of it finds the question at its next start, and no checkpoint with the vehicle in it. What the vehicle measures
-afterwards is new.
+Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an incomplete erasure.
+Others wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. If the service
+dies during the erasure, its next start finds the request, and no checkpoint contains the vehicle. Later measurements of
+the vehicle are new.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from typing import Any
 
 from fleet_service.app import beside
 from fleet_service.app.engine import Engine
-from fleet_service.app.memory import remember
+from fleet_service.app.memory import load_state
 from fleet_service.archive import requests
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.requests import Erasure
-from fleet_service.archive.retention import destroy_key, erased, forget_witness, key_of
+from fleet_service.archive.retention import destroy_key, erase_files, forget_witness, key_of
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
 
-def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
-    """Answer the questions that wait; returns a line for the operator."""
+def handle_requests(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
+    """Handle waiting requests; return a line for the operator."""
     rows = answered = 0
-    for question in requests.waiting(root):
+    for question in requests.open_requests(root):
         try:
             outcome = _erase(engine, config, root, requests.read(question), stop)
         except InputError as error:
@@ -45,16 +45,16 @@ def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Eve
         if outcome is None:  # the service stops; the next one does it
             break
         if engine.copy is not None:
-            outcome["copy"] = _followed(engine.copy)
+            outcome["copy"] = _erase_in_copy(engine.copy)
         requests.settle(question, outcome)
         rows, answered = rows + outcome["rows"], answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
 
 
-def _followed(copy: Copy) -> str | None:
-    """Let what was erased go from the copy too; what keeps it, and then the upkeep does it later."""
+def _erase_in_copy(copy: BucketReplica) -> str | None:
+    """Erase in the copy too; return why this is incomplete, in which case a background job does it later."""
     try:
-        copy.follow()
+        copy.sync()
     except OSError as error:
         return str(error)
     return None
@@ -63,46 +63,46 @@ def _followed(copy: Copy) -> str | None:
 def _erase(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:  # fmt: skip
-    """What was done; None if the service stops before it is.
+    """Return the result; None if the service stops before the end.
 
     Raises:
         InputError: there is no such month, or a file is damaged.
-        OSError: a file cannot be read or written; to be tried again.
+        OSError: a file cannot be read or written; the erasure is tried again.
     """
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
     if vehicle is None:
-        destroyed = _recalled(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
+        destroyed = _reload_service(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
         return {"rows": 0, "files": []} if destroyed else None
-    cut = engine.between(lambda: engine.written_to, stop)
+    cut = engine.run_between_segments(lambda: engine.newest_segment, stop)
     if cut is None:
         return None
     request = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
-    output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, request)
+    output = beside.run_module("erasure", "fleet_service.app.erasing_process", [str(root)], stop, request)
     if output is None:
         return None
     answer: dict[str, Any] = json.loads(output)
-    return answer if _recalled(engine, lambda: forget_witness(root, vehicle, wanted.month), stop) else None
+    return answer if _reload_service(engine, lambda: forget_witness(root, vehicle, wanted.month), stop) else None
 
 
-def _recalled(engine: Engine, before: Callable[[], None], stop: threading.Event) -> bool | None:
-    """Whether the service has done something and forgot what it knew before; None if it stops first."""
+def _reload_service(engine: Engine, before: Callable[[], None], stop: threading.Event) -> bool | None:
+    """Replace the service's state after calling `before`; None if it stops first."""
 
     def work() -> bool:
-        engine.recall(before)
+        engine.reload_state(before)
         return True
 
-    return engine.between(work, stop)
+    return engine.run_between_segments(work, stop)
 
 
-def apart(root: Path, request: dict[str, Any]) -> dict[str, Any]:
-    """The part of a process of its own.
+def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
+    """Do the part of the separate process.
 
     Raises:
-        InputError, OSError: as of `retention.forget_vehicle`.
+        InputError, OSError: as for `retention.forget_vehicle`.
     """
     known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
-    with erased(root, request["vehicle"], request["month"]) as done:
+    with erase_files(root, request["vehicle"], request["month"]) as done:
         cut = Cut(*request["cut"])
-        checkpoints.save(root, remember(root, ServiceConfig(**request["config"]), until=cut).image(cut, known))
+        checkpoints.save(root, load_state(root, ServiceConfig(**request["config"]), until=cut).image(cut, known))
     return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

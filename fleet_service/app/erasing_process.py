@@ -1,4 +1,4 @@
-"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure, told on stdin, as a service wants it."""
+"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure for a service, read from stdin."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Do it, and say what was done."""
+    """Erase, and print the result."""
     limit_memory(*UNUSED)
-    from fleet_service.app.erasing import apart
+    from fleet_service.app.erasing import run_erasure_process
 
     try:
-        print(json.dumps(apart(Path(sys.argv[1]), json.load(sys.stdin))))
+        print(json.dumps(run_erasure_process(Path(sys.argv[1]), json.load(sys.stdin))))
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""What a running service does for its archive now and then, at low priority beside the worker."""
+"""Background jobs of a running service for its archive, at low priority next to the worker."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.archive import layout, reserve, segments, snapshots
 from fleet_service.archive.load import count_set_aside
-from fleet_service.archive.retention import retire
+from fleet_service.archive.retention import retire_rows
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
@@ -39,7 +39,7 @@ _NICE: Final = 10  # the worker goes first
 
 
 class Job(NamedTuple):
-    """Something to do every so often: returns a line for the operator, or None; 0 seconds: never."""
+    """Periodic work: returns a line for the operator, or None; a period of 0 seconds means never."""
 
     name: str
     every_s: float
@@ -47,18 +47,18 @@ class Job(NamedTuple):
 
 
 def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]) -> list[Job]:
-    """What keeps an archive in order, as the settings say; `moment` is the service's time."""
+    """Return the jobs that maintain an archive, according to the settings; `moment` returns the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
         if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
             return "compaction waits for the copy"
-        reserve.keep(root)
-        weather.gather(root)
+        reserve.allocate(root)
+        weather.join_daily_files(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
         words += ["--to", config.put_to] if config.put_to else []
-        output = beside.run("compact", "fleet_service.cli", words, stop)
+        output = beside.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:
@@ -78,12 +78,12 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         at = moment()
         if not at.sure:
             return "retention waits: no report has confirmed the clock yet"
-        done = retire(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
+        done = retire_rows(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
         weather.retire(root, at.now // layout.DAY_NS - config.raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
     def old_cells(stop: threading.Event) -> str | None:
-        dropped = engine.between(engine.drop_old, stop)
+        dropped = engine.run_between_segments(engine.drop_old, stop)
         return f"dropped: {dropped} cells that nobody visited for a week" if dropped else None
 
     def inventory(_: threading.Event) -> str | None:
@@ -91,13 +91,13 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         return None
 
     def with_disk_space(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
-        """On a full disk a job that makes room has the reserve to work with."""
+        """Release the reserve to a job that makes room, if the disk is full."""
 
         def done(stop: threading.Event) -> str | None:
             try:
                 return work(stop)
             except (OSError, InputError):
-                if not reserve.give(root):
+                if not reserve.release(root):
                     raise
                 return work(stop)
 
@@ -105,7 +105,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
     def following(_: threading.Event) -> str | None:
         if engine.copy is not None:
-            engine.copy.follow()
+            engine.copy.sync()
         return None
 
     def handing_over(stop: threading.Event) -> str | None:
@@ -130,15 +130,15 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("old_cells", DAY_S, old_cells),
         Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),
         Job("handing_over", ASKED_S if engine.holding.lease is not None else 0.0, handing_over),
-        Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
+        Job("erasure", ASKED_S, lambda stop: erasing.handle_requests(engine, config, root, stop)),
     ]
 
 
-class Upkeep:
-    """The jobs while they are done, in a thread of their own.
+class BackgroundJobs:
+    """Thread that runs the jobs.
 
     Attributes:
-        failed: how often in a row each job has failed that failed the last time.
+        failed: number of consecutive failures per job whose last run failed.
     """
 
     def __init__(self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> None:
@@ -149,22 +149,22 @@ class Upkeep:
         self._busy: tuple[str, float] | None = None
         self._thread = threading.Thread(target=self._keep, name="upkeep")
 
-    def troubles(self) -> list[str]:
-        """What is not as it should be."""
+    def health_problems(self) -> list[str]:
+        """Return one message per failed or hanging job."""
         found = [f"{name} failed {times} times in a row" for name, times in list(self.failed.items())]
         busy = self._busy
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
-        if self.ended:
-            found.append("upkeep has ended; start the service again")
+        if self.has_ended:
+            found.append("background jobs have ended; restart the service")
         return found
 
     @property
-    def ended(self) -> bool:
-        """Whether its thread is gone though nobody stopped it."""
+    def has_ended(self) -> bool:
+        """Return True if the thread has ended although nobody stopped it."""
         return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
 
-    def __enter__(self) -> Upkeep:
+    def __enter__(self) -> BackgroundJobs:
         self._thread.start()
         return self
 
@@ -179,11 +179,11 @@ class Upkeep:
         due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
         while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):
             job = min(due, key=lambda job: due[job])
-            again_s = job.every_s if self._done(job) else min(job.every_s, SOON_S)
+            again_s = job.every_s if self._run_job(job) else min(job.every_s, SOON_S)
             due[job] = time.monotonic() + again_s
 
-    def _done(self, job: Job) -> bool:
-        """Do one turn of a job; whether it went well. Whatever is wrong with it, the others must go on."""
+    def _run_job(self, job: Job) -> bool:
+        """Run one turn of a job; return True on success. A failure must not affect the other jobs."""
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)

@@ -1,4 +1,4 @@
-"""What a service knows of its archive: from the newest checkpoint and the log after it, or from the log alone."""
+"""State of a service, loaded from the newest checkpoint and the log after it, or from the log alone."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.archive.layout import DAY_NS, Cut
-from fleet_service.archive.load import pass_over
+from fleet_service.archive.load import skip_damaged
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.dedup import SequenceTrackers
-from fleet_service.ingest.weather import archived
+from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.rebuild import Begin, Since, first_day, nobody, replay, restore_streams
-from fleet_service.replay.restart import image_of, restart
+from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.visitors import Visitors
@@ -33,15 +33,15 @@ VISITORS: Final = "visitors"  # a table of a checkpoint
 SLOTS: Final = 20_000  # at once: a lock is held for 40 ms, and little memory is needed
 
 
-class Memory(NamedTuple):
-    """What is known.
+class ServiceState(NamedTuple):
+    """State of a service.
 
     Attributes:
         fusion, map, alerts: of all observations.
-        streams: batches that were admitted.
-        weather: all reports that were used.
-        refused: checkpoints that could not be begun from.
-        visitors: who was where lately; None, where every cell is public.
+        streams: admitted batches.
+        weather: all weather reports used.
+        refused: checkpoints that could not be loaded.
+        visitors: recent vehicles per cell; None if every cell is public.
     """
 
     fusion: Fusion
@@ -53,28 +53,29 @@ class Memory(NamedTuple):
     visitors: Visitors | None
 
     def drop_old(self) -> int:
-        """Drop cells that nobody visited for KEPT_NS: what is believed of them is the prior again; returns how many."""
+        """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their number."""
         newest = self.fusion.checkpoint or 0
         stale = self.fusion.untouched(newest - KEPT_NS)
-        stale[sorted(self.alerts.raised)] = False
+        stale[sorted(self.alerts.slots)] = False
         dropped = int(stale.sum())
         if dropped > self.fusion.size * LEAST_DROPPED:
             place = self.fusion.drop(stale)
-            self.map.renumbered()
-            self.alerts.renumbered(place)
+            self.map.rebuild()
+            self.alerts.renumber(place)
             if self.visitors is not None:
-                self.visitors.renumbered(place)
+                self.visitors.renumber(place)
             return dropped
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """What a checkpoint keeps of it; everything up to the segment `cut`, and these files of weather, are in it."""
-        tables = image_of(self.fusion, self.alerts.standing, self.streams) | visited(self.visitors)
+        """Return the content of a checkpoint, which includes everything up to the segment `cut` and these weather
+        files."""
+        tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(self.visitors)
         return Taken(tables, cut, tuple(path.name for path in weather))
 
 
-def visited(visitors: Visitors | None) -> dict[str, pa.Table]:
-    """Visitors as tables of a checkpoint: bits and the part of the window in columns of one length."""
+def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:
+    """Return visitors as tables of a checkpoint: bits and part of the window in columns of one length."""
     if visitors is None:
         return {}
     columns = visitors.columns()
@@ -82,15 +83,15 @@ def visited(visitors: Visitors | None) -> dict[str, pa.Table]:
     return {VISITORS: pa.table({"bits": pa.array(columns["bits"]), "part": pa.array(part)})}
 
 
-def remember(
-    root: Path, config: ServiceConfig, damaged: Callable[[Path, str], None] = pass_over, until: Cut | None = None
-) -> Memory:
-    """Read the archive; of segments that are not compacted, those written up to `until`.
+def load_state(
+    root: Path, config: ServiceConfig, damaged: Callable[[Path, str], None] = skip_damaged, until: Cut | None = None
+) -> ServiceState:
+    """Load the state from the archive; of uncompacted segments, those written up to `until`.
 
     Raises:
         OSError: it cannot be read.
     """
-    begin = restart(root, config.lateness_s, (VISITORS,))
+    begin = load_restart(root, config.lateness_s, (VISITORS,))
     fusion, streams = begin.fusion, begin.streams
     visitors = None
     if config.public_vehicles > 1:  # after a checkpoint that does not have them nothing is shown until so many came
@@ -98,23 +99,23 @@ def remember(
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
     shown, alerts = MapState(fusion), Alerts(fusion)
     alerts.resume(begin.standing)
-    used = archived(root, damaged=damaged)  # before the observations, which it acts on
-    fusion.update_weather(archived(root, known=begin.weather, damaged=damaged) if begin.cut else used)
+    used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
+    fusion.update_weather(archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used)
     restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
     matters = Begin(first_day(root), begin.cut, until)
-    heard = nobody if visitors is None else visitors.heard
+    heard = nobody if visitors is None else visitors.add
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
         noting = None if begin.cut else beside.submit(noted)  # what a checkpoint knows, the replay asks
         for slots in chain(restored, (updated.slots for updated in rest)):
-            alerts.updated(slots)
-            shown.changed(slots)
+            alerts.update(slots)
+            shown.mark_changed(slots)
         if noting is None:
             noted()
         else:
             noting.result()
     pa.default_memory_pool().release_unused()  # the archive went through it
-    memory = Memory(fusion, shown, alerts, streams, used, begin.refused, visitors)
+    memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, visitors)
     memory.drop_old()
     return memory

@@ -1,4 +1,4 @@
-"""What an operator sees of a service in numbers, and what counts as trouble."""
+"""Metrics and health problems of a service."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """What only the running service knows: seconds since the worker's last turn, the queue, routers, clock lag [s], for
-    how long one tile of an answer is being made [s]."""
+    """Values that only the running service knows: seconds since the worker's last turn, queue length, routers, clock
+    lag [s], and how long the current tile of an answer takes [s]."""
 
     turn_age_s: float
     queued: int
@@ -50,7 +50,7 @@ class Pulse(NamedTuple):
 
 
 def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
-    """All values, now."""
+    """Return all current values."""
     counts = dict(engine.counts)
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
     found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
@@ -60,53 +60,54 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
     return [
         *found,
         Metric("rows", "counter", "rows admitted", kinds, "kind"),
-        Metric("failures", "counter", "what could not be done and is tried again", failures, "work"),
-        Metric("runs", "counter", "rounds of upkeep", runs, "work"),
-        Metric("segments", "gauge", "segments that wait for compaction", _per_kind(root, segments.paths), "kind"),
-        gauge("queue_messages", "messages that wait", pulse.queued),
-        gauge("queue_capacity", "messages that may wait", config.queue_batches),
-        gauge("routers", "routers that the session is connected to", pulse.routers),
-        gauge("worker_turn_age_seconds", "since the worker's last turn", pulse.turn_age_s),
-        gauge("clock_lag_seconds", "by which the system's clock is behind", pulse.clock_lag_s),
-        gauge("report_lag_seconds", "between the end of the newest visit and its arrival", engine.report_lag_s),
-        gauge("unsettled_batches", "batches that are admitted and not on disk yet", engine.unsettled),
-        gauge("copy_away_seconds", "for which the archive's copy takes no segments", away_s),
-        gauge("lease_left_seconds", "for which it may acknowledge without renewing its lease", engine.holding.left_s),
+        Metric("failures", "counter", "failed work, which is tried again", failures, "work"),
+        Metric("runs", "counter", "runs of background jobs", runs, "work"),
+        Metric("segments", "gauge", "segments waiting for compaction", _per_kind(root, segments.paths), "kind"),
+        gauge("queue_messages", "waiting messages", pulse.queued),
+        gauge("queue_capacity", "capacity of the queue", config.queue_batches),
+        gauge("routers", "routers to which the session is connected", pulse.routers),
+        gauge("worker_turn_age_seconds", "time since the worker's last turn", pulse.turn_age_s),
+        gauge("clock_lag_seconds", "lag of the system clock", pulse.clock_lag_s),
+        gauge("report_lag_seconds", "time between the end of the newest visit and its arrival", engine.report_lag_s),
+        gauge("unsettled_batches", "admitted batches that are not on disk yet", engine.unsettled),
+        gauge("copy_away_seconds", "time for which the archive's copy has not accepted segments", away_s),
+        gauge("lease_left_seconds", "time for which the service may acknowledge without renewing its "
+                                    "lease", engine.holding.left_s),
         _serves(config, 1.0),
         gauge("cells", "cells and sectors with a belief", engine.fusion.size),
         gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
         gauge("alerts", "cells under an alert", engine.alerts),
-        gauge("damaged_files", "files set aside, as last counted", counts.get("files_set_aside", 0)),
+        gauge("damaged_files", "damaged files set aside, at the last count", counts.get("files_set_aside", 0)),
     ]  # fmt: skip
 
 
-def of_standby(config: ServiceConfig) -> list[Metric]:
-    """All values of a service that waits."""
+def standby_metrics(config: ServiceConfig) -> list[Metric]:
+    """Return all values of a waiting service."""
     return [_serves(config, 0.0)]
 
 
 def _serves(config: ServiceConfig, value: float) -> Metric:
-    text = "1 where this service serves its regions, 0 where it stands by for them"
+    text = "1 if this service serves its regions, 0 if it is their standby"
     return Metric("serves", "gauge", text, {" ".join(sorted(config.regions)): value}, "regions")
 
 
-def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
-    """What is not as it should be."""
+def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
+    """Return one message per problem."""
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:
-        found.append(f"the worker has done nothing for {pulse.turn_age_s:.0f} s")
+        found.append(f"the worker has been idle for {pulse.turn_age_s:.0f} s")
     if pulse.answer_s > STALLED_S:
-        found.append(f"a tile of an answer is being made for {pulse.answer_s:.0f} s")
+        found.append(f"a tile of an answer has been in progress for {pulse.answer_s:.0f} s")
     if engine.hangs_s > STALLED_S:
-        found.append(f"a segment is being written for {engine.hangs_s:.0f} s")
+        found.append(f"a segment write has been in progress for {engine.hangs_s:.0f} s")
     if abs(pulse.clock_lag_s) > CLOCK_S:
-        found.append(f"the system's clock is {abs(pulse.clock_lag_s):.0f} s off by what is known")
+        found.append(f"the system clock differs by {abs(pulse.clock_lag_s):.0f} s from the service's time")
     if engine.copy is not None and engine.copy.trouble is not None:
         found.append(engine.copy.trouble)
     elif engine.failing:
         found.append("segments cannot be written")
     if not engine.holding.may_acknowledge:
-        found.append("the lease is not renewed, and nothing is acknowledged")
+        found.append("the lease is not renewed, so nothing is acknowledged")
     if pulse.queued > FULL * config.queue_batches:
         found.append("the queue is full")
     return found

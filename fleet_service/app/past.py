@@ -1,7 +1,7 @@
-"""The map of a past moment, rebuilt in a process of its own: its memory is bounded before it reads, and goes with it.
+"""Maps of past moments, rebuilt in a separate process: its memory is bounded in advance and returned at the end.
 
-That process (`past_process`) reads questions, a line of JSON each, and writes the replies, each after its tile and
-length; the last of a question is a tile of -1, an error, or of -2, the end.
+That process (`past_process`) reads questions as lines of JSON and writes the replies, each after its tile and length.
+Tile -1 marks an error and -2 the end of an answer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import BinaryIO, Final, NamedTuple
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.replay.rebuild import Box, past, rows_near, too_much
+from fleet_service.replay.rebuild import Box, past_fusion, rows_near, too_much
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
 from fleet_service.serve.tile_cache import TileCache
@@ -38,8 +38,11 @@ _ERROR, _END = -1, -2
 
 
 class PastQuery(NamedTuple):
-    """A query about a moment [ns], with the lateness that the service had [s]; `only`: the one tile that is wanted;
-    `public`: vehicles that a cell must have had lately to be shown."""
+    """Query about a moment [ns].
+
+    It has the lateness of the service [s], `only` (the only selected tile) and `public` (minimum number of recent
+    vehicles of a visible cell).
+    """
 
     query: MapQuery
     at: int
@@ -48,8 +51,8 @@ class PastQuery(NamedTuple):
     public: int = 1
 
 
-class PastMaps:
-    """Answers about the past. A process is kept for the next question for IDLE_S: it takes a second to begin.
+class HistoricalMaps:
+    """Answers about the past. The process is kept for IDLE_S for the next question, because it takes a second to start.
 
     Args:
         root: of the archive.
@@ -60,10 +63,10 @@ class PastMaps:
         self._idle: _Process | None = None
 
     def ask(self, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
-        """Tile and payload of every reply.
+        """Yield tile and payload of every reply.
 
         Raises:
-            InputError: it would have to read too much, or the archive cannot be read.
+            InputError: too much would have to be read, or the archive cannot be read.
             ChildProcessError: the process died.
         """
         box = box_of(question)
@@ -87,12 +90,12 @@ class PastMaps:
                 left.end()
 
     def close(self) -> None:
-        """End the process that waits."""
+        """End the idle process."""
         if process := self._kept(None):
             process.end()
 
     def _asked(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """A process that answers the question, and the head of its first reply."""
+        """Return a process that answers the question, and the head of its first reply."""
         if process := self._kept(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
                 return process, process.ask(question)
@@ -105,13 +108,13 @@ class PastMaps:
             raise
 
     def _kept(self, process: _Process | None) -> _Process | None:
-        """Keep a process for the next question, or none; returns what was kept before."""
+        """Keep a process for the next question, or none; return the one kept before."""
         self._idle, before = process, self._idle
         return before
 
 
 class _Process:
-    """One that answers a question after the other, and leaves when none comes for a while."""
+    """Process that answers one question after the other, and exits when none arrives for a while."""
 
     def __init__(self, root: Path) -> None:
         command = [sys.executable, "-m", "fleet_service.app.past_process", str(root)]
@@ -121,20 +124,20 @@ class _Process:
         self._in, self.out = self._child.stdin, self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
-        """Ask; returns the head of the first reply."""
-        self._in.write(encoded(question))
+        """Ask; return the head of the first reply."""
+        self._in.write(encode_question(question))
         self._in.flush()
         return self.head()
 
     def head(self) -> bytes:
-        """The head of the next reply; ChildProcessError: it is gone."""
+        """Return the head of the next reply; ChildProcessError if the process has ended."""
         head = self.out.read(_HEAD.size)
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past could not be rebuilt ({self._child.wait()})")
         return head
 
     def end(self) -> None:
-        """End it, whatever it does."""
+        """Kill it."""
         self._child.kill()
         with suppress(BrokenPipeError):
             self._in.close()
@@ -143,7 +146,7 @@ class _Process:
 
 
 def box_of(question: PastQuery) -> Box | None:
-    """What a query looks at, if that is less than everything."""
+    """Return the box that a query reads; None for the whole map."""
     query = question.query
     if query.route is not None:
         longitudes, latitudes = zip(*query.route, strict=True)
@@ -154,8 +157,8 @@ def box_of(question: PastQuery) -> Box | None:
     return query.bbox
 
 
-def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
-    """Tile and payload of every reply.
+def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
+    """Yield tile and payload of every reply.
 
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.
@@ -164,19 +167,19 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
     def listener(fusion: Fusion) -> Callable[[Observations], None]:
         heard.append(Visitors(fusion))
-        return heard[0].heard
+        return heard[0].add
 
     listening = listener if question.public > 1 else None
     try:
-        then = past(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
+        then = past_fusion(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
     except OSError as error:
         raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
     cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 
-def encoded(question: PastQuery) -> bytes:
-    """A question as a line, for `answer_line`."""
+def encode_question(question: PastQuery) -> bytes:
+    """Return a question as a line for `answer_line`."""
     return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode() + b"\n"
 
 
@@ -185,7 +188,7 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
     heard = json.loads(line)
     question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:
-        for tile, payload in replies(root, question):
+        for tile, payload in replies_to(root, question):
             out.write(_HEAD.pack(tile, len(payload)) + payload)
         out.write(_HEAD.pack(_END, 0))
     except InputError as error:
@@ -195,7 +198,7 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
 
 
 def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
-    """Answer until nobody asks for IDLE_S, ANSWERS at the most."""
+    """Answer until no question arrives for IDLE_S, or ANSWERS were given."""
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
     for _ in range(ANSWERS):

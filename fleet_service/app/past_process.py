@@ -1,4 +1,4 @@
-"""`python -m fleet_service.app.past_process ARCHIVE`: questions about the past from stdin, their replies to stdout."""
+"""`python -m fleet_service.app.past_process ARCHIVE`: answers questions about the past, from stdin to stdout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Answer them."""
+    """Answer the questions."""
     limit_memory(*UNUSED)  # before anything loads what it keeps out: 40 MB
     from fleet_service.app.past import answer_all
 

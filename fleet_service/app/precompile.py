@@ -1,4 +1,4 @@
-"""Kernels loaded or compiled before the service is ready: compiling takes seconds, and vehicles wait meanwhile."""
+"""Loads or compiles kernels before the service is ready, because compiling takes seconds while vehicles wait."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fleet_service.fusion.likelihoods import at_least, levelled, supported
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import shares
 from fleet_service.ingest.budgets import Tracks
-from fleet_service.ingest.grouping import grouped, largest_of
+from fleet_service.ingest.grouping import group_rows, largest_of
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from schemas import mugrid
@@ -28,8 +28,8 @@ DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
 def warm_up() -> None:
-    """Load the kernels. If they were never compiled, a process of its own does it: the compiler leaves a hundred
-    megabytes of holes, into which a service would grow for hours."""
+    """Load the kernels. If they were never compiled, a separate process compiles them: the compiler leaves a hundred
+    megabytes of fragmented memory, into which a service would grow for hours."""
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
         beside = subprocess.run([sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False)
@@ -41,17 +41,17 @@ def warm_up() -> None:
 
 
 def live() -> None:
-    """Take a throw-away map through its life: update, grow, advance, update late within the window, commit, believe."""
+    """Run a temporary map through its life: update, grow, advance, update late within the window, commit, believe."""
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
         o = _visits(epoch * EPOCH_NS, cells)
-        Alerts(fusion).updated(fusion.update(o).slots)
+        Alerts(fusion).update(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
     supported(levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
     column = np.zeros(1, np.int64)  # as Arrow hands it out: not to be written to
     column.flags.writeable = False
-    group, _ = grouped(np.zeros(1, np.int64), column, column)
+    group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
     Tracks().impossible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     shares(np.ones(1), np.ones(1))
@@ -59,7 +59,7 @@ def live() -> None:
 
 
 def _visits(time: int, cells: int) -> Observations:
-    """One visit to each of so many cells, by two vehicles."""
+    """Return one visit to each of `cells` cells, by two vehicles."""
     one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
     flat = as_reported(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))))
     return Observations(

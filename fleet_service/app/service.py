@@ -19,8 +19,8 @@ import zenoh
 
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import Upkeep, archive_jobs
-from fleet_service.app.metrics import Pulse, metrics, troubles
+from fleet_service.app.jobs import BackgroundJobs, archive_jobs
+from fleet_service.app.metrics import Pulse, health_problems, metrics
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
@@ -28,15 +28,15 @@ from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 from fleet_service.shards import moving
-from fleet_service.shards.holding import Holding
-from fleet_service.shards.serving import claimed, successors
-from fleet_service.shards.serving import serving as serving_regions
+from fleet_service.shards.holding import Ownership
+from fleet_service.shards.serving import announce_regions as serving_regions
+from fleet_service.shards.serving import claim_regions, watch_successors
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
 from schemas.runtime import watchdog, zenoh_session
-from schemas.runtime.metrics import serving
-from schemas.runtime.process import Line
+from schemas.runtime.metrics import serve_metrics
+from schemas.runtime.process import LogLine
 from schemas.wire import Alert, Kind
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
@@ -52,20 +52,20 @@ LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
 class Service:
-    """One service.
+    """One running service.
 
     Args:
         config: settings.
         root: of the archive.
-        log_line: takes the lines for the operator.
-        holding: of the archive; None: it is taken without a lease.
+        log_line: called with lines for the operator.
+        holding: ownership of the archive; None to open it without a lease.
 
     Raises:
         InputError: the archive belongs to another service.
     """
 
     def __init__(
-        self, config: ServiceConfig, root: Path, log_line: Callable[[str], None], holding: Holding | None = None
+        self, config: ServiceConfig, root: Path, log_line: Callable[[str], None], holding: Ownership | None = None
     ) -> None:
         self._config, self._root, self._log_line = config, root, log_line
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
@@ -75,7 +75,7 @@ class Service:
         self._replies = MapQueryable(Answering(self.engine.size, self._answer), self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
-        self._upkeep = Upkeep(jobs, self.engine.counts, log_line)
+        self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
@@ -86,7 +86,7 @@ class Service:
         self._followed = False  # by a service that has the lease now
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set; then flush, acknowledge and leave."""
+        """Serve until `stop` is set; then flush, acknowledge and stop."""
         if self.engine.holding.lease is not None:
             self.engine.holding.lease.serves = self._works
         try:
@@ -99,22 +99,22 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """0 where all that was admitted is on disk and nothing failed, else 1: also where another took over."""
+        """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another service took over."""
         return 1 if self.failure is not None or self._followed or self.engine.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         config = self._config
         with (
             session,
-            claimed(session, config.name, config.regions, stop, self.engine.holding.former) as mine,
-            successors(session, mine) as came,
+            claim_regions(session, config.name, config.regions, stop, self.engine.holding.former) as mine,
+            watch_successors(session, mine) as came,
             self._upkeep,
             self._declared(session),
             serving_regions(session, mine),
         ):
             self._session = session
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
-            watchdog.alive()
+            watchdog.notify_alive()
             try:
                 while not (stop.is_set() or self._lost(came) or self.engine.holding.leaves):
                     self._step(session, stop)
@@ -125,27 +125,28 @@ class Service:
                 raise
 
     def _lost(self, came: Callable[[], bool]) -> bool:
-        """Whether another has taken over, by the lease, or by its tokens while the bucket does not say."""
+        """Return True if another service has taken over, by the lease, or by its tokens while the bucket does not
+        answer."""
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
-            holding.give_up()
+            holding.mark_lost()
         return holding.lost
 
     def _hanging(self) -> str | None:
-        """What has died or hangs beside the worker, so that only another start helps."""
+        """Return what has died or hangs next to the worker, so that only a restart helps."""
         if self.engine.hangs_s >= HANGS_S:
-            return f"a segment is being written for {self.engine.hangs_s:.0f} s"
+            return f"a segment write has been in progress for {self.engine.hangs_s:.0f} s"
         if self._replies.hangs_s >= HANGS_S:
-            return f"a tile of an answer is being made for {self._replies.hangs_s:.0f} s"
-        return "upkeep has ended" if self._upkeep.ended else None
+            return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
+        return "upkeep has ended" if self._upkeep.has_ended else None
 
     def _works(self) -> bool:
-        """Whether this service does for its regions what a successor could do."""
+        """Return True if this service can do for its regions what a successor could do."""
         session, turn_age_s = self._session, time.monotonic() - self._stepped_at
         return session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
 
     def _monitored(self) -> AbstractContextManager[str | None]:
-        """Metrics and health, where the settings want them."""
+        """Serve metrics and health if the settings ask for it."""
         config, engine, root = self._config, self.engine, self._root
 
         def pulse() -> Pulse:
@@ -153,10 +154,10 @@ class Service:
             lag_s, turn_s = self._clock.lag() * 1e-9, time.monotonic() - self._stepped_at
             return Pulse(turn_s, len(self.inbox), routers, lag_s, self._replies.hangs_s)
 
-        return serving(
+        return serve_metrics(
             config.metrics_host, config.metrics_port,
             lambda: metrics(engine, pulse(), config, root),
-            lambda: troubles(engine, pulse(), config) + self._upkeep.troubles(),
+            lambda: health_problems(engine, pulse(), config) + self._upkeep.health_problems(),
         )  # fmt: skip
 
     @contextmanager
@@ -189,14 +190,14 @@ class Service:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Leave in good order, for the standby that is named."""
-        self.engine.holding.to = moving.asked(query, session, self._config.regions) or self.engine.holding.to
+        """Stop in good order, for the named standby."""
+        self.engine.holding.to = moving.answer_request(query, session, self._config.regions) or self.engine.holding.to
 
     def _standing(self, asked: zenoh.Query) -> None:
-        """Tell who came late which alerts stand."""
+        """Reply with the standing alerts, for late clients."""
         expression = asked.key_expr
         with asked:
-            for tile, alerts in self.engine.standing(
+            for tile, alerts in self.engine.standing_alerts(
                 lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
             ):
                 asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
@@ -210,12 +211,12 @@ class Service:
         self.engine.weather.enqueue(message)
 
     def _step(self, session: zenoh.Session, stop: threading.Event) -> None:
-        if self.engine.full:
+        if self.engine.is_full:
             stop.wait(IDLE_S)
         else:
             self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else IDLE_S))
         now = self._stepped_at = time.monotonic()
-        self._acknowledge(session, self.engine.written())
+        self._acknowledge(session, self.engine.end_flush())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
             self._acknowledge(session, self.engine.begin_flush())
@@ -225,29 +226,29 @@ class Service:
         self._rounds.go_on(SHARE_S if len(self.inbox) < BEHIND else 0.0)
         if now - self._repeated_at >= REPEAT_S:
             self._repeated_at = now
-            self._put_alerts(session, self.engine.repeated(REPEATED))
+            self._put_alerts(session, self.engine.alerts_to_repeat(REPEATED))
         if now - self._reported_at >= STATUS_S:
             self._status(now)
             if hanging := self._hanging():
-                self._log_line(f"no sign of life is given: {hanging}")
+                self._log_line(f"watchdog signal withheld: {hanging}")
             else:
-                watchdog.alive()
+                watchdog.notify_alive()
         if not self._survived and now - self._began >= SURVIVED_S:
             self._survived = True
-            self.engine.survived()
+            self.engine.mark_survived()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
+        """Process and settle waiting messages within LEAVE_S; senders keep the rest."""
         if self.engine.holding.lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
-            self._log_line("followed: another service has the lease; what it did not get its senders keep")
+            self._log_line("lease lost to another service; senders keep everything that was not acknowledged")
             return
         leaves = self.engine.holding.leaves
         if leaves:
             stop.set()
         deadline = time.monotonic() + LEAVE_S
-        while not self.engine.full and time.monotonic() < deadline:
+        while not self.engine.is_full and time.monotonic() < deadline:
             messages = self.inbox.drain(0.0)
             if not messages:
                 break
@@ -259,20 +260,22 @@ class Service:
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
-            self._put_alerts(session, take(self.engine, self._clock, messages))
+            self._put_alerts(session, ingest_messages(self.engine, self._clock, messages))
 
     def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
         for vehicle, ack in acks:
-            put(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
+            publish(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
     def _put_tile(self, tile: int) -> None:
         stream = self.engine.tile(tile, self._clock.now())
         if stream and self._session is not None:
-            put(self._session, keys.map_key(tile), stream, wire.ARROW)
+            publish(self._session, keys.map_key(tile), stream, wire.ARROW)
 
     def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
         for alert in alerts:
-            put(session, keys.alert_key(int(grid.tile_of(alert.cell))), wire.encode_alert(alert), wire.ALERT_ENCODING)
+            publish(
+                session, keys.alert_key(int(grid.tile_of(alert.cell))), wire.encode_alert(alert), wire.ALERT_ENCODING
+            )
 
     def _status(self, now: float) -> None:
         counts = self.engine.counts
@@ -284,24 +287,24 @@ class Service:
             f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
             f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
-            + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
-            + (f"; the system's clock has jumped {-behind:.0f} s ahead, no report agrees" if behind <= -LAG_S else "")
+            + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
+            + (f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it" if behind <= -LAG_S else "")
         )
-        self._log_line(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
+        self._log_line(LogLine(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
     def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
         return self.engine.answer(wanted, near, self._clock.now(), only)
 
 
-def take(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
-    """Let an engine take messages now, and the clock hear what time they tell."""
+def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
+    """Let an engine process messages now, and pass their times to the clock."""
     alerts = engine.ingest(messages, clock.moment())
-    clock.heard(engine.times)
+    clock.record_reports(engine.times)
     return alerts
 
 
-def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
-    """Put with the quality of service of the key's topic."""
+def publish(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
+    """Publish with the quality of service of the key's topic."""
     topic = keys.parse(key).topic
     congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
     session.put(

@@ -1,4 +1,4 @@
-"""What other threads want the worker to do between two segments."""
+"""Work that other threads want the worker to do between two segments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Tasks:
-    """A queue of such work, true while there is some."""
+    """Queue of such work; true if it is not empty."""
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
@@ -24,7 +24,7 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Have something done and return what that gave; None if stopped meanwhile.
+        """Queue work and return its result; None if stopped meanwhile.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -42,7 +42,7 @@ class Tasks:
                 raise OSError("no segment could be written for so long")
 
     def do(self) -> None:
-        """Do all of it: by the worker."""
+        """Do all queued work; called by the worker."""
         while self:
             done, work = self._queue.get()
             if done.set_running_or_notify_cancel():

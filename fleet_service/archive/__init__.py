@@ -1,1 +1,1 @@
-"""The archive: durable segments that are the log, the keys of the pseudonyms, and reading it all back."""
+"""The archive: durable segments (the log), keys of the pseudonyms, and reading all rows."""

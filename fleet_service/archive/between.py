@@ -1,7 +1,7 @@
-"""Which rows are wanted, by the range of a column: what a file's statistics can tell before anything is read.
+"""Row filter by the range of a column, which a file's statistics can evaluate before anything is read.
 
-Ranges and not expressions of Arrow's, whose machinery brings pandas along: 40 MB of a process, and a scan that holds
-several row groups whole.
+Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their scan holds several
+complete row groups in memory.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import pyarrow.parquet as pq
 Bound = int | float | str | None
 
 
-class Between(NamedTuple):
-    """Rows whose value lies from `least` to `most`, both included; None: without an end. Times are whole microseconds.
-    A row without a value is not wanted."""
+class ValueRange(NamedTuple):
+    """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are whole microseconds. A
+    row without a value is not selected."""
 
     column: str
     least: Bound = None
     most: Bound = None
 
 
-Where = Sequence[Between]
+Where = Sequence[ValueRange]
 
 
-def those(table: pa.Table, where: Where) -> pa.Table:
-    """The rows of a table that are wanted; it has all of the columns."""
+def filter_table(table: pa.Table, where: Where) -> pa.Table:
+    """Return the selected rows of a table, with all columns."""
     for column, least, most in where:
         values = table[column]
         if pa.types.is_timestamp(values.type):
@@ -41,8 +41,8 @@ def those(table: pa.Table, where: Where) -> pa.Table:
     return table
 
 
-def groups(footer: pq.FileMetaData, where: Where) -> list[int]:
-    """Row groups of a file that may hold rows that are wanted, by their statistics."""
+def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
+    """Return the row groups of a file that may hold selected rows, by their statistics."""
     places = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
     known = [(places[one.column], one) for one in where if one.column in places]
     return [
@@ -52,7 +52,7 @@ def groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     ]
 
 
-def _may(statistics: Any, wanted: Between) -> bool:  # noqa: ANN401 pyarrow's has no name
+def _may(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's has no name
     if statistics is None or not statistics.has_min_max:
         return True
     least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])

@@ -1,6 +1,6 @@
-"""Object storage by obstore: S3 and what speaks like it, GCS, Azure. Nothing hangs, and no error shows a credential.
+"""Object storage by obstore: S3 and compatible, GCS, Azure. Every request ends, and no error shows a credential.
 
-An object is there whole or not at all, and durable when its put has returned; a put that timed out may have landed.
+An object is either complete or absent, and durable when its put has returned. A put that timed out may have succeeded.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _TEXT: Final = 160  # characters of an error; what the server says as XML may na
 
 
 class CopyError(OSError):
-    """The second place does not take or give an object; it is tried again."""
+    """The bucket does not accept or return an object; the request may be repeated."""
 
 
 class ObjectBucket:
     """Objects below a URL.
 
     Args:
-        url: as s3://bucket/folder.
-        options: as obstore takes them beside the environment: endpoint, region, access_key_id …
-        timeout_s: of one request, as a whole.
+        url: for example s3://bucket/folder.
+        options: of obstore, in addition to the environment: endpoint, region, access_key_id …
+        timeout_s: of one request in total.
 
     Raises:
-        InputError: obstore is not installed, or does not know the URL or an option.
+        InputError: obstore is not installed, or does not accept the URL or an option.
     """
 
     def __init__(self, url: str, options: Mapping[str, str], timeout_s: float) -> None:
@@ -66,20 +66,20 @@ class ObjectBucket:
             raise InputError("archive.store", f"is not as {url} wants it ({reason(error)})", fix) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Put an object, in place of one that is there.
+        """Put an object; replace an existing one.
 
         Raises:
-            CopyError: it is not known to have landed.
-            FileNotFoundError: the file to be put is gone.
+            CopyError: it is unknown whether the put succeeded.
+            FileNotFoundError: the file to upload does not exist any more.
         """
         with self._telling(name):
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
-        """Put an object that must be new, or be these very bytes: then a put that timed out had landed.
+        """Put an object that must be new or hold these very bytes already, because a put that timed out had succeeded.
 
         Raises:
-            CopyError: as `put`, or it is another's.
+            CopyError: as for `put`, or the object has other content.
         """
         with self._telling(name):
             try:
@@ -89,10 +89,10 @@ class ObjectBucket:
                     raise CopyError(f"{name}: another service has put an object of this name") from None
 
     def make(self, name: str, content: bytes) -> bool:
-        """Put an object that must be new; whether it is this one that is there then.
+        """Create an object; return True if the existing object is this one.
 
         Raises:
-            CopyError: as `put`.
+            CopyError: as for `put`.
         """
         with self._telling(name):
             try:
@@ -102,7 +102,7 @@ class ObjectBucket:
         return True
 
     def names(self, folder: str) -> list[str]:
-        """Names of the objects in a folder, and below.
+        """Return the names of the objects in a folder and its subfolders.
 
         Raises:
             CopyError: they cannot be listed.
@@ -111,7 +111,7 @@ class ObjectBucket:
             return [meta["path"] for page in self._do.list(self._store, prefix=folder) for meta in page]
 
     def get(self, name: str) -> bytes | None:
-        """An object; None if there is none.
+        """Return an object; None if it does not exist.
 
         Raises:
             CopyError: it cannot be read.
@@ -123,17 +123,17 @@ class ObjectBucket:
                 return None
 
     def parts(self, name: str) -> Iterator[bytes]:
-        """An object, a piece at a time.
+        """Yield the content of an object in pieces.
 
         Raises:
-            CopyError: as `get`, or there is none.
+            CopyError: as for `get`, or it does not exist.
         """
         with self._telling(name):
             for part in self._do.get(self._store, name).stream():
                 yield bytes(part)
 
     def sizes(self) -> dict[str, int]:
-        """Names of all objects, and bytes.
+        """Return names and sizes [bytes] of all objects.
 
         Raises:
             CopyError: they cannot be listed.
@@ -142,10 +142,10 @@ class ObjectBucket:
             return {meta["path"]: meta["size"] for page in self._do.list(self._store) for meta in page}
 
     def delete(self, name: str) -> None:
-        """Delete an object, if there is one.
+        """Delete an object if it exists.
 
         Raises:
-            CopyError: it may be there still.
+            CopyError: it may still exist.
         """
         with self._telling(name):
             try:
@@ -168,7 +168,7 @@ class ObjectBucket:
 
 
 def reason(error: BaseException) -> str:
-    """The first words of an error: no headers, nothing of what the server answered, and not how long it took, so that
-    the same trouble is the same line."""
+    """Return the first words of an error, without headers, response body and duration, so that the same problem gives
+    the same line."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return _TOOK.sub("", line.partition("<")[0]).strip()[:_TEXT]

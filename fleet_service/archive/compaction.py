@@ -1,4 +1,4 @@
-"""From the log to the data set: inbox rows, sorted by cell and time, as one file per date and zone.
+"""Compaction: rows of the inbox, sorted by cell and time, become one file per date and zone.
 
 A round takes the oldest segments and only adds:
 
@@ -6,8 +6,8 @@ A round takes the oldest segments and only adds:
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
-It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted
-if a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
+It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted if
+a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.archive import layout, reading, readme, segments, terms
-from fleet_service.archive.files import COMPACTED, exclusive, sync_tree, write_table
-from fleet_service.archive.load import conformed, content, set_aside
+from fleet_service.archive.files import COMPACTED, lock_file, sync_tree, write_table
+from fleet_service.archive.load import conform_columns, content, set_aside
 from fleet_service.archive.version import KEY, VERSION
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
@@ -32,32 +32,32 @@ from schemas.wire import Kind
 ROUND_ROWS: Final = 1_000_000
 
 
-class Compacted(NamedTuple):
-    """What a compaction did: rows moved, segments deleted, files added."""
+class CompactionResult(NamedTuple):
+    """Result of a compaction: rows moved, segments deleted, files added."""
 
     rows: int
     segments: int
     files: int
 
 
-def alone(root: Path) -> BinaryIO:
-    """Take the compacted files for this process, until the handle is closed.
+def lock_compacted(root: Path) -> BinaryIO:
+    """Lock the compacted files for this process until the handle is closed.
 
     Raises:
-        InputError: another process adds to them, or rewrites them.
+        InputError: another process adds to them or rewrites them.
     """
-    return exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended")
+    return lock_file(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended")
 
 
 @contextmanager
-def compacting(root: Path) -> Iterator[None]:
-    """Be the only one that adds to, or rewrites, the compacted files.
+def hold_compaction_lock(root: Path) -> Iterator[None]:
+    """Lock the compacted files while the block runs.
 
     Raises:
-        InputError: it is no archive, or another process does.
+        InputError: the folder is no archive, or another process has the lock.
     """
-    layout.insist_on_archive(root)
-    with alone(root):
+    layout.require_archive(root)
+    with lock_compacted(root):
         drafts = root / "drafts"
         drafts.mkdir(exist_ok=True)
         for draft in drafts.iterdir():  # of a run that died
@@ -65,7 +65,7 @@ def compacting(root: Path) -> Iterator[None]:
         yield
 
 
-def compact(root: Path, round_rows: int = ROUND_ROWS) -> Compacted:
+def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
     """Move all rows of the inbox into the compacted files.
 
     Args:
@@ -76,24 +76,24 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> Compacted:
         InputError: another process compacts it.
         OSError: a file cannot be read or written; nothing is lost.
     """
-    total = Compacted(0, 0, 0)
-    with compacting(root):
+    total = CompactionResult(0, 0, 0)
+    with hold_compaction_lock(root):
         readme.keep(root)
-        term = terms.of(root)
+        term = terms.read_epoch(root)
         for kind in Kind:
             waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
-            done = reading.compacted(layout.compacted(root, kind), {path.name for path in waiting})
+            done = reading.compacted_partitions(layout.compacted_files(root, kind), {path.name for path in waiting})
             # A run that died, or found the disk full, may have left its files in place with their names not yet synced:
             # the segments that they stand for may only be deleted when power loss can no longer forget them.
             sync_tree(root, {part.folder(root, layout.TABLES[kind]) for parts in done.values() for part in parts})
             rest = _Rest(root, kind, iter(waiting), done, term)
             while (moved := _round(rest, round_rows)).segments:
-                total = Compacted(*map(sum, zip(total, moved, strict=True)))
+                total = CompactionResult(*map(sum, zip(total, moved, strict=True)))
     return total
 
 
 class _Rest(NamedTuple):
-    """Segments that wait, old ones first, and where an earlier run compacted some of their rows."""
+    """Segments that wait, oldest first, and the partitions to which an earlier run moved some of their rows."""
 
     root: Path
     kind: Kind
@@ -102,8 +102,8 @@ class _Rest(NamedTuple):
     term: int
 
 
-def _round(rest: _Rest, most: int) -> Compacted:
-    """Move the next segments: so many rows, or one segment at least."""
+def _round(rest: _Rest, most: int) -> CompactionResult:
+    """Move the next segments: about `most` rows, or at least one segment."""
     sources: list[Path] = []
     tables: list[pa.Table] = []
     newest = VERSION
@@ -112,31 +112,34 @@ def _round(rest: _Rest, most: int) -> Compacted:
         if found is not None:
             sources.append(path)
             newest = max(newest, found.version)
-            tables.append(reading.without(found.table, rest.kind, rest.done.get(path.name, set())))
+            tables.append(reading.drop_compacted(found.table, rest.kind, rest.done.get(path.name, set())))
     if not sources:
-        return Compacted(0, 0, 0)
-    table = together(tables, segments.SCHEMAS[rest.kind])
+        return CompactionResult(0, 0, 0)
+    table = join_versions(tables, segments.SCHEMAS[rest.kind])
     named = json.dumps(runs(path.name for path in sources))
     footer = {KEY: str(newest), reading.SOURCES.decode(): named}
-    files = _place(rest.root, rest.kind, layout.signed(sources[-1].name, rest.term), table, footer)
+    files = _place(rest.root, rest.kind, layout.compacted_name(sources[-1].name, rest.term), table, footer)
     for path in sources:
         path.unlink()
     sync_directory(segments.folder(rest.root, rest.kind))
-    return Compacted(table.num_rows, len(sources), files)
+    return CompactionResult(table.num_rows, len(sources), files)
 
 
-def together(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
-    """Rows of segments of several versions: the columns that are known, null where a segment has none, and behind them
-    those that only a newer version knows, so that nothing is lost on the way back to it."""
+def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
+    """Join rows of segments of several versions.
+
+    The result has the known columns, null where a segment has none. Columns that only a newer version knows follow, so
+    that a downgrade loses nothing.
+    """
     others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
     schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
-    return pa.concat_tables([conformed(table, schema) for table in tables])
+    return pa.concat_tables([conform_columns(table, schema) for table in tables])
 
 
 def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]) -> int:
-    """Write the files of a round and rename them into place; returns how many."""
+    """Write the files of a round and rename them into place; return their number."""
     drafts: list[tuple[Path, Path]] = []
-    for partition, part in partitioned(table, kind):
+    for partition, part in split_by_partition(table, kind):
         path = partition.folder(root, layout.TABLES[kind]) / name
         draft = root / "drafts" / f"{len(drafts)}.parquet"
         write_table(part, draft, COMPACTED, footer, named=False)
@@ -149,7 +152,7 @@ def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[s
 
 
 def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
+    """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
     out: list[tuple[str, int, int]] = []
     for name in names:
         prefix, n = Path(name).stem.rpartition("-")[0], layout.age(name)[1]
@@ -160,8 +163,8 @@ def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
     return out
 
 
-def partitioned(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
-    """Rows of each date and zone, sorted by cell and time."""
+def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
+    """Yield the rows of each date and zone, sorted by cell and time."""
     if not table.num_rows:
         return
     table = table.combine_chunks()

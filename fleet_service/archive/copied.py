@@ -1,4 +1,4 @@
-"""Which files of an archive are in its copy, and as which they were put: a journal beside them.
+"""Journal of uploads: the files of an archive that are in its copy, with size and time at the upload.
 
     ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each delete, [name]
 
@@ -14,30 +14,30 @@ from pathlib import Path
 from threading import Lock
 from typing import Final, NamedTuple
 
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 NAME: Final = "copied"
 
 
 class Stamp(NamedTuple):
-    """Tells a file from what it was before: bytes, and when it was written [ns]."""
+    """Identifies a version of a file: size, and time of the last write [ns]."""
 
     size: int
     time: int
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Of a file, now.
+    """Return the stamp of a file.
 
     Raises:
-        FileNotFoundError: it is gone.
+        FileNotFoundError: it does not exist any more.
     """
     found = path.stat()
     return Stamp(found.st_size, found.st_mtime_ns)
 
 
-class Copied:
-    """The journal of one archive and one copy; one of another copy counts for nothing.
+class UploadJournal:
+    """Journal of one archive and one copy; the journal of another copy is ignored.
 
     Args:
         root: of the archive.
@@ -58,43 +58,43 @@ class Copied:
                 self._stamps.pop(name, None)
                 if stamp:
                     self._stamps[name] = Stamp(*map(int, stamp))
-        with written(path) as file:
+        with open_durably(path) as file:
             rest = [json.dumps([name, *stamp]) for name, stamp in self._stamps.items()]
             file.write("".join(f"{line}\n" for line in [head, *rest]).encode())
         self._file = path.open("ab", buffering=0)
 
-    def all(self) -> dict[str, Stamp]:
-        """Names of what is in the copy, and as what it was put; as it is now."""
+    def stamps(self) -> dict[str, Stamp]:
+        """Return the names in the copy, each with its stamp at the upload; a snapshot."""
         with self._guard:
             return dict(self._stamps)
 
-    def of(self, name: str) -> Stamp | None:
-        """As what a file was put; None: it was not."""
+    def stamp(self, name: str) -> Stamp | None:
+        """Return the stamp at a file's upload; None if it was not uploaded."""
         return self._stamps.get(name)
 
     def add(self, name: str, stamp: Stamp) -> None:
-        """Note a put."""
+        """Record an upload."""
         with self._guard:
             self._file.write(f"{json.dumps([name, *stamp])}\n".encode())
             self._stamps[name] = stamp
 
     def remove(self, name: str) -> None:
-        """Note a delete."""
+        """Record a deletion."""
         with self._guard:
             self._file.write(f"{json.dumps([name])}\n".encode())
             self._stamps.pop(name, None)
 
     def sync(self) -> None:
-        """Make the notes durable."""
+        """Make the records durable."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Leave the journal."""
+        """Close the journal."""
         self._file.close()
 
 
-def copy_of(root: Path) -> str | None:
-    """URL of the copy that an archive had last; None: it has none."""
+def last_copy_url(root: Path) -> str | None:
+    """Return the URL of the last copy of an archive; None if it had none."""
     with suppress(OSError, ValueError, KeyError, TypeError), (root / NAME).open() as file:
         return str(json.loads(file.readline())["copy"])
     return None

@@ -1,9 +1,9 @@
-"""The second place of an archive: a bucket that holds what the folder holds, under the same names.
+"""Bucket replica of an archive: the same files under the same names.
 
-What an acknowledgement rests on (segments, keys, who the vehicles are) is put before it (`settle`). All else follows
-(`follow`): puts first, then deletes, so that at any instant the copy holds every row at least once, as the folder does.
-A start (`begin`) gets what only the bucket has, on an empty disk all, and puts what only the folder has.
-Only what the journal knows to have been here is deleted there.
+Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it
+(`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any instant the copy holds
+every row at least once, like the folder. A start (`begin`) downloads what only the bucket has (everything onto an empty
+disk), and uploads what only the folder has. Only objects recorded in the journal are deleted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Final
 
 from fleet_service.archive import layout
 from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copied import Copied, Stamp, stamp_of
+from fleet_service.archive.copied import Stamp, UploadJournal, stamp_of
 from fleet_service.archive.files import sync_tree
 from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.load import BAD
-from fleet_service.archive.terms import Fence, Term, fence_of, newest, put_fence
+from fleet_service.archive.terms import Fence, Term, fence_of, largest_epoch, put_fence
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 LOG: Final = "inbox/"
 KEYS: Final = "keys/"
@@ -38,14 +38,14 @@ _LAST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
 _PRIVATE: Final = ("tried",)  # notes of this disk
 QUICK_S: Final = 5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
 SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
-TURN_S: Final = 20.0  # of `settle`, which then says that it has come so far
+TURN_S: Final = 20.0  # of `upload_segments`, which then says that it has come so far
 BACK_OFF_S: Final = 0.5  # after the first failure; doubles
 MOST_BACK_OFF_S: Final = 8.0
 _AT_ONCE: Final = 8  # requests
 
 
-class Copy:
-    """The copy of one archive; `settle` from one thread, `follow` from another.
+class BucketReplica:
+    """Copy of one archive; call `upload_segments` from one thread and `sync` from another.
 
     Args:
         root: of the archive.
@@ -53,17 +53,17 @@ class Copy:
         options: of the store, see `ObjectBucket`.
 
     Raises:
-        InputError: the URL or an option is not usable, or obstore is not installed.
+        InputError: the URL or an option cannot be used, or obstore is not installed.
         OSError: the journal cannot be read or written.
 
     Attributes:
-        failures: requests of `settle` that failed.
+        failures: requests of `upload_segments` that failed.
     """
 
     def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
         self._root, self._url = root, url
         self._quick, self._slow = ObjectBucket(url, options, QUICK_S), ObjectBucket(url, options, SLOW_S)
-        self._copied = Copied(root, url)
+        self._copied = UploadJournal(root, url)
         self._following = Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
         self.failures, self._in_a_row, self._not_before, self._error = 0, 0, 0.0, ""
@@ -73,39 +73,39 @@ class Copy:
         self._term, self._fence, self._turn = Term(0, 0), Fence(0, frozenset()), 0
 
     def close(self) -> None:
-        """Leave the copy as it is."""
+        """Close the copy and leave the bucket unchanged."""
         self._pool.shutdown(cancel_futures=True)
         self._copied.close()
 
-    def under(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
+    def attach_lease(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
         """Work under a lease from now on.
 
         Args:
-            may: whether it is held for sure.
-            alone: asks the bucket that nobody has a later one; CopyError if somebody has, or it cannot be asked.
+            may: returns True if the lease is certainly held.
+            alone: checks in the bucket that no later lease exists; CopyError if one exists or the check fails.
         """
         self._may, self._alone = may, alone
 
     @property
     def away_s(self) -> float:
-        """For how long it has not taken what is to be acknowledged [s]; 0: it does."""
+        """Return for how long the bucket has not accepted data that an acknowledgement needs [s]; 0 if it does."""
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
     @property
     def trouble(self) -> str | None:
-        """What an operator is to know; None while all goes well."""
+        """Return a message for the operator; None if there is no problem."""
         if self._since is None:
             return None
         waits = f"nothing is acknowledged for {self.away_s:.0f} s"
         return f"the copy at {self._url} does not take segments, {waits}: {self._error}"
 
     def begin(self, service: str) -> int:
-        """Make folder and bucket the same: get what only the bucket has, put what only the folder has; returns how
-        many files were got. Nothing may run on the archive.
+        """Synchronise folder and bucket in both directions; return the number of downloaded files. Nothing else may use
+        the archive.
 
         Raises:
-            InputError: the bucket cannot be reached, or is another service's.
+            InputError: the bucket cannot be reached, or belongs to another service.
             OSError: the folder cannot be read or written.
         """
         try:
@@ -115,16 +115,18 @@ class Copy:
             raise InputError("archive.copy", f"{self._url} cannot be used ({error})", fix) from error
 
     def join(self, service: str | None, term: Term | None = None, *, succeeds: bool = False) -> int:
-        """As `begin`, with a lease's `term`: what a former holder puts from now on does not count.
+        """Synchronise like `begin`, under a lease's `term`: later uploads of a former holder do not count.
 
         Args:
-            service: its name; None: a standby, which follows whoever has the bucket.
-            term: of the lease; None: there is none.
-            succeeds: another machine had the lease before: what only this folder has was never acknowledged, and goes.
+            service: its name; None for a standby, which follows the owner of the bucket.
+            term: of the lease; None without one.
+            succeeds: True if another machine had the lease before: data that only this folder has was never
+                acknowledged and
+                is removed.
 
         Raises:
-            InputError: the bucket is another service's.
-            CopyError: the bucket cannot be reached; it may be tried again.
+            InputError: the bucket belongs to another service.
+            CopyError: the bucket cannot be reached; the call may be repeated.
             OSError: the folder cannot be read or written.
         """
         if service is not None:
@@ -136,23 +138,24 @@ class Copy:
         return got
 
     def epoch(self) -> int:
-        """The largest epoch of a name here or in the bucket, or 0.
+        """Return the largest epoch in a name of the folder or the bucket, or 0.
 
         Raises:
-            CopyError: it cannot be listed.
+            CopyError: the bucket cannot be listed.
         """
-        return max(newest(self._slow.sizes()), newest(self._files(FOLDERS)))
+        return max(largest_epoch(self._slow.sizes()), largest_epoch(self._files(FOLDERS)))
 
-    def get_ahead(self) -> None:
-        """Get what a later `join` would: of a standby, while another has the bucket.
+    def prefetch(self) -> None:
+        """Download for a standby, in advance, what a later `join` would, while another service owns the bucket.
 
         Raises:
-            CopyError, OSError: not all of it; compaction may take files away meanwhile.
+            CopyError, OSError: the download is incomplete; compaction may remove files meanwhile.
         """
         self._fetch(self._counting(self._slow.sizes()))
 
     def _raise_fence(self, term: Term) -> None:
-        """Of what came from now on only what is of this term counts; what does not count goes."""
+        """Write a fence for this term: later objects count only if they have its epoch. Remove objects that do not
+        count."""
         names = [name for name in self._files(FOLDERS) if (layout.term_of(name) or term.epoch) < term.epoch]
         fence = Fence(term.epoch, frozenset(names))
         self._put_fence(term, fence)
@@ -167,34 +170,35 @@ class Copy:
         self._term, self._fence = term, fence
 
     def _mirror(self) -> int:
-        """Make the folder what the bucket is, whatever it was; returns how many files were got."""
+        """Make the folder identical to the bucket; return the number of downloaded files."""
         there = self._counting(self._slow.sizes())
         for name, stamp in self._files(FOLDERS).items():
             if there.get(name) != stamp.size:
                 (self._root / name).unlink()
-        for name in self._copied.all():
+        for name in self._copied.stamps():
             if not (self._root / name).exists():
                 self._copied.remove(name)
         return self._fetch(there)
 
     def _counting(self, there: Mapping[str, int]) -> dict[str, int]:
-        """Names and bytes of the objects that count."""
+        """Return names and sizes of the objects that count."""
         fence = fence_of(self._slow)
         return {name: size for name, size in there.items() if fence.passes(name)}
 
-    def settle(self, segments: Iterable[Path]) -> None:
-        """Put segments that are written, and the keys; all of it is in the bucket when this returns.
+    def upload_segments(self, segments: Iterable[Path]) -> None:
+        """Upload written segments and the keys; all are in the bucket when this returns.
 
         Raises:
-            CopyError: not all of it is; the next call goes on, and puts nothing twice. After a failure nothing is
-                tried for a moment, and for longer after each further one.
+            CopyError: some are not; the next call continues and uploads nothing twice. After a failure there is a
+                pause,
+                which grows with each further failure.
         """
         if time.monotonic() < self._not_before:
             raise CopyError(f"is tried again: {self._error}")
         try:
-            missing = [path for path in segments if self._copied.of(self._name(path)) is None]
+            missing = [path for path in segments if self._copied.stamp(self._name(path)) is None]
             own = self._files(("keys",))
-            keys = [self._root / name for name, stamp in own.items() if self._copied.of(name) != stamp]
+            keys = [self._root / name for name, stamp in own.items() if self._copied.stamp(name) != stamp]
             self._put_soon([*keys, *missing])
         except CopyError as error:
             self.failures += 1
@@ -204,12 +208,13 @@ class Copy:
             raise
         self._in_a_row, self._since = 0, None
 
-    def follow(self) -> int:
-        """Put what is new or was rewritten, then delete what is gone; returns how many objects that changed. The log
-        is put by `settle` alone.
+    def sync(self) -> int:
+        """Upload new and rewritten files, then delete removed ones; return the number of changed objects.
+
+        Only `upload_segments` uploads the log.
 
         Raises:
-            CopyError: not all of it was done; the next call goes on.
+            CopyError: the work is incomplete; the next call continues.
             OSError: the journal cannot be written.
         """
         return self._follow(with_log=False)
@@ -235,7 +240,7 @@ class Copy:
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being put")
         try:
-            known = self._copied.all()  # before the files: what comes meanwhile is not taken for gone
+            known = self._copied.stamps()  # before the files: what comes meanwhile is not taken for gone
             local = self._files(FOLDERS)
             new = [
                 name for name, stamp in local.items()
@@ -258,7 +263,7 @@ class Copy:
             self._following.release()
 
     def _put_there(self, name: str) -> bool:
-        """Put a file; False if it has gone meanwhile."""
+        """Upload a file; False if it was removed meanwhile."""
         try:
             self._put(self._root / name, self._slow)
         except FileNotFoundError:
@@ -267,7 +272,7 @@ class Copy:
 
     def _put(self, path: Path, bucket: ObjectBucket) -> None:
         name, stamp = self._name(path), stamp_of(path)
-        if self._copied.of(name) is None and (name.startswith(LOG) or name.endswith(".key")):
+        if self._copied.stamp(name) is None and (name.startswith(LOG) or name.endswith(".key")):
             self._put_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
             bucket.put(name, path.read_bytes())  # who the vehicles are grows meanwhile, and is then put again
@@ -276,8 +281,8 @@ class Copy:
         self._copied.add(name, stamp)
 
     def _put_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Put what must be new. A key that a former service put when it had lost its lease is of rows that do not
-        count, and gives way."""
+        """Upload a file that must be new. A key that a former service uploaded after it lost its lease belongs to rows
+        that do not count, and is replaced."""
         if self._alone is None or name.startswith(LOG) or bucket.make(name, content):
             bucket.put_new(name, content)
         else:
@@ -300,12 +305,12 @@ class Copy:
             raise InputError("archive.copy", problem, "give each service a folder of its own in the bucket")
 
     def _fetch(self, there: Mapping[str, int]) -> int:
-        """Get what the bucket has and the folder has not, and note what of the folder it has not."""
+        """Download what only the bucket has, and record which files of the folder it lacks."""
         local = self._files(FOLDERS)
-        for name in self._copied.all():
+        for name in self._copied.stamps():
             if name not in there or (name in local and local[name].size != there[name]):
                 self._copied.remove(name)
-        known = self._copied.all()
+        known = self._copied.stamps()
         whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{_LAST}")}
         wanted = [
             name for name in there
@@ -324,7 +329,7 @@ class Copy:
     def _get(self, name: str) -> None:
         path, secret = self._root / name, name.startswith(KEYS)
         path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
-        with written(path, 0o600 if secret else None, named=False) as file:
+        with open_durably(path, 0o600 if secret else None, named=False) as file:
             for part in self._slow.parts(name):
                 file.write(part)
 
@@ -335,7 +340,7 @@ class Copy:
         return self._root / f"{name}{BAD}"
 
     def _files(self, folders: Iterable[str]) -> dict[str, Stamp]:
-        """Names and stamps of what is to be in the copy, in the order of the folders."""
+        """Return names and stamps of the files that belong into the copy, in the order of the folders."""
         found: dict[str, Stamp] = {}
         for folder in folders:
             for path in sorted((self._root / folder).rglob("*")):
@@ -348,22 +353,22 @@ class Copy:
 
 
 def _ours(name: str) -> bool:
-    """Whether a name is that of a file which belongs into the copy: no draft, none set aside."""
+    """Return True for the name of a file that belongs into the copy; drafts and files set aside do not."""
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
     return folder in FOLDERS and bool(rest) and not hidden and not name.endswith(BAD) and rest[-1] not in _PRIVATE
 
 
-def copy_for(config: ServiceConfig, root: Path) -> Copy | None:
-    """The copy that the settings want, which holds then what the folder holds, and the folder what it holds.
+def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
+    """Return the copy of the settings, synchronised with the folder; None without one.
 
     Raises:
-        InputError, OSError: as `Copy` and its `begin`.
+        InputError, OSError: as for `BucketReplica` and its `begin`.
     """
     wanted = config.archive
     if wanted.second is None:
         return None
-    copy = Copy(root, wanted.second, wanted.options)
+    copy = BucketReplica(root, wanted.second, wanted.options)
     try:
         copy.begin(config.name)
     except BaseException:

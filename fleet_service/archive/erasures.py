@@ -1,11 +1,11 @@
-"""Months, and vehicles in a month, that were forgotten: what was measured in them is not let in again.
+"""Forgotten months, and forgotten vehicles of a month: their measurements are not accepted again.
 
-    keys/2026-01.UNTIL.erased             empty; of that month, what was measured before UNTIL [ns]
-    keys/2026-01.PSEUDONYM.UNTIL.erased   likewise, of the vehicle that had this pseudonym; goes with the month's key
+    keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
+    keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with the month's key
 
-Without the month's key nobody can tell which batches are there already, so that one which is sent again would count
-twice; and of a vehicle whose rows were removed nothing tells either that they were there. UNTIL is the end of the
-month, or in a month that goes on the newest that the archive holds: no clock decides.
+Without the month's key nobody can tell which batches were received, so a repeated batch would count twice. If the rows
+of a vehicle were removed, nothing proves either that they were received. UNTIL is the end of the month. In the current
+month it is the newest measurement in the archive, so no clock is needed.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _EPOCH: Final = date(1970, 1, 1)
 
 
 class Span(NamedTuple):
-    """Times [ns] from `begin` on and before `until`."""
+    """Times [ns] from `begin` to before `until`."""
 
     begin: int
     until: int
 
 
 def first_day(month: str) -> date:
-    """First day of a month (2026-01).
+    """Return the first day of a month (2026-01).
 
     Raises:
-        InputError: it is none.
+        InputError: the text is not a month.
     """
     try:
         return date.fromisoformat(f"{month}-01")
@@ -49,19 +49,19 @@ def first_day(month: str) -> date:
 
 
 def span_of(month: str) -> Span:
-    """A whole month.
+    """Return the span of a month.
 
     Raises:
-        InputError: as `first_day`.
+        InputError: as for `first_day`.
     """
     first = first_day(month)
     following = (first.replace(day=28) + timedelta(days=4)).replace(day=1)
     return Span((first - _EPOCH).days * DAY_NS, (following - _EPOCH).days * DAY_NS)
 
 
-def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
-    """Let nothing of a month, or of one vehicle in it, in again that was measured until `newest` [ns], the newest that
-    the archive holds; durable when it returns.
+def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
+    """Refuse from now on measurements of a month, or of one vehicle in it, up to `newest` [ns], the newest in the
+    archive. The record is durable when this returns.
 
     Raises:
         OSError: the disk is full or broken.
@@ -79,15 +79,15 @@ def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) ->
     sync_directory(folder)
 
 
-class Erased(NamedTuple):
-    """What is not let in again: spans of all vehicles, and until when [ns] of a pseudonym, by its number."""
+class ErasedData(NamedTuple):
+    """Erased data: spans for all vehicles, and the end [ns] per pseudonym number."""
 
     months: list[Span]
     vehicles: dict[int, int]
 
 
-def read(folder: Path) -> Erased:
-    """As the folder of the keys has it."""
+def read(folder: Path) -> ErasedData:
+    """Return the erased data recorded in the folder of the keys."""
     months, vehicles = list[Span](), dict[int, int]()
     for path in sorted(folder.glob("*.erased")):
         if (name := _NAME.fullmatch(path.name)) is None:
@@ -97,11 +97,11 @@ def read(folder: Path) -> Erased:
             months.append(Span(span_of(month).begin, until))
         else:
             vehicles[number(pseudonym)] = max(until, vehicles.get(number(pseudonym), 0))
-    return Erased(months, vehicles)
+    return ErasedData(months, vehicles)
 
 
-def within(spans: Sequence[Span], time: IntArray) -> BoolArray:
-    """Which times (n,) [ns] lie in one of the spans."""
+def in_spans(spans: Sequence[Span], time: IntArray) -> BoolArray:
+    """Return which times (n,) [ns] lie in one of the spans."""
     out = np.zeros(len(time), bool)
     for begin, until in spans:
         out |= (time >= begin) & (time < until)

@@ -1,4 +1,4 @@
-"""Parts of the archive as files for other programs: GeoParquet, GeoJSON or CSV, by the ending of the name."""
+"""Export of parts of the archive as GeoParquet, GeoJSON or CSV, selected by the ending of the name."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from fleet_service.archive import geo, layout, reading, rollup, snapshots
-from fleet_service.archive.between import Between
+from fleet_service.archive.between import ValueRange
 from fleet_service.archive.files import MAP, write_table
 from fleet_service.archive.load import load
 from schemas import grid, tables
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.runtime import commandline
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 _OF_MU: Final = ("mu_sum", "mu_sum_squares", "mu_min", "mu_max", "value_sum")  # of the roll-up
@@ -30,7 +30,7 @@ Box = tuple[float, float, float, float]
 
 
 class Extract(NamedTuple):
-    """What is wanted: from, to [ns], the second excluded; west, south, east, north [deg]."""
+    """Selection: from, to [ns], the second excluded; west, south, east, north [deg]."""
 
     since: int
     until: int
@@ -38,21 +38,21 @@ class Extract(NamedTuple):
 
 
 def observations(root: Path, part: Extract) -> pa.Table:
-    """Rows of observations, inbox included, as points."""
+    """Return rows of observations, inbox included, as points."""
     where = [_within("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
-        where.append(Between("longitude", west, math.nextafter(east, -math.inf)))
-        where.append(Between("latitude", south, math.nextafter(north, -math.inf)))
+        where.append(ValueRange("longitude", west, math.nextafter(east, -math.inf)))
+        where.append(ValueRange("latitude", south, math.nextafter(north, -math.inf)))
     days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     found = [*reading.read(root, Kind.OBSERVATION, where=where, days=days), tables.OBSERVATION_ARCHIVE.empty_table()]
     table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
-    table = without(table, ("mu",), table["value"].to_numpy().astype(bool))
+    table = mask_unmeasured(table, ("mu",), table["value"].to_numpy().astype(bool))
     return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
 
 
 def snapshot_time(root: Path, part: Extract) -> int:
-    """When the last snapshot of the map before `until` was taken [ns]."""
+    """Return the time of the last snapshot of the map before `until` [ns]."""
     return snapshots.time_of(_snapshot(root, part))
 
 
@@ -63,23 +63,25 @@ def _snapshot(root: Path, part: Extract) -> Path:
     return path
 
 
-def seen_by(table: pa.Table, vehicles: int) -> pa.Table:
-    """Cells of so many vehicles or more."""
+def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
+    """Return cells with at least so many vehicles."""
     return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
 
 
 def map_then(root: Path, part: Extract) -> pa.Table:
-    """The last snapshot of the map before `until`."""
+    """Return the last snapshot of the map before `until`."""
     path = _snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
-    table = without(table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound")  # files before 1.2 say one
+    table = mask_unmeasured(
+        table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound"
+    )  # files before 1.2 say one
     return geo.with_cells(_inside(table, part.bbox))
 
 
-def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """A table whose columns `names` are null where nothing was measured: who colours by them paints no bound."""
+def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
+    """Return a table with nulls in the columns `names` where nothing was measured, so that no bound gets a colour."""
     for name in names:
         column = table[name]
         held: pa.ChunkedArray[Any] = pc.if_else(pa.array(known), column, pa.scalar(None, column.type))
@@ -88,7 +90,7 @@ def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table
 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
-    """Parts of the roll-up, with the polygons of their cells."""
+    """Return parts of the roll-up with the polygons of their cells."""
     where = [_within("hour", part)]
     days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
@@ -96,7 +98,7 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
     measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
-    table = without(table, _OF_MU, measured)
+    table = mask_unmeasured(table, _OF_MU, measured)
     return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
 
 
@@ -105,33 +107,33 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 }  # fmt: skip
 
 
-def _within(column: str, part: Extract) -> Between:
-    """Rows from the first time on, before the second."""
-    return Between(column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1)
+def _within(column: str, part: Extract) -> ValueRange:
+    """Return the filter for rows from the first time on and before the second."""
+    return ValueRange(column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1)
 
 
 def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
-    """Cells that touch a box."""
+    """Return the cells that touch a box."""
     if bbox is None:
         return table
     return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))
 
 
 def write(table: pa.Table, path: Path) -> None:
-    """Write a GeoParquet table as the ending of the name says; CSV leaves binary and nested columns out.
+    """Write a GeoParquet table in the format of the name's ending; CSV omits binary and nested columns.
 
     Raises:
-        InputError: an unknown ending, or the file cannot be written.
+        InputError: the ending is unknown, or the file cannot be written.
     """
     writer = _WRITERS.get(path.suffix)
     if writer is None:
         raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(_WRITERS)}")
-    with commandline.writing(path):
+    with commandline.report_write_errors(path):
         writer(table, path)
 
 
 def features(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """The rows of a GeoParquet table as GeoJSON has them; binary and nested columns are left out."""
+    """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are omitted."""
     flat = _flat(table)
     for geometry, *values in zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True):
         properties = dict(zip(flat.schema.names, values, strict=True))
@@ -139,17 +141,17 @@ def features(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _geojson(table: pa.Table, path: Path) -> None:
-    with written(path) as raw:
+    with open_durably(path) as raw:
         file = io.TextIOWrapper(raw, encoding="utf-8")
         file.write('{"type": "FeatureCollection", "features": [\n')
         for place, feature in enumerate(features(table)):
             file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
-        file.detach()  # flushes it; `written` closes it
+        file.detach()  # flushes it; `open_durably` closes it
 
 
 def _texts(table: pa.Table, name: str) -> list[Any]:
-    """Values as JSON has them: times as ISO 8601 text, no NaN, no digits that single precision does not have."""
+    """Return values for JSON: times as ISO 8601 text, no NaN, no digits beyond single precision."""
     column = table[name]
     if pa.types.is_timestamp(column.type):
         us = column.cast(tables.US).cast(pa.int64()).to_numpy().astype("datetime64[us]")
@@ -168,7 +170,7 @@ def _flat(table: pa.Table) -> pa.Table:
 
 
 def _csv(table: pa.Table, path: Path) -> None:
-    with written(path) as file:
+    with open_durably(path) as file:
         pacsv.write_csv(_flat(table), file)
 
 

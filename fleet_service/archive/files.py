@@ -1,4 +1,4 @@
-"""Files that survive power loss, and the lock of an archive."""
+"""Durable Parquet files, and the lock of an archive."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ import pyarrow.parquet as pq
 from fleet_service.archive import version
 from schemas import tables
 from schemas.errors import InputError
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 ROW_GROUP: Final = 128 * 1024  # rows: 5 MB, which is what a query reads at the least
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a table is written; plain encodings and zstd are read by DuckDB, pandas, polars and every Spark in use.
+    """Encoding of a table; DuckDB, pandas, polars and every Spark in use read plain encodings and zstd.
 
     Attributes:
-        dictionary: columns whose values repeat; elsewhere dictionaries cost size and time.
-        delta: columns of integers that are stored as differences.
-        index: whether statistics and page indices are for readers that look for few rows.
-        level: of zstd; 9 saves 2 % over 3 and costs eight times the time.
+        dictionary: columns with repeated values; elsewhere dictionaries cost size and time.
+        delta: integer columns stored as differences.
+        index: True to write statistics and page indices for readers of few rows.
+        level: of zstd; 9 saves 2 % over 3 and takes eight times the time.
     """
 
     dictionary: tuple[str, ...] = ()
@@ -61,17 +61,17 @@ def write_table(
     *,
     named: bool = True,
 ) -> None:
-    """Write a Parquet file that is whole and durable when this returns, or as it was before.
+    """Write a Parquet file that is complete and durable when this returns; on failure nothing changes.
 
     Args:
         table: the rows.
-        path: of the file; one that is there is replaced.
-        encoding: how.
-        footer: key-value pairs for its end, beside version and digest.
-        named: whether its name is durable too; else the caller syncs the folder.
+        path: of the file; an existing one is replaced.
+        encoding: of the columns.
+        footer: key-value pairs for the footer, in addition to version and digest.
+        named: True to make the name durable too; otherwise the caller syncs the folder.
 
     Raises:
-        OSError: the disk is full or read-only; nothing is left of it.
+        OSError: the disk is full or read-only; no draft is left.
     """
     names = table.schema.names
     options: dict[str, Any] = {
@@ -80,7 +80,7 @@ def write_table(
         "column_encoding": {name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names},
         "write_statistics": encoding.index, "write_page_index": encoding.index, "write_page_checksum": True,
     }  # fmt: skip
-    with written(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
+    with open_durably(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
         writer.write_table(table, ROW_GROUP)
         writer.add_key_value_metadata(version.footer(table.schema, footer))
 
@@ -88,7 +88,7 @@ def write_table(
 def put_in_place(
     root: Path, table: pa.Table, path: Path, encoding: Encoding, footer: Mapping[str, str] | None = None
 ) -> None:
-    """Write a file below `root`, or in place of an old one, with the folders that it wants.
+    """Write a file below `root`, with its folders; replace an old one.
 
     Raises:
         OSError: the disk is full or read-only.
@@ -105,33 +105,33 @@ def sync_tree(root: Path, folders: Iterable[Path]) -> None:
         sync_directory(folder)
 
 
-def lock(root: Path) -> BinaryIO:
-    """Take the archive for this process; it is free again when the file is closed, or the process is gone.
+def lock_archive(root: Path) -> BinaryIO:
+    """Lock the archive for this process; the lock is released when the file is closed or the process ends.
 
     Raises:
-        InputError: another service holds it, or the folder cannot be made.
+        InputError: another service holds it, or the folder cannot be created.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unusable(root, error) from error
-    return exclusive(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
+    return lock_file(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
 
 
-def held(root: Path) -> bool:
-    """Whether a service runs on an archive."""
+def is_served(root: Path) -> bool:
+    """Return True if a service runs on an archive."""
     try:
-        lock(root).close()
+        lock_archive(root).close()
     except InputError:
         return True
     return False
 
 
-def exclusive(path: Path, problem: str, fix: str) -> BinaryIO:
-    """Take a lock file for as long as the handle is open.
+def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
+    """Lock a file for as long as the handle is open.
 
     Raises:
-        InputError: another holds it (`problem` and `fix` are said), or the file cannot be made.
+        InputError: another process holds it (with `problem` and `fix`), or the file cannot be created.
     """
     try:
         file = path.open("ab")

@@ -27,18 +27,18 @@ Pieces = Sequence[Sequence[int]]
 
 
 def with_cells(table: pa.Table) -> pa.Table:
-    """A table with a column `cell`, and the cells' polygons beside it, as a GeoParquet table.
+    """Return a table with a column `cell` as a GeoParquet table with the cells' polygons.
 
-    Where it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline): no row hides another.
+    If it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline), so that no row hides another.
     """
     x, y = _outlines(table, table["cell"].to_numpy())
     return _marked(table, _binary(_polygons(x, y)), "Polygon", _extremes(x, y))
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
-    """A table of which each row is made of several cells, with these as one multi-polygon, as a GeoParquet table.
+    """Return a table whose rows consist of several cells as a GeoParquet table with one multi-polygon per row.
 
-    Of a table with a column `sector`, the quarters of that sector.
+    With a column `sector`, the polygons are the quarters of that sector.
     """
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
@@ -55,7 +55,7 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
 
 
 def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
-    """A table with points [deg], (n,) each, as a GeoParquet table."""
+    """Return a table with points [deg], (n,) each, as a GeoParquet table."""
     wkb = np.zeros(len(longitude), _POINT)
     wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
     wkb["xy"] = np.stack([longitude, latitude], axis=1)
@@ -63,7 +63,7 @@ def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) ->
 
 
 def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """The geometries of a GeoParquet table, as GeoJSON has them."""
+    """Yield the geometries of a GeoParquet table as GeoJSON."""
     written: list[Any] = table[GEOMETRY].to_pylist()
     for wkb in written:
         kind, count = struct.unpack_from("<II", wkb, 1) if len(wkb) > _POINT.itemsize else (_TYPE_POINT, 0)
@@ -76,7 +76,7 @@ def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _rings(wkb: bytes, count: int, begin: int) -> list[Any]:
-    """The rings of `count` polygons of one ring and as many corners each, from a byte on."""
+    """Return the rings of `count` polygons with one ring and equally many corners, from a byte on."""
     corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
     rings: list[Any] = np.frombuffer(wkb, _ring(corners), count, begin)["xy"][:, None].tolist()
     return rings
@@ -87,7 +87,7 @@ def _ring(corners: int) -> np.dtype[Any]:
 
 
 def _outlines(table: pa.Table, cells: IntArray, count: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
-    """Corners (n, k) of cells, of the sector of their row where it has one; `count`: cells of each row."""
+    """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number of cells per row."""
     if "sector" not in table.schema.names:
         return grid.outline(cells)
     sector = table["sector"].to_numpy()
@@ -99,7 +99,7 @@ def _extremes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 
 
 def _polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
-    """Polygons of the corners x, y (n, k), each a ring that ends where it began."""
+    """Return polygons of the corners x, y (n, k), each as a closed ring."""
     wkb = np.zeros(len(x), _ring(x.shape[1] + 1))
     wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, x.shape[1] + 1
     corners = np.stack([x, y], axis=2)

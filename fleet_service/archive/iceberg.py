@@ -1,7 +1,7 @@
-"""The compacted files as Iceberg tables: registered where they lie, nothing is copied; the inbox is never registered.
+"""Iceberg tables of the compacted files: registered without copying; the inbox is never registered.
 
-One registrar per table. What retention and forgetting remove or rewrite leaves the tables first (`let_go`), for a
-table that names a file that is gone can no longer be read.
+There is one registrar per table. Before retention and erasure remove or rewrite files, these files leave the tables
+(`unregister`), because a table that names a missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import pyarrow as pa
 
 from fleet_service.archive import layout
-from fleet_service.archive.compaction import compacting
+from fleet_service.archive.compaction import hold_compaction_lock
 from fleet_service.archive.segments import SCHEMAS
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 Catalog: TypeAlias = Any  # of pyiceberg, which an archive without tables does not need
@@ -35,12 +35,12 @@ PROPERTIES: Final = {
 
 
 class Place(NamedTuple):
-    """Where an archive is registered.
+    """Registration of an archive.
 
     Attributes:
-        catalog: a name of pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
+        catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
         namespace: of the tables `observations` and `states`.
-        at: URL under which the tables' readers find the archive's folder; its mirror or copy, or itself.
+        at: URL at which readers of the tables find the archive's folder, its mirror or its copy.
     """
 
     catalog: str
@@ -48,16 +48,16 @@ class Place(NamedTuple):
     at: str
 
 
-class Registered(NamedTuple):
-    """Files that came into the tables, files that left them, and rows that the tables have of the archive now."""
+class RegistrationResult(NamedTuple):
+    """Result: files added to the tables, files removed from them, and rows of the archive in them."""
 
     added: int
     dropped: int
     rows: int
 
 
-def register(root: Path, place: Place) -> Registered:
-    """Make the tables name the compacted files of an archive as they are; again, it changes nothing.
+def register(root: Path, place: Place) -> RegistrationResult:
+    """Register the compacted files of an archive in the tables; a repeated call changes nothing.
 
     Files of other archives in the same tables stay.
 
@@ -65,20 +65,20 @@ def register(root: Path, place: Place) -> Registered:
         InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at `place.at`.
         OSError: the archive cannot be read or written.
     """
-    total = Registered(0, 0, 0)
-    with compacting(root):  # nobody removes or rewrites files meanwhile
+    total = RegistrationResult(0, 0, 0)
+    with hold_compaction_lock(root):  # nobody removes or rewrites files meanwhile
         _remember(root, place)
         with _said(place):
             catalog = _catalog(place)
             catalog.create_namespace_if_not_exists(place.namespace)
             for kind in Kind:
                 done = _brought_up(_table(catalog, place, kind), root, place, kind)
-                total = Registered(*map(sum, zip(total, done, strict=True)))
+                total = RegistrationResult(*map(sum, zip(total, done, strict=True)))
     return total
 
 
-def let_go(root: Path, paths: Sequence[Path]) -> None:
-    """Take files out of the tables that name them, before they are removed or rewritten.
+def unregister(root: Path, paths: Sequence[Path]) -> None:
+    """Remove files from the tables before they are removed or rewritten on disk.
 
     Raises:
         InputError: the archive is registered and pyiceberg is not installed, or the catalogue refuses.
@@ -96,10 +96,10 @@ def let_go(root: Path, paths: Sequence[Path]) -> None:
 
 
 def place_of(root: Path) -> Place | None:
-    """Where an archive is registered, if it is.
+    """Return the registration of an archive, if it has one.
 
     Raises:
-        InputError: what says so cannot be read: a file that a table names must not go unseen.
+        InputError: the record cannot be read; it must not be ignored, because tables may name files.
     """
     path = root / RECORD
     try:
@@ -111,7 +111,7 @@ def place_of(root: Path) -> Place | None:
 
 
 def _remember(root: Path, place: Place) -> None:
-    """Note where the archive is registered before it is, so that no file goes that a table names."""
+    """Record the registration before it happens, so that no registered file is removed unnoticed."""
     path = root / RECORD
     try:
         before = place_of(root)
@@ -121,7 +121,7 @@ def _remember(root: Path, place: Place) -> None:
         problem = f"this archive is registered at {before.catalog}, namespace {before.namespace}, files at {before.at}"
         raise InputError("catalog", problem, f"give these; or drop those tables, then remove {path}")
     if before is None:
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(json.dumps(place._asdict()).encode())
 
 
@@ -141,7 +141,7 @@ def _catalog(place: Place) -> Catalog:
 
 
 def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
-    """The table of a kind, with every column that is known today."""
+    """Return the table of a kind with all columns known today."""
     from pyiceberg.transforms import DayTransform
 
     name, schema = (place.namespace, layout.TABLES[kind]), SCHEMAS[kind]
@@ -160,20 +160,20 @@ def _plain(schema: pa.Schema) -> pa.Schema:
     return pa.schema([field.with_nullable(True).remove_metadata() for field in schema])
 
 
-def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registered:
-    """Drop what is gone or no longer the same, add what is missing, in one commit."""
-    there = {_name(root, place, path): path for path in layout.compacted(root, kind)}
+def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
+    """Remove missing and changed files from a table and add new ones, in one commit."""
+    there = {_name(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
     # one that was rewritten elsewhere is known by its size
     stale = [n for n, file in mine.items() if n not in there or there[n].stat().st_size != file.file_size_in_bytes]
     missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
     _commit(table, [mine[name] for name in stale], missing)
     now = _held(table.refresh())
-    return Registered(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
+    return RegistrationResult(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
 
 
 def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
-    """Change a table at once, or not at all."""
+    """Change a table atomically."""
     if not removed and not added:
         return
     with table.transaction() as change:
@@ -186,7 +186,7 @@ def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
 
 
 def _held(table: Table) -> dict[str, Any]:
-    """Files that a table names, by name."""
+    """Return the files that a table names, by name."""
     return {task.file.file_path: task.file for task in table.scan().plan_files()}
 
 
@@ -200,7 +200,7 @@ def _name(root: Path, place: Place, path: Path) -> str:
 
 @contextmanager
 def _said(place: Place) -> Iterator[None]:
-    """Errors of the catalogue as one line."""
+    """Turn errors of the catalogue into one line."""
     try:
         yield
     except InputError:

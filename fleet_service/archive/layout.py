@@ -1,15 +1,15 @@
-"""Where everything lies in an archive: names are built and parsed here only.
+"""Layout of an archive: names are built and parsed only here.
 
     inbox/…                                                     the log, see `segments`
     observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
-    states/date=…/zone=…/NAME.parquet                           likewise
-    checkpoints/…                                               what a restart begins from, see `replay.checkpoints`
+    states/date=…/zone=…/NAME.parquet                           compacted
+    checkpoints/…                                               start of a restart, see `replay.checkpoints`
     requests/…                                                  see `requests`
-    drafts/                                                     what is being written; nothing there counts
+    drafts/                                                     files being written; nothing there counts
 
-The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds; where services
-succeed each other by a lease, the epoch of who compacted is behind its SHARD: two that do it at once, since one was
-frozen, never make two files of one name.
+The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds. If services
+succeed each other by a lease, the epoch of the compacting service follows SHARD: two services that compact at once,
+because one was frozen, never write the same name.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ _DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")  #
 
 
 class Cut(NamedTuple):
-    """A place in the log: everything up to this segment. Names only grow, whatever the clock does."""
+    """Position in the log: everything up to this segment. Names only increase, independent of the clock."""
 
     epoch: int
     number: int
 
 
 class Partition(NamedTuple):
-    """A folder of compacted rows: days since 1970 and z7 zone."""
+    """Folder of compacted rows: days since 1970 and z7 zone."""
 
     day: int
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Where its files lie. The letter before the zone keeps readers from taking it for a number."""
+        """Return its folder. The letter before the zone keeps readers from parsing it as a number."""
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
 
@@ -66,11 +66,11 @@ class Partition(NamedTuple):
 MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 
-def insist_on_archive(root: Path) -> None:
-    """Let only an archive pass: who compacts another folder would write into it.
+def require_archive(root: Path) -> None:
+    """Raise unless a folder is an archive, because compaction would write into it.
 
     Raises:
-        InputError: it is no folder, or none that a service made.
+        InputError: it is no folder, or no service created it.
     """
     if not root.is_dir():
         raise InputError("archive", f"{root} is no folder", "give the archive of a service")
@@ -79,33 +79,35 @@ def insist_on_archive(root: Path) -> None:
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Day and zone of rows, (n,) each."""
+    """Return day and zone of rows, (n,) each."""
     return time // DAY_NS, grid.zone_of(cell)
 
 
 def date_of(day: int) -> date:
-    """The date so many days after 1970-01-01."""
+    """Return the date that is `day` days after 1970-01-01."""
     return _EPOCH + timedelta(days=day)
 
 
 def day_of(folder: Path) -> int:
-    """Days since 1970 of a folder `date=…`."""
+    """Return the days since 1970 of a folder `date=…`."""
     return (date.fromisoformat(folder.name.removeprefix("date=")) - _EPOCH).days
 
 
 def partition_of(path: Path) -> Partition:
-    """The partition in whose folder a file lies."""
+    """Return the partition in whose folder a file lies."""
     return Partition(day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q")))
 
 
-def compacted(root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None) -> Iterator[Path]:
-    """Compacted files of a kind, by date, zone and age; both days count as inside."""
+def compacted_files(
+    root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
+) -> Iterator[Path]:
+    """Yield the compacted files of a kind by date, zone and age; both days are included."""
     for folder in days(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
 
 
 def days(root: Path, table: str, since_day: int | None = None, until_day: int | None = None) -> list[Path]:
-    """Folders of a table's days, in order."""
+    """Return the folders of a table's days in order."""
     found = sorted(path for path in (root / table).glob("date=*") if _DAY.fullmatch(path.name))
     return [
         folder
@@ -115,27 +117,28 @@ def days(root: Path, table: str, since_day: int | None = None, until_day: int | 
 
 
 def segment_name(prefix: str, number: int) -> str:
-    """Name of a segment: `prefix` is SHARD-EPOCH."""
+    """Return the name of a segment; `prefix` is SHARD-EPOCH."""
     return f"{prefix}-{number:08d}.parquet"
 
 
 def with_term(name: str, term: int) -> str:
-    """First part of a file's name, with the term of who writes it in the place of a former one, so that it takes the
-    place of nobody's file; 0: there are no terms."""
+    """Return the first part of a file's name with the writer's term instead of a former one, so that it replaces no
+    other file; 0 without terms."""
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
 
-def signed(name: str, term: int) -> str:
-    """Name of a compacted file, by that of its newest segment and the term of who compacts; 0: there are no terms."""
+def compacted_name(name: str, term: int) -> str:
+    """Return the name of a compacted file from its newest segment and the term of the compacting service; 0 without
+    terms."""
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
 
 
 def term_of(name: str) -> int | None:
-    """Epoch of the service that made an object of an archive's copy; None: its name does not tell.
+    """Return the epoch of the service that made an object of an archive's copy; None if its name has none.
 
-    Segments, checkpoints, weather and the list of witnesses tell the epoch of their service, compacted files and their
-    roll-ups who compacted.
+    Segments, checkpoints, weather and vehicle identities have the epoch of their service; compacted files and their
+    roll-ups that of the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:
@@ -145,6 +148,6 @@ def term_of(name: str) -> int | None:
 
 
 def age(name: str) -> tuple[int, int, str]:
-    """Sorts segments, and the files that hold their rows, from old to new: epoch, number, shard."""
+    """Return a sort key of segments, and of files with their rows, from old to new: epoch, number, shard."""
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard

@@ -1,8 +1,8 @@
-"""One file of the archive, verified, with the columns that this version knows.
+"""Reading of one file of the archive, verified, with the columns that this version knows.
 
-A column that the file does not have is null, one that is not known is passed over. Damage is what a checksum, a digest
-or a text shows. The service that writes the archive and its compaction set a damaged file aside; who only reads passes
-it over and changes nothing.
+A missing column is null, and an unknown one is ignored. A file is damaged if a checksum, a digest or a text is wrong.
+The service that writes the archive, and its compaction, set a damaged file aside. Readers skip it with a warning and
+change nothing.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.between import Where, groups, those
+from fleet_service.archive.between import Where, filter_table, matching_row_groups
 from fleet_service.archive.segments import is_value
-from fleet_service.archive.version import DamagedError, Version, entries_of, judge, newer
+from fleet_service.archive.version import DamagedError, Version, entries_of, is_newer, judge
 from schemas import tables
 from schemas.errors import InputError
 
@@ -37,25 +37,25 @@ NEEDED: Final = frozenset(
 Damaged = Callable[[Path, str], None]
 
 
-def pass_over(path: Path, problem: str) -> None:
-    """Leave a damaged file where it is, and say so: the way of everybody who only reads."""
+def skip_damaged(path: Path, problem: str) -> None:
+    """Leave a damaged file in place and log a warning; for readers."""
     log.warning("%s is damaged and passed over: %s", path, problem)
 
 
 def set_aside(path: Path, problem: str) -> None:
-    """Rename a damaged file so that it is not read again, and say so: the way of who writes the archive."""
+    """Rename a damaged file so that it is not read again, and log a warning; for the writer of the archive."""
     log.warning("%s is damaged and set aside: %s", path, problem)
     with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
         path.rename(path.with_name(path.name + BAD))
 
 
 def count_set_aside(root: Path) -> int:
-    """How many damaged files lie in an archive; looks through all of it."""
+    """Return the number of damaged files of an archive; this scans all of it."""
     return sum(1 for _ in root.rglob(f"*{BAD}"))
 
 
 class Content(NamedTuple):
-    """Rows of a file with its own columns, the version that wrote it, and its key-value pairs."""
+    """Rows of a file with its own columns, its version and its key-value pairs."""
 
     table: pa.Table
     version: Version
@@ -69,20 +69,20 @@ def load(
     where: Where | None = None,
     *,
     whole: bool = False,
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> pa.Table | None:
-    """Rows of one file; None if it is damaged.
+    """Return the rows of one file; None if it is damaged.
 
     Args:
         path: of the file.
         schema: the columns that this version knows.
-        columns: those wanted; None: all that are known.
-        where: rows wanted, by columns wanted; row groups that cannot hold any are skipped.
-        whole: verify every column, not only those wanted.
-        damaged: is told of a damaged file.
+        columns: columns to return; None for all known ones.
+        where: filter on returned columns; row groups without a match are skipped.
+        whole: True to verify every column, not only the returned ones.
+        damaged: called with a damaged file.
 
     Raises:
-        FileNotFoundError: it is gone.
+        FileNotFoundError: it does not exist any more.
         InputError: it is of a newer major version.
         OSError: the system cannot read.
     """
@@ -97,8 +97,8 @@ def load(
     found = _content(path, read, damaged)
     if found is None:
         return None
-    table = conformed(found.table, schema if whole else known)
-    return (table if where is None else those(table, where)).select(known.names)
+    table = conform_columns(found.table, schema if whole else known)
+    return (table if where is None else filter_table(table, where)).select(known.names)
 
 
 def load_groups(
@@ -107,11 +107,12 @@ def load_groups(
     columns: Sequence[str],
     where: Where,
     take: Callable[[pa.Table], None],
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> bool:
-    """As `load`, with the rows handed to `take` a row group at a time: a whole file takes several times their memory
-    while it is read. Of a row group that holds none that are wanted only the columns of `where` are read. False if
-    the file is damaged: what was taken of it is to be forgotten.
+    """Read a file like `load`, passing the rows to `take` one row group at a time.
+
+    A complete file takes several times the memory of its rows while it is read. Of a row group without a match only the
+    columns of `where` are read. The result is False if the file is damaged; discard the rows taken from it.
 
     Raises:
         as `load`.
@@ -122,10 +123,10 @@ def load_groups(
         names = [name for name in columns if name in file.schema_arrow.names]
         own = [one for one in where if one.column in names]
         looked = list({one.column: None for one in own})
-        for group in groups(file.metadata, where):
-            if own and not any(those(part, own).num_rows for part in _batches(file, group, looked)):
+        for group in matching_row_groups(file.metadata, where):
+            if own and not any(filter_table(part, own).num_rows for part in _batches(file, group, looked)):
                 continue
-            parts = [those(conformed(part, known), where) for part in _batches(file, group, names)]
+            parts = [filter_table(conform_columns(part, known), where) for part in _batches(file, group, names)]
             if parts:  # none, of a file whose only vehicle was forgotten
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
@@ -141,15 +142,17 @@ def _batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterator[pa.
 
 
 def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
-    """Row groups that may hold rows that are wanted, one after the other, with no more of each than these."""
+    """Return the row groups that may match, one after the other, filtered."""
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
-    parts = [those(file.read_row_group(group, names), known) for group in groups(file.metadata, where)]
+    parts = [
+        filter_table(file.read_row_group(group, names), known) for group in matching_row_groups(file.metadata, where)
+    ]
     return pa.concat_tables(parts) if parts else own.empty_table().select(own.names if names is None else names)
 
 
-def content(path: Path, damaged: Damaged = pass_over) -> Content | None:
-    """All that a file holds, also what this version does not know; None if it is damaged.
+def content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
+    """Return everything in a file, unknown columns included; None if it is damaged.
 
     Raises:
         as `load`.
@@ -163,7 +166,7 @@ def _content(
     try:
         with pq.ParquetFile(path, page_checksum_verification=True, buffer_size=buffer_bytes) as file:
             entries = entries_of(file.metadata.metadata)
-            if newer(entries):  # before it is read: it may be written in a way that is not known here
+            if is_newer(entries):  # before it is read: it may be written in a way that is not known here
                 judge(path, file.schema_arrow, entries)
             table = read(file)
             whole = table.num_columns == file.metadata.num_columns  # then its schema is at hand, in a third of the time
@@ -179,11 +182,11 @@ def _content(
         return None
 
 
-def conformed(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """The columns of `schema`: null where the table has none, of the schema's type where it has another.
+def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """Return the columns of `schema`: null if the table has none, cast if the type differs.
 
     Raises:
-        InputError: a value does not go into the type, or a column is missing without which a row is none.
+        InputError: a value does not fit the type, or a required column is missing.
     """
     if table.schema.names == schema.names and table.schema.types == schema.types:
         return table

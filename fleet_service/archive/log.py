@@ -1,6 +1,7 @@
-"""Rows that wait for the disk, and the order that the promise rests on: rows, fsynced segment, then settled.
+"""The log: rows that wait for the disk. The order is the guarantee: rows, fsynced segment, then settled.
 
-Segments are written in a thread of their own, so that messages are taken meanwhile; only what `end` gives is settled.
+A thread of its own writes segments, so that messages are processed meanwhile. Only batches returned by `end` are
+settled.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.segments import Rows, Writer
 from schemas.wire import Kind
@@ -22,7 +23,7 @@ Batch = TypeVar("Batch")
 
 
 class _Load(Generic[Batch]):
-    """Rows that are written together, by kind, and the batches that they are of."""
+    """Rows that are written together, by kind, and their batches."""
 
     def __init__(self) -> None:
         self.waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
@@ -31,17 +32,17 @@ class _Load(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """How many are not written yet."""
+        """Return the number of rows that are not written yet."""
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
-        """Take over what another holds."""
+        """Add the rows of another load."""
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches
 
-    def write(self, writer: Writer, copy: Copy | None) -> None:
-        """Write each kind that is not written yet, then make all of it durable, in the second place too."""
+    def write(self, writer: Writer, copy: BucketReplica | None) -> None:
+        """Write each kind that is not written yet, then make all of it durable, in the bucket too."""
         for kind, waiting in self.waiting.items():
             if waiting:
                 rows = {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
@@ -49,20 +50,20 @@ class _Load(Generic[Batch]):
                 self.waiting[kind] = []
         writer.sync()
         if copy is not None:
-            copy.settle(self.segments)
+            copy.upload_segments(self.segments)
 
 
 class SegmentLog(Generic[Batch]):
-    """The log of one run of one service, for one thread; the disk's work is done in another.
+    """Log of one run of one service, for one thread; another thread does the disk's work.
 
     Args:
         root: of the archive.
         shard: name of the service.
-        copy: of the archive; with one, durable is what is in both places.
-        epoch: at the least, as a lease has it.
+        copy: of the archive; with one, durable means in both places.
+        epoch: smallest epoch, from the lease.
     """
 
-    def __init__(self, root: Path, shard: str, copy: Copy | None = None, epoch: int = 0) -> None:
+    def __init__(self, root: Path, shard: str, copy: BucketReplica | None = None, epoch: int = 0) -> None:
         self._writer, self._copy = Writer(root, shard, epoch), copy
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
@@ -72,36 +73,37 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def newest(self) -> Cut:
-        """The segment that was written last."""
+        """Return the last written segment."""
         return self._writer.newest
 
     @property
     def hangs_s(self) -> float:
-        """For how long the write that was begun has not ended [s]."""
+        """Return how long the current write has taken so far [s]."""
         return 0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
 
     @property
     def rows(self) -> int:
-        """Rows that wait."""
+        """Return the number of waiting rows."""
         return self._next.rows + self._load.rows
 
     @property
     def unsettled(self) -> int:
-        """Batches that wait."""
+        """Return the number of waiting batches."""
         return len(self._next.batches) + len(self._load.batches)
 
     @property
     def ended(self) -> bool:
-        """Whether a write was begun and has ended, one way or the other."""
+        """Return True if a write was begun and has ended, successfully or not."""
         return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
-        """Let rows wait for the next write, and the batches that they are of."""
+        """Queue rows, and the batches they belong to, for the next write."""
         self._next.waiting[kind].append(rows)
         self._next.batches += batches
 
     def begin(self) -> None:
-        """Hand over what waits, and what failed before; nothing happens while a write has not been ended."""
+        """Start writing waiting rows and rows that failed before; do nothing while a write is not collected by
+        `end`."""
         if self._written is None:
             self._load.take(self._next)
             self._next = _Load()
@@ -109,10 +111,11 @@ class SegmentLog(Generic[Batch]):
             self._written = self._thread.submit(self._load.write, self._writer, self._copy)
 
     def end(self) -> list[Batch]:
-        """Wait for the write that was begun; returns the batches that are durable by it, each once.
+        """Wait for the current write; return the batches that it made durable, each once.
 
         Raises:
-            OSError: the disk is full or broken, or the copy is not reached; what is not durable waits for the next.
+            OSError: the disk is full or broken, or the copy is not reached; rows that are not durable wait for the next
+                write.
         """
         if self._written is None:
             return []
@@ -122,10 +125,10 @@ class SegmentLog(Generic[Batch]):
         return durable
 
     def flush(self) -> list[Batch]:
-        """Write all that waits; returns the batches that are durable by it, each once.
+        """Write all waiting rows; return the batches that became durable, each once.
 
         Raises:
-            OSError: as `end`.
+            OSError: as for `end`.
         """
         durable = self.end()
         self._next.batches[:0] = durable  # they are reported with the rest, which may fail
@@ -133,5 +136,5 @@ class SegmentLog(Generic[Batch]):
         return self.end()
 
     def close(self) -> None:
-        """Let the thread go when it has written."""
+        """Stop the thread after its current write."""
         self._thread.shutdown()

@@ -1,4 +1,4 @@
-"""Compacted files, snapshots and roll-ups put to another file system: a folder, S3, GCS, HDFS."""
+"""Mirror of compacted files, snapshots and roll-ups on another file system: a folder, S3, GCS, HDFS."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ FOLDERS: Final = (*TABLES.values(), "map", "rollup")
 _CHUNK: Final = 1 << 22
 
 
-def put(root: Path, uri: str, again: Collection[Path] = ()) -> int:
-    """Put what is not there yet, or was rewritten since; returns how many files.
+def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
+    """Copy new and rewritten files; return their number.
 
-    What was retired here stays there. A file appears under its name when it is whole. What is to be put `again` is so
-    whatever its size.
+    Files that were retired here stay in the mirror. A file appears under its name when it is complete. Files in `again`
+    are copied whatever their size.
 
     Raises:
-        InputError: the place cannot be used.
+        InputError: the destination cannot be used.
         OSError: a file cannot be read or written.
     """
     try:

@@ -1,7 +1,8 @@
-"""Keyed hashes of vehicle names and of their starts, with a key per month: destroying a month's key forgets who drove
-in it. A start has another number in each month too, or one that lasts over midnight would tell both months' pseudonyms.
+"""Pseudonyms: keyed hashes of vehicle names and of their starts, with one key per month.
 
-The month is that of a batch's first record, so that a batch that is sent again has the same pseudonym.
+Destroying a month's key makes its rows anonymous. The number of a start differs per month too, because a start that
+lasts over midnight would otherwise link the pseudonyms of two months. The month is that of a batch's first record, so a
+repeated batch has the same pseudonym.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import IntArray
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 KEY_BYTES: Final = 32
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
@@ -27,20 +28,20 @@ _DAY_NS: Final = 86_400_000_000_000
 
 @lru_cache(1 << 16)
 def number(pseudonym: str) -> int:
-    """A pseudonym as a signed 64-bit number."""
+    """Return a pseudonym as a signed 64-bit number."""
     return int.from_bytes(bytes.fromhex(pseudonym), signed=True)
 
 
 def texts(numbers: IntArray) -> NDArray[np.bytes_]:
-    """The pseudonyms (n,) that `number` makes these of."""
+    """Return the pseudonyms (n,) of numbers; the inverse of `number`."""
     return np.frombuffer(numbers.astype(">i8").tobytes().hex().encode(), f"S{2 * _DIGEST_BYTES}")
 
 
 class Pseudonyms:
-    """Names to pseudonyms.
+    """Mapping from names to pseudonyms.
 
     Args:
-        folder: where the keys lie, one file of mode 600 per month; a missing key is made.
+        folder: of the keys, one file of mode 600 per month; a missing key is created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,7 +51,7 @@ class Pseudonyms:
         self._month_of_day: dict[int, str] = {}
 
     def of(self, vehicle: str, time: int) -> str:
-        """Pseudonym (16 hexadecimal digits) of a vehicle at a time [ns].
+        """Return the pseudonym (16 hexadecimal digits) of a vehicle at a time [ns].
 
         Raises:
             OSError: a key can neither be read nor written.
@@ -63,10 +64,10 @@ class Pseudonyms:
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
-        """Number (63 bits) of a vehicle's start at a time [ns].
+        """Return the number (63 bits) of a vehicle's start at a time [ns].
 
         Raises:
-            OSError: as `of`.
+            OSError: as for `of`.
         """
         text = f"{vehicle}/{boot}".encode()
         digest = blake2b(text, key=self._key(self.month(time)), digest_size=_DIGEST_BYTES).digest()
@@ -79,24 +80,24 @@ class Pseudonyms:
         return month
 
     def month(self, time: int) -> str:
-        """The month (2026-01) whose key is used at a time [ns]."""
+        """Return the month (2026-01) whose key is used at a time [ns]."""
         return self._month(time // _DAY_NS)
 
     def _key(self, month: str) -> bytes:
         if month not in self._keys:
-            self._keys[month] = kept_key(self.folder / f"{month}.key")
+            self._keys[month] = load_or_create_key(self.folder / f"{month}.key")
         return self._keys[month]
 
 
-def kept_key(path: Path) -> bytes:
-    """A key in a file of mode 600, made if there is none.
+def load_or_create_key(path: Path) -> bytes:
+    """Return a key from a file of mode 600; create it if it does not exist.
 
     Raises:
         OSError: it can neither be read nor written, or is damaged.
     """
     if not path.exists():
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with written(path, 0o600) as file:
+        with open_durably(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
             file.write(key + _check(key))
         sync_directory(path.parent.parent)  # else power loss forgets the key, and acknowledged batches with it
@@ -104,10 +105,10 @@ def kept_key(path: Path) -> bytes:
 
 
 def _checked(path: Path) -> bytes:
-    """A key, as it was made; those of a former version have no digest.
+    """Return a verified key; keys of a former version have no digest.
 
     Raises:
-        OSError: it is damaged: other pseudonyms would be made, and every batch would come in once more.
+        OSError: it is damaged; other pseudonyms would result, and every batch would be accepted again.
     """
     data = path.read_bytes()
     key, check = data[:KEY_BYTES], data[KEY_BYTES:]

@@ -1,8 +1,8 @@
-"""Every row of an archive once, whether it lies in the inbox or in a compacted file, while compaction goes on.
+"""Reading of an archive: every row once, from the inbox or a compacted file, also during a compaction.
 
-The inbox is read first and whole; a compaction that deletes segments meanwhile makes the reader begin again. Then the
-compacted files are listed, once. Rows of a segment are left out where a listed file holds them; a file that comes later
-is not read, for its rows were read from the inbox. So it is the order of these steps that makes it right.
+The inbox is read first and completely; if a compaction deletes segments meanwhile, the reader starts again. Then the
+compacted files are listed once. Rows of a segment are skipped if a listed file holds them. A file that appears later is
+not read, because its rows were read from the inbox. The order of these steps is what makes the result correct.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, segments
 from fleet_service.archive.between import Where
 from fleet_service.archive.layout import Partition
-from fleet_service.archive.load import Damaged, load, load_groups, pass_over
+from fleet_service.archive.load import Damaged, load, load_groups, skip_damaged
 from fleet_service.archive.version import DamagedError, entries_of, judge
 from schemas import grid
 from schemas.numeric import BoolArray
@@ -31,9 +31,11 @@ _TURNS: Final = 100  # a reader that is overtaken by so many compactions has ano
 
 
 class Wanted(NamedTuple):
-    """Which rows: with these columns (all, if None), where a filter holds, measured within these days (both count),
-    and written after a place in the log. May yield more than was written after it: the rest of a compacted file. Of the
-    inbox nothing that was written after `until`; of compacted files those of zones that touch a box [deg]."""
+    """Selection of rows: columns (None for all), filter, days of measurement (both included), position in the log.
+
+    It may yield more than was written after the position: the rest of a compacted file. It yields nothing of the inbox
+    written after `until`, and only compacted files of zones that touch a box [deg].
+    """
 
     columns: Sequence[str] | None = None
     where: Where | None = None
@@ -43,7 +45,7 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Whether a segment, or a file that is named by its newest one, was written after the place."""
+        """Return True if a segment, or a file named by its newest segment, was written after the position."""
         return self.after is None or layout.age(path.name)[:2] > self.after
 
 
@@ -53,17 +55,17 @@ def read(
     columns: Sequence[str] | None = None,
     where: Where | None = None,
     days: tuple[int | None, int | None] = (None, None),
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> Iterator[pa.Table]:
-    """Tables that together hold every row once, of files that are not damaged.
+    """Yield tables that together hold every row once; damaged files are skipped.
 
     Args:
         root: of the archive.
         kind: observations or states.
-        columns: all, if None.
-        where: rows wanted; row groups that cannot hold any are skipped.
-        days: first and last day of measurement wanted; may yield more.
-        damaged: is told of a damaged file.
+        columns: None for all.
+        where: filter; row groups without a match are skipped.
+        days: first and last day of measurement; may yield more.
+        damaged: called with a damaged file.
 
     Raises:
         InputError: a file is of a newer major version.
@@ -72,8 +74,8 @@ def read(
     yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
 
 
-def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> Iterator[pa.Table]:
-    """As `read`."""
+def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> Iterator[pa.Table]:
+    """Yield tables like `read`, for a selection."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
     for path in listing.files:
@@ -83,30 +85,30 @@ def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_
 
 
 class Listing:
-    """The rows of an archive as they were found at once: the inbox, and the compacted files, which are read later.
+    """Rows of an archive at one moment: the inbox, and the list of compacted files, which are read later.
 
     Args:
         as of `read`.
     """
 
-    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> None:
+    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> None:
         self.kind, self._wanted, self._damaged = kind, wanted, damaged
         self._schema = segments.SCHEMAS[kind]
         self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
         needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
         self._fresh = _inbox(root, kind, wanted._replace(columns=needed), damaged)
-        files = list(layout.compacted(root, kind, *wanted.days))
-        self._done = compacted(files, {path.name for path, _ in self._fresh})
-        self.files = [path for path in near(files, wanted.box) if wanted.newer(path)]
+        files = list(layout.compacted_files(root, kind, *wanted.days))
+        self._done = compacted_partitions(files, {path.name for path, _ in self._fresh})
+        self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
-        """Rows that no compacted file holds; once."""
+        """Yield the rows that no compacted file holds; call it once."""
         fresh, self._fresh = self._fresh, []
         for path, table in fresh:
-            yield without(table, self.kind, self._done.get(path.name, set())).select(self._names)
+            yield drop_compacted(table, self.kind, self._done.get(path.name, set())).select(self._names)
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
-        """As `load`, a row group at a time; False if what was taken is to be forgotten."""
+        """Read a file like `load`, one row group at a time; if False, discard the rows taken."""
         both = [*(self._wanted.where or ()), *where]
         try:
             return load_groups(path, self._schema, self._names, both, take, self._damaged)
@@ -114,7 +116,7 @@ class Listing:
             return False
 
     def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
-        """Rows of one of the files, where this filter holds too; None if it is damaged, or its day was retired."""
+        """Return the rows of one file that also match this filter; None if it is damaged, or its day was retired."""
         both = [*(self._wanted.where or ()), *(where or ())]
         try:
             return load(path, self._schema, self._names, both or None, damaged=self._damaged)
@@ -122,8 +124,8 @@ class Listing:
             return None
 
 
-def near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
-    """Compacted files of zones that touch a box [deg], or all."""
+def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
+    """Return the compacted files of zones that touch a box [deg], or all."""
     if box is None or not files:
         return list(files)
     zone = np.array([layout.partition_of(path).zone for path in files])
@@ -147,10 +149,10 @@ def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tup
     raise OSError(f"the inbox of {root} changes faster than it can be read")
 
 
-def compacted(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
-    """In which partitions the rows of segments are compacted already, by the names of the segments.
+def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
+    """Return, by segment name, the partitions into which its rows are already compacted.
 
-    A file's name is that of its newest segment, so that older files need not be opened.
+    A file is named by its newest segment, so older files need not be opened.
     """
     done: dict[str, set[Partition]] = {}
     if not names:
@@ -163,8 +165,8 @@ def compacted(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition
     return done
 
 
-def without(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """The rows that lie in none of the partitions."""
+def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
+    """Return the rows that lie in none of the partitions."""
     if not done or not table.num_rows:
         return table
     day, zone = layout.partitions_of(segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy())
@@ -175,7 +177,7 @@ def without(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
 
 
 def sources_of(path: Path) -> set[str]:
-    """Segments whose rows of its partition a compacted file holds; none if it is gone or damaged.
+    """Return the segments whose rows of its partition a compacted file holds; empty if it is missing or damaged.
 
     Raises:
         InputError: it is of a newer major version.

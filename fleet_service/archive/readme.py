@@ -1,4 +1,4 @@
-"""The page that lies in every archive: what is where, and every column with unit and meaning, from the contract."""
+"""The README of every archive: folders, and every column with unit and meaning, from the contract."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas import mugrid, tables
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.tables import Field
 
 NAME: Final = "README.md"
@@ -51,7 +51,7 @@ _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
 
 
 def text() -> str:
-    """The page."""
+    """Return the page."""
     parts = [_HEAD]
     for name, fields in _TABLES:
         parts.append(f"\n## `{name}`\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
@@ -68,7 +68,7 @@ def _cell(value: str) -> str:
 
 
 def keep(root: Path) -> None:
-    """Write the page into an archive, if it is not there as it should be. Somebody else's page of that name stays.
+    """Write the page into an archive if it is missing or outdated. A foreign page of that name stays.
 
     Raises:
         OSError: it cannot be written.
@@ -76,5 +76,5 @@ def keep(root: Path) -> None:
     path, page = root / NAME, text().encode()
     there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
     if there != page and (not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())):
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(page)

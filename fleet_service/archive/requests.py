@@ -1,9 +1,9 @@
-"""What the owner of an archive asks the service that runs on it, as files: erasure, which only the service may do.
+"""Requests of the archive's owner to the service that runs on it, as files: erasure, which only the service may do.
 
-    requests/NAME.json           the question: a month, and a vehicle or none
-    requests/NAME.answer.json    what was done, or why not; the question is gone then
+    requests/NAME.json           the request: a month, and a vehicle or none
+    requests/NAME.answer.json    the result, or the reason of refusal; the request is removed then
 
-Whoever may write into the archive may ask. A question outlives the service: the next one finds it.
+Everybody who may write into the archive may make a request. A request outlives the service: the next one finds it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 FOLDER: Final = "requests"
 _ANSWER: Final = ".answer.json"
@@ -28,14 +28,14 @@ _KEPT_S: Final = 86_400.0  # an answer that nobody takes
 
 @dataclass(frozen=True)
 class Erasure:
-    """Forget a month's key, or one vehicle's rows of that month."""
+    """Request to forget a month's key, or one vehicle's rows of that month."""
 
     month: str
     vehicle: str | None = None
 
 
-def ask(root: Path, wanted: Erasure) -> Path:
-    """Put a question; returns its file.
+def write_request(root: Path, wanted: Erasure) -> Path:
+    """Write a request; return its file.
 
     Raises:
         OSError: it cannot be written.
@@ -43,7 +43,7 @@ def ask(root: Path, wanted: Erasure) -> Path:
     folder = root / FOLDER
     folder.mkdir(mode=0o700, exist_ok=True)
     path = folder / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
-    with written(path, _SECRET) as file:
+    with open_durably(path, _SECRET) as file:
         file.write(json.dumps(asdict(wanted)).encode())
     owner = root.stat()
     for place in (folder, path):
@@ -53,10 +53,10 @@ def ask(root: Path, wanted: Erasure) -> Path:
 
 
 def answer_to(question: Path) -> dict[str, Any] | None:
-    """What was answered, once; None: nothing yet.
+    """Return the answer to a request and remove it; None if there is none yet.
 
     Raises:
-        InputError: it was refused.
+        InputError: the request was refused.
     """
     path = _answer_of(question)
     try:
@@ -69,8 +69,8 @@ def answer_to(question: Path) -> dict[str, Any] | None:
     return answer
 
 
-def waiting(root: Path) -> list[Path]:
-    """Questions without an answer, the oldest first; answers that nobody took for a day go."""
+def open_requests(root: Path) -> list[Path]:
+    """Return the requests without an answer, oldest first; remove answers that were not collected for a day."""
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
         if time.time() - path.stat().st_mtime > _KEPT_S:
             path.unlink()
@@ -78,10 +78,10 @@ def waiting(root: Path) -> list[Path]:
 
 
 def read(question: Path) -> Erasure:
-    """What is asked.
+    """Return the content of a request.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not valid.
     """
     try:
         record = json.loads(question.read_bytes())
@@ -91,14 +91,14 @@ def read(question: Path) -> Erasure:
 
 
 def settle(question: Path, outcome: dict[str, Any] | InputError) -> None:
-    """Answer a question and take it away.
+    """Answer a request and remove it.
 
     Raises:
-        OSError: the answer cannot be written; the question stays.
+        OSError: the answer cannot be written; the request stays.
     """
     if isinstance(outcome, InputError):
         outcome = {"error": [outcome.field, outcome.problem, outcome.fix]}
-    with written(_answer_of(question), _SECRET) as file:
+    with open_durably(_answer_of(question), _SECRET) as file:
         file.write(json.dumps(outcome).encode())
     question.unlink()
 

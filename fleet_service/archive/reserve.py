@@ -1,4 +1,4 @@
-"""Room set aside on the archive's disk, so that a full one leaves retention and compaction some to make more in."""
+"""Reserve on the archive's disk: retention and compaction use it to make room when the disk is full."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ NAME: Final = "reserve"
 _LEAST_FREE: Final = 4 * SIZE
 
 
-def keep(root: Path) -> None:
-    """Set room aside, if there is plenty."""
+def allocate(root: Path) -> None:
+    """Allocate the reserve if there is plenty of room."""
     path = root / NAME
     with suppress(OSError):
         if not path.exists() and shutil.disk_usage(root).free > _LEAST_FREE:
@@ -22,8 +22,8 @@ def keep(root: Path) -> None:
                 os.posix_fallocate(file.fileno(), 0, SIZE)
 
 
-def give(root: Path) -> bool:
-    """Give the room free if the disk is full; whether that was so."""
+def release(root: Path) -> bool:
+    """Release the reserve if the disk is full; return True if it was released."""
     path = root / NAME
     if not path.exists() or shutil.disk_usage(root).free > SIZE:
         return False

@@ -1,4 +1,4 @@
-"""What is given up: raw rows after so many days, when their roll-ups stay; and what one vehicle left.
+"""Removal of data: raw rows after a number of days, when their roll-ups stay; and the rows of one vehicle.
 
 Only these two rewrite or remove compacted files, one file for one.
 """
@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import erasures, iceberg, layout, reading, rollup, snapshots, witnesses
-from fleet_service.archive.between import Between, Where
-from fleet_service.archive.compaction import compact, compacting
-from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
+from fleet_service.archive.between import ValueRange, Where
+from fleet_service.archive.compaction import compact, hold_compaction_lock
+from fleet_service.archive.files import COMPACTED, MAP, lock_archive, put_in_place
 from fleet_service.archive.layout import TABLES
 from fleet_service.archive.load import BAD, content, load
 from fleet_service.archive.pseudonyms import Pseudonyms, number
@@ -36,14 +36,14 @@ ANONYMOUS: Final = 5  # vehicles of a cell, as the settings that are shipped as 
 _KEYS: Final = "keys"
 
 
-class Retired(NamedTuple):
-    """Days whose raw rows went, and files."""
+class RetirementResult(NamedTuple):
+    """Result: days whose raw rows were removed, and files."""
 
     days: int
     files: int
 
 
-def retire(root: Path, raw_days: int, today: date) -> Retired:
+def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
     """Remove rows measured more than `raw_days` before `today`, after their roll-ups are safe.
 
     Raises:
@@ -51,10 +51,10 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
         OSError: a file cannot be read, written or removed.
     """
     files = 0
-    with compacting(root):
+    with hold_compaction_lock(root):
         rollup.complete(root, until_day=_last_to_go(raw_days, today))
-        folders = due(root, raw_days, today)
-        iceberg.let_go(root, [path for folder in folders for path in folder.glob("*/*")])
+        folders = due_folders(root, raw_days, today)
+        iceberg.unregister(root, [path for folder in folders for path in folder.glob("*/*")])
         for folder in folders:
             for path in sorted(folder.glob("*/*"), reverse=True):
                 path.unlink()
@@ -63,11 +63,11 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
                 zone.rmdir()
             folder.rmdir()
             sync_directory(folder.parent)
-    return Retired(len(folders), files)
+    return RetirementResult(len(folders), files)
 
 
-def due(root: Path, raw_days: int, today: date) -> list[Path]:
-    """Folders of days whose raw rows `retire` removes.
+def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
+    """Return the folders of days whose raw rows `retire_rows` removes.
 
     Raises:
         InputError: too few days.
@@ -83,36 +83,36 @@ def _last_to_go(raw_days: int, today: date) -> int:
 
 
 def forget_period(root: Path, month: str) -> None:
-    """Destroy the key of a month (2026-01): nobody can tell any more whose its pseudonyms were.
+    """Destroy the key of a month (2026-01): its pseudonyms cannot be attributed any more.
 
     Raises:
         InputError: there is no such key, or a service runs on the archive.
         OSError: a file cannot be read or written.
     """
-    with lock(root):
+    with lock_archive(root):
         key_of(root, month)
         begin, until = erasures.span_of(month)
         destroy_key(root, month, _newest(root, (begin // layout.DAY_NS, None), until=until))
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """As `forget_period`, for who holds the archive and keeps nothing of the month in mind. What was measured in it
-    until `newest` [ns], the newest that the archive holds, does not come in again.
+    """Destroy the key like `forget_period`, for a caller that holds the archive and has no data of the month in memory.
+    Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted again.
 
     Raises:
         InputError: there is no such key.
-        OSError: the disk is full or broken; the key may be there still.
+        OSError: the disk is full or broken; the key may still exist.
     """
     key = key_of(root, month)
-    erasures.note(key.parent, month, newest)
+    erasures.record_erasure(key.parent, month, newest)
     witnesses.forget(key.parent, month)
     key.unlink()
     sync_directory(key.parent)
 
 
 def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf) -> int:
-    """Newest first time of a record that the archive holds of these days [ns], -1 if of none; one that is not before
-    `until` will do."""
+    """Return the newest first time of a record of these days [ns], -1 if there is none; one not before `until` is
+    enough."""
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
         for table in reading.read(root, kind, [name, *(one.column for one in where)], where, days):
@@ -122,63 +122,64 @@ def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: 
     return newest
 
 
-class Forgotten(NamedTuple):
-    """What forgetting a vehicle changed: rows removed, files rewritten or removed."""
+class ErasureResult(NamedTuple):
+    """Result of forgetting a vehicle: rows removed, files rewritten or removed."""
 
     rows: int
     files: tuple[Path, ...]
     kept: str | None = None  # why the archive's copy holds it still
 
 
-def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
-    """Remove the rows of one vehicle in one month, and what could tell of them: lines of few vehicles in the month's
-    snapshots, files that were set aside, checkpoints. Roll-ups are made anew from what stays. What it measured in that
-    month until the newest of them does not come in again.
+def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
+    """Remove the rows of one vehicle in one month, and everything derived that could reveal them.
+
+    That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints. Roll-ups are computed
+    again. Its measurements of that month up to the newest removed row are not accepted again.
 
     Raises:
-        InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
+        InputError: the month's key does not exist, or a service runs on the archive (it has more in memory).
         OSError: a file cannot be read or written.
     """
-    with lock(root):
-        with erased(root, vehicle, month) as done:
+    with lock_archive(root):
+        with erase_files(root, vehicle, month) as done:
             pass
         forget_witness(root, vehicle, month)
     return done
 
 
 @contextmanager
-def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
-    """What `forget_vehicle` does to the files, while a service may write to the log: of its rows those that were there.
-    Nothing is compacted before the block ends.
+def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
+    """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it removes only those that
+    exist at the begin. Nothing is compacted before the block ends.
 
     Raises:
-        as `forget_vehicle`, but for the service.
+        as `forget_vehicle`, except for a running service.
     """
     key_of(root, month)
     compact(root)
     begin, end = _days(month)
     pseudonym = _pseudonym(root, vehicle, month)
-    if (newest := _newest(root, (begin, end), [Between("vehicle", pseudonym, pseudonym)])) >= 0:
-        erasures.note(root / _KEYS, month, newest, pseudonym)
+    if (newest := _newest(root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)])) >= 0:
+        erasures.record_erasure(root / _KEYS, month, newest, pseudonym)
     rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
-    with compacting(root):
+    with hold_compaction_lock(root):
         drop_checkpoints(root)  # what it reported is in them
         for damaged in files:  # nobody can tell what is in them
             damaged.unlink()
         for kind in Kind:
-            theirs = [path for path in layout.compacted(root, kind, begin, end) if _names(kind, path, pseudonym)]
-            iceberg.let_go(root, theirs)
+            theirs = [path for path in layout.compacted_files(root, kind, begin, end) if _names(kind, path, pseudonym)]
+            iceberg.unregister(root, theirs)
             for path in theirs:
                 if len(removed := _without(root, kind, path, pseudonym)):
                     rows, cells = rows + len(removed), cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
         for folder in layout.days(root, snapshots.TABLE, begin, end):
-            files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]
-        yield Forgotten(rows, tuple(files))
+            files += [path for path in sorted(folder.glob("*.parquet")) if _thin_snapshot(root, path, cells)]
+        yield ErasureResult(rows, tuple(files))
 
 
 def forget_witness(root: Path, vehicle: str, month: str) -> None:
-    """Remove the line that tells the number by which the map knew a vehicle in a month.
+    """Remove the line with the number by which the map knew a vehicle in a month.
 
     Raises:
         OSError: it cannot be written.
@@ -190,9 +191,9 @@ def _pseudonym(root: Path, vehicle: str, month: str) -> str:
     return Pseudonyms(root / _KEYS).of(vehicle, erasures.span_of(month).begin)
 
 
-def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
-    """Whether a snapshot had lines of these cells with less than ANONYMOUS vehicles; they are removed."""
-    found = content(path, _unread)
+def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
+    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return True if there were any."""
+    found = content(path, _refuse_damaged)
     if found is None or not cells:
         return False
     lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (found.table["vehicles"].to_numpy() < ANONYMOUS)
@@ -204,20 +205,20 @@ def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
 
 
 def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
-    """How many rows `forget_vehicle` would remove; changes nothing.
+    """Return how many rows `forget_vehicle` would remove; change nothing.
 
     Raises:
-        InputError: the month's key is gone.
+        InputError: the month's key does not exist.
         OSError: a file cannot be read.
     """
     key_of(root, month)
     pseudonym = _pseudonym(root, vehicle, month)
-    where = [Between("vehicle", pseudonym, pseudonym)]
+    where = [ValueRange("vehicle", pseudonym, pseudonym)]
     return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, _days(month)))
 
 
 def drop_checkpoints(root: Path) -> None:
-    """Remove all checkpoints: what they were made from changes; a service then replays the log.
+    """Remove all checkpoints because their sources change; a service then replays the log.
 
     Raises:
         OSError: one cannot be removed.
@@ -228,14 +229,14 @@ def drop_checkpoints(root: Path) -> None:
 
 
 def _names(kind: Kind, path: Path, pseudonym: str) -> bool:
-    """Whether a file may hold rows of a vehicle."""
-    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_unread)
+    """Return True if a file may hold rows of a vehicle."""
+    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
-    """Cells of the rows of a vehicle, which are removed from a file."""
-    found = content(path, _unread)
+    """Remove the rows of a vehicle from a file; return their cells."""
+    found = content(path, _refuse_damaged)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return []
     theirs = pc.equal(found.table["vehicle"], pa.scalar(pseudonym))
@@ -243,20 +244,20 @@ def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
         root, found.table.filter(pc.invert(theirs)), path, COMPACTED, {KEY: str(found.version), **found.entries}
     )
     if kind is Kind.OBSERVATION:
-        rollup.make(root, path)
+        rollup.make_part(root, path)
     return [int(cell) for cell in found.table["cell"].filter(theirs).to_numpy()]
 
 
-def _unread(path: Path, problem: str) -> None:
-    """A damaged file may hold what is to be forgotten: neither passed over nor kept under another name."""
+def _refuse_damaged(path: Path, problem: str) -> None:
+    """Raise for a damaged file, because it may hold rows to be forgotten."""
     raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
 
 
 def key_of(root: Path, month: str) -> Path:
-    """The key of a month.
+    """Return the key file of a month.
 
     Raises:
-        InputError: there is none.
+        InputError: it does not exist.
     """
     erasures.first_day(month)
     path = root / _KEYS / f"{month}.key"
@@ -266,6 +267,7 @@ def key_of(root: Path, month: str) -> Path:
 
 
 def _days(month: str) -> tuple[int, int]:
-    """Days of a month, and the one after it: a batch has the pseudonym of its first record and may end a day later."""
+    """Return the days of a month and the one after it: a batch has the pseudonym of its first record and may end a day
+    later."""
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

@@ -1,13 +1,13 @@
-"""Statistics per cell, sector and hour that can be added up, and that stay when the rows they came from are retired.
+"""Roll-up: additive statistics per cell, sector and hour, which stay when their source rows are retired.
 
     rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
 
-One file per compacted file, of the same name: a part. An hour's statistics are the sum over all parts; so a part may be
-made whenever it is missing, and again when its rows were rewritten.
+There is one file (a part) per compacted file, with the same name. An hour's statistics are the sum over all parts, so a
+missing part can be computed at any time, and again when its rows were rewritten.
 
 Legend of the merging (columns of `tables.CELL_HOUR`)
     sums, counts     add
-    mu_min, mu_max   least, largest
+    mu_min, mu_max   minimum, maximum
     vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of zeros)
                      (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2)
 """
@@ -34,48 +34,50 @@ _BITS: Final = 64
 
 
 def part_of(path: Path, below: Path | None = None) -> Path:
-    """Where the part of a compacted file of observations lies; below another folder than the archive on request."""
+    """Return the path of the part of a compacted file of observations; below another folder on request."""
     root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 
 
 def complete(root: Path, until_day: int | None = None) -> int:
-    """Make the parts that are missing; returns how many.
+    """Compute missing parts; return their number.
 
     Raises:
         OSError: one cannot be read or written.
     """
     missing = [
-        path for path in layout.compacted(root, Kind.OBSERVATION, until_day=until_day) if not part_of(path).exists()
+        path
+        for path in layout.compacted_files(root, Kind.OBSERVATION, until_day=until_day)
+        if not part_of(path).exists()
     ]
     for path in missing:
-        make(root, path)
+        make_part(root, path)
     return len(missing)
 
 
-def make(root: Path, path: Path) -> None:
-    """Make the part of one compacted file, or make it anew.
+def make_part(root: Path, path: Path) -> None:
+    """Compute the part of one compacted file; replace an existing one.
 
     Raises:
         OSError: it cannot be read or written.
     """
-    table = computed(path, set_aside)
+    table = compute_part(path, set_aside)
     if table is not None:
         put_in_place(root, table, part_of(path), ROLLUP)
 
 
-def computed(path: Path, damaged: Damaged) -> pa.Table | None:
-    """The part of one compacted file; None if it is damaged, of which `damaged` is told.
+def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
+    """Return the part of one compacted file; None if it is damaged (then `damaged` is called).
 
     Raises:
         OSError: it cannot be read.
     """
     table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
-    return None if table is None else rolled_up(table)
+    return None if table is None else roll_up(table)
 
 
-def rolled_up(table: pa.Table) -> pa.Table:
-    """Rows of observations as statistics per cell, sector and hour, sorted by them."""
+def roll_up(table: pa.Table) -> pa.Table:
+    """Return rows of observations as statistics per cell, sector and hour, sorted by them."""
     rows = segments.rows_of(table)
     hour = rows["leave_time"] // HOUR_NS
     order = np.lexsort((hour, rows["sector"], rows["cell"]))

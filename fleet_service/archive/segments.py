@@ -1,4 +1,4 @@
-"""The log: admitted rows as Parquet segments, and reading them back.
+"""Segments: admitted rows as Parquet files of the log, and reading them.
 
     inbox/SHARD-EPOCH-SEQ.parquet          observations
     inbox/states/SHARD-EPOCH-SEQ.parquet   states
@@ -36,22 +36,22 @@ Rows = dict[str, NDArray[Any]]
 
 
 def folder(root: Path, kind: Kind) -> Path:
-    """Where the segments of a kind lie."""
+    """Return the folder of a kind's segments."""
     return root / _FOLDERS[kind]
 
 
 def paths(root: Path, kind: Kind) -> list[Path]:
-    """Segments of a kind, oldest first within a shard."""
+    """Return the segments of a kind, oldest first within a shard."""
     return sorted(folder(root, kind).glob("*.parquet"), key=lambda path: layout.age(path.name))
 
 
 class Writer:
-    """Writes the segments of one run of one service.
+    """Writer of the segments of one run of one service.
 
     Args:
         root: of the archive.
         shard: name of the service.
-        epoch: at the least, as a lease has it.
+        epoch: smallest epoch, from the lease.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
@@ -65,22 +65,22 @@ class Writer:
             sync_directory(parent)
         self._unsynced: set[Path] = set()
         # Compacted rows are known by the names of their segments, so that these may not be used again either.
-        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted(root, kind))]
+        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted_files(root, kind))]
         used = [layout.age(path.name)[0] for path in named]
         self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
     @property
     def newest(self) -> layout.Cut:
-        """The segment that was written last."""
+        """Return the last written segment."""
         return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
-        """Write one segment from columns (n,), durable after `sync`.
+        """Write one segment from columns (n,); it is durable after `sync`.
 
-        `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for the rows that have one.
+        `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for rows that have one.
 
         Raises:
-            OSError: it could not be written; nothing is kept of it.
+            OSError: it could not be written; no draft is left.
         """
         self._seq += 1
         path = folder(self._root, kind) / layout.segment_name(f"{self._shard}-{self._epoch:010d}", self._seq)
@@ -89,7 +89,7 @@ class Writer:
         return path
 
     def sync(self) -> None:
-        """Make the names of the written segments durable. They are written: after a failure only this is repeated.
+        """Make the names of the written segments durable. After a failure only this is repeated.
 
         Raises:
             OSError: a folder cannot be synced.
@@ -99,19 +99,20 @@ class Writer:
             self._unsynced.discard(inbox)
 
 
-def stepped(rows: Rows) -> Rows:
-    """Rows with floats at multiples of their column's step and times at microseconds: what is fused is what is kept."""
+def round_to_steps(rows: Rows) -> Rows:
+    """Return rows with floats at multiples of their column's step and times in microseconds: the fusion uses what is
+    stored."""
     out = {name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c for name, c in rows.items()}
     return out | {name: out[name] // tables.US_STEP * tables.US_STEP for name in _TIMES if name in out}
 
 
 def nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Times of a kept table in ns, (n,)."""
+    """Return the times of a stored table in ns, (n,)."""
     return np.asarray(times.cast(tables.NS).cast(pa.int64()))
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
-    """Columns as an Arrow table of the archive's schema."""
+    """Return columns as an Arrow table of the archive's schema."""
     return pa.Table.from_arrays([_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind])
 
 
@@ -127,12 +128,13 @@ def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
-    """Whether rows tell a value of mu and not only a bound, (n,): they used EXCITED_SHARE of it. NaN tells nothing."""
+    """Return which rows give a value of mu and not only a bound, (n,): they used EXCITED_SHARE of it. NaN gives
+    nothing."""
     return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 
 
 def rows_of(table: pa.Table) -> Rows:
-    """Columns of a table as `Writer.write` takes them; times are int64, and null reads as what no sender sent."""
+    """Return the columns of a table as `Writer.write` takes them; times are int64, and null becomes the default."""
     rows: Rows = {}
     for f in table.schema:
         column = table.column(f.name).combine_chunks()
@@ -147,7 +149,7 @@ def rows_of(table: pa.Table) -> Rows:
 
 
 def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
-    """A column without null: what an older version did not write reads as what no sender sent; NaN in floats."""
+    """Return a column without null: columns of older versions get the default; floats get NaN."""
     if not column.null_count or pa.types.is_floating(f.type):
         return column
     filled: pa.Array[Any] = column.fill_null(
@@ -157,7 +159,7 @@ def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def _likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:
-    """Fixed-size binary as (n, 32); rows without one are flat."""
+    """Return fixed-size binary as (n, 32); rows without one are flat."""
     filled: pa.Array[Any] = column.fill_null(bytes(mugrid.BINS))
     data = np.frombuffer((filled.buffers()[1] or pa.py_buffer(b"")).to_pybytes(), np.uint8).reshape(-1, mugrid.BINS)
     return data[filled.offset : filled.offset + len(filled)]

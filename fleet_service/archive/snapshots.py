@@ -1,4 +1,4 @@
-"""The map as it was, for people: one GeoParquet file an hour.
+"""Snapshots of the public map: one GeoParquet file per hour.
 
 map/date=2026-01-31/20260131T070000Z.parquet      cells that are public, their polygons, sorted by cell
 """
@@ -22,10 +22,10 @@ _NAME: Final = "%Y%m%dT%H%M%SZ"
 
 
 def write(root: Path, table: pa.Table, now: int) -> Path:
-    """Keep the map of a moment [ns]; `table` has the schema of the map.
+    """Store the map of a moment [ns]; `table` has the schema of the map.
 
     Raises:
-        OSError: it could not be written; nothing is left of it.
+        OSError: it could not be written; no draft is left.
     """
     path = path_of(root, now)
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
@@ -36,18 +36,18 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
 
 
 def path_of(root: Path, now: int) -> Path:
-    """Where the map of a moment [ns] lies."""
+    """Return the path of the map of a moment [ns]."""
     moment = datetime.fromtimestamp(now // NS, UTC)
     return root / TABLE / f"date={moment:%Y-%m-%d}" / f"{moment:{_NAME}}.parquet"
 
 
 def time_of(path: Path) -> int:
-    """TimeNow [ns] of a snapshot."""
+    """Return the time [ns] of a snapshot."""
     return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 
 def newest(root: Path, until: int) -> Path | None:
-    """The last snapshot that was taken until a moment [ns]."""
+    """Return the last snapshot taken up to a moment [ns]."""
     for folder in reversed(layout.days(root, TABLE, until_day=until // layout.DAY_NS)):
         for path in sorted(folder.glob("*.parquet"), reverse=True):
             if time_of(path) <= until:

@@ -1,12 +1,12 @@
-"""Terms: the times of the services that had an archive's copy one after the other, and what counts of the former ones.
+"""Terms: successive owners of an archive's copy, and the files of former owners that count.
 
     fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest counts
     ARCHIVE/term            the epoch of the service that has the folder
 
-An object of the term's epoch or a later one counts, one of a former term if it is on the fence's list, and one whose
-name tells no epoch always. The list is made after nobody of a former term can acknowledge any more, and before anything
-is acknowledged in the new one. Who was frozen meanwhile and wakes may put more: it has an older epoch and is not on the
-list. Nobody acknowledged it, its senders send it again, and it counts for nothing, whoever reads the bucket later.
+An object counts if it has the term's epoch or a later one, if the fence lists it, or if its name has no epoch. The list
+is made after no former owner can acknowledge any more, and before anything is acknowledged in the new term. A service
+that was frozen and wakes may upload more. Such objects have an older epoch and are not on the list. They were never
+acknowledged, their senders send them again, and they do not count for any later reader of the bucket.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from typing import Final, NamedTuple
 
 from fleet_service.archive import layout
 from fleet_service.archive.bucket import ObjectBucket
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 FOLDER: Final = "fence"
 NAME: Final = "term"
 
 
 class Term(NamedTuple):
-    """A service's time with the copy: which since there were any, and the epoch of the names that it gives."""
+    """Ownership of the copy by one service: its number, and the epoch in its file names."""
 
     number: int
     epoch: int
 
 
 class Fence(NamedTuple):
-    """All from `epoch` on counts, and these names of former terms."""
+    """Objects that count: all from `epoch` on, and these names of former terms."""
 
     epoch: int
     names: frozenset[str]
 
     def passes(self, name: str) -> bool:
-        """Whether an object counts."""
+        """Return True if an object counts."""
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Fix what counts; each turn has a name of its own, so that none that lands late takes the place of a later one.
+    """Write the fence; each turn has a name of its own, so that a delayed upload never replaces a later one.
 
     Raises:
-        CopyError: it is not known to have landed.
+        CopyError: it is unknown whether the upload succeeded.
     """
     content = json.dumps({"epoch": fence.epoch, "names": sorted(fence.names)}).encode()
     bucket.put(f"{FOLDER}/{number:010d}-{turn:06d}.json.gz", gzip.compress(content, 6, mtime=0))
 
 
 def fence_of(bucket: ObjectBucket) -> Fence:
-    """The fence of who took over last; with none all counts.
+    """Return the fence of the last owner; without one, everything counts.
 
     Raises:
         CopyError: it cannot be read.
@@ -69,23 +69,23 @@ def fence_of(bucket: ObjectBucket) -> Fence:
     return Fence(int(document["epoch"]), frozenset(document["names"]))
 
 
-def newest(names: Iterable[str]) -> int:
-    """The largest epoch that names tell, or 0."""
+def largest_epoch(names: Iterable[str]) -> int:
+    """Return the largest epoch in names, or 0."""
     return max((layout.term_of(name) or 0 for name in names), default=0)
 
 
-def of(root: Path) -> int:
-    """Epoch of the service that has a folder; 0: there are no terms."""
+def read_epoch(root: Path) -> int:
+    """Return the epoch of the service that has a folder; 0 without terms."""
     with suppress(OSError, ValueError):
         return int((root / NAME).read_text())
     return 0
 
 
-def note(root: Path, epoch: int) -> None:
-    """Let what is compacted from now on bear this epoch.
+def write_epoch(root: Path, epoch: int) -> None:
+    """Write this epoch into the names of files compacted from now on.
 
     Raises:
         OSError: it cannot be written.
     """
-    with written(root / NAME) as file:
+    with open_durably(root / NAME) as file:
         file.write(f"{epoch}\n".encode())

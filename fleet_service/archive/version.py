@@ -1,16 +1,15 @@
-"""What a file says of its own format: a version, and a digest of its columns, in the footer.
+"""Format version of a file and digest of its columns, both in the footer.
 
-| version | what is new |
+| version | change |
 |---|---|
 | 1.0 | no version and no digest; the columns are exactly those of FIRST |
 | 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
 | 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` is null where only bounds are known |
 | 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
 
-A minor version adds columns: who knows fewer passes over the others, who knows more reads null. A major version changes
-what a column means: who is older refuses it. The digest is made the same way in all versions, so that damage is told
-from another version: Parquet's page checksums cover the values, and nothing else covers the names and types of columns
-that give the values their meaning.
+A minor version adds columns: older readers ignore them, newer readers read null. A major version changes the meaning of
+a column: older readers refuse the file. The digest is computed in the same way in all versions, so that damage differs
+from another version. Parquet's page checksums cover the values, but not the names and types of the columns.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from schemas.errors import InputError
 
 
 class Version(NamedTuple):
-    """Major and minor."""
+    """Major and minor version."""
 
     major: int
     minor: int
@@ -49,18 +48,18 @@ FIRST: Final = frozenset(
 
 
 class DamagedError(Exception):
-    """A file is not what was written."""
+    """The file is not what was written."""
 
 
 def footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Key-value pairs for the footer of a file: `entries`, a version if they have none, and the digest."""
+    """Return key-value pairs for the footer of a file: `entries`, a version if they have none, and the digest."""
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}
     return own | {DIGEST: digest(schema, own)}
 
 
 def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
-    """This project's key-value pairs of a file; undecodable ones are damage, which the digest shows."""
+    """Return this project's key-value pairs of a file; undecodable ones are damage, which the digest shows."""
     return {
         key.decode(errors="replace"): value.decode(errors="replace")
         for key, value in (metadata or {}).items()
@@ -68,13 +67,13 @@ def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
     }
 
 
-def newer(entries: Mapping[str, str]) -> bool:
-    """Whether a file says that it is of a newer major version; only a look, `judge` decides."""
+def is_newer(entries: Mapping[str, str]) -> bool:
+    """Return True if a file states a newer major version; a quick check, `judge` decides."""
     return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
 
 
 def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
-    """The version of a file with these columns and key-value pairs.
+    """Return the version of a file with these columns and key-value pairs.
 
     Raises:
         DamagedError: its columns or its key-value pairs are not those that were written.
@@ -87,7 +86,7 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     others = {key: value for key, value in entries.items() if key != DIGEST}
     if entries.get(DIGEST) != digest(schema, others):
         raise DamagedError("columns are not those that were written")
-    found = parsed(entries[KEY])
+    found = parse_version(entries[KEY])
     if found.major > VERSION.major:
         raise InputError(
             "archive", f"{path} is of version {found}, and this GripMap reads {VERSION.major}.x", "use a newer GripMap"
@@ -95,14 +94,14 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     return found
 
 
-def parsed(text: str) -> Version:
-    """A version from its text."""
+def parse_version(text: str) -> Version:
+    """Return a version from its text."""
     major, minor = text.split(".")
     return Version(int(major), int(minor))
 
 
 def digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
-    """Hash (16 hexadecimal digits) of names and types of columns, and of key-value pairs."""
+    """Return the hash (16 hexadecimal digits) of names and types of columns, and of key-value pairs."""
     state = _columns(tuple(schema.names), tuple(schema.types)).copy()
     for key in sorted(entries):
         state.update(f"\n{key}={entries[key]}".encode())
@@ -116,7 +115,7 @@ def _columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> blake2b:
 
 
 def _type(kind: pa.DataType) -> str:
-    """Name of a type; that of a list's values differs between versions of Arrow and is left out."""
+    """Return the name of a type; that of a list's values differs between versions of Arrow and is omitted."""
     if pa.types.is_list(kind):
         return f"list<{_type(kind.value_type)}>"
     if pa.types.is_struct(kind):

@@ -1,12 +1,12 @@
-"""Who a vehicle is to the map: one number for ever, while the archive knows it by another name in each month.
+"""Vehicle numbers of the map: one number per vehicle for ever, while the archive has one pseudonym per month.
 
-    keys/witness.key            of the service: a vehicle's number is its name's keyed hash
-    keys/2026-01.witnesses      which pseudonym of the month is whose number; goes with the month's key
-    keys/2026-01.TERM.witnesses likewise, of a service that succeeds others: each writes into a file of its own
+    keys/witness.key            of the service: a vehicle's number is the keyed hash of its name
+    keys/2026-01.witnesses      number of each pseudonym of the month; removed with the month's key
+    keys/2026-01.TERM.witnesses the same, of a service that succeeds others: each writes a file of its own
 
-One car must not be two witnesses because a month ended, or because it says so. The second file is for restarts and
-replays, which see pseudonyms; a line that is lost or damaged makes one vehicle two again there, and nothing else. So
-a service looks through them when it starts, counts what is damaged and takes it out; the vehicle's next batch writes
+One car must not become two witnesses because a month ended, or because it claims so. The second file is for restarts
+and replays, which see pseudonyms. A lost or damaged line makes one vehicle two there, and has no other effect. A
+service therefore checks the lines when it starts, counts damaged ones and removes them. The vehicle's next batch writes
 its line again.
 """
 
@@ -24,9 +24,9 @@ from typing import Final
 import numpy as np
 
 from fleet_service.archive import layout, terms
-from fleet_service.archive.pseudonyms import kept_key
+from fleet_service.archive.pseudonyms import load_or_create_key
 from schemas.numeric import IntArray
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 ENDING: Final = ".witnesses"
 _KEY: Final = "witness.key"
@@ -35,27 +35,27 @@ _SECRET: Final = 0o600
 _MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
 
-class Witnesses:
+class VehicleIds:
     """Numbers of vehicles.
 
     Args:
-        folder: where the keys lie.
+        folder: of the keys.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._term = folder, terms.of(folder.parent)
+        self._folder, self._term = folder, terms.read_epoch(folder.parent)
         self._key: bytes | None = None
         self._known: set[int] | None = None
         self._unsynced: set[Path] = set()
 
-    def of(self, vehicle: str, month: str, pseudonym: int) -> int:
-        """Number of a vehicle, which has this pseudonym in this month (2026-01); durable after `sync`.
+    def id_of(self, vehicle: str, month: str, pseudonym: int) -> int:
+        """Return the number of a vehicle, which has this pseudonym in this month (2026-01); durable after `sync`.
 
         Raises:
-            OSError: the key can neither be read nor written, or the line not be written.
+            OSError: the key can neither be read nor written, or the line cannot be written.
         """
         if self._key is None or self._known is None:
-            self._key = kept_key(self._folder / _KEY)
+            self._key = load_or_create_key(self._folder / _KEY)
             self._known = set(read(self._folder))
         number = int.from_bytes(blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True)
         if pseudonym not in self._known:
@@ -70,10 +70,10 @@ class Witnesses:
         return number
 
     def sync(self) -> None:
-        """Make the new lines durable: before anything of their vehicles is acknowledged.
+        """Make new lines durable, before anything of their vehicles is acknowledged.
 
         Raises:
-            OSError: the disk is full or broken; it is tried again at the next call.
+            OSError: the disk is full or broken; the next call tries again.
         """
         for path in sorted(self._unsynced):
             if path.exists():  # else the month was forgotten meanwhile
@@ -84,12 +84,12 @@ class Witnesses:
 
 
 def read(folder: Path) -> dict[int, int]:
-    """Numbers by pseudonym, of all months; without lines that are damaged."""
+    """Return the numbers by pseudonym of all months, without damaged lines."""
     return {pseudonym: number for path in _files(folder) for pseudonym, number in _whole(path.read_bytes())}
 
 
-def mend(folder: Path) -> int:
-    """Take damaged lines out, and what is no line, where the disk lets it; returns how many there were.
+def remove_damaged_lines(folder: Path) -> int:
+    """Remove damaged lines, and text that is no line, if the disk allows it; return their number.
 
     Raises:
         OSError: a file cannot be read.
@@ -100,18 +100,18 @@ def mend(folder: Path) -> int:
         good = b"".join(_line(*both) for both in _whole(data))
         if len(good) < len(data):
             damaged += -(-(len(data) - len(good)) // _LINE)
-            with suppress(OSError), written(path, _SECRET) as file:
+            with suppress(OSError), open_durably(path, _SECRET) as file:
                 file.write(good)
     return damaged
 
 
 def _files(folder: Path) -> list[Path]:
-    """Of all months."""
+    """Return the files of all months."""
     return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
 
 
 def _whole(data: bytes) -> Iterator[tuple[int, int]]:
-    """Pseudonym and number of every line that is as it was written."""
+    """Yield pseudonym and number of every undamaged line."""
     for at in range(0, len(data) - _LINE + 1, _LINE):
         pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
         if data[at : at + _LINE] == _line(pseudonym, number):
@@ -119,7 +119,7 @@ def _whole(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
-    """Numbers of pseudonyms (n,) by what `read` gave; one that is not known is its own."""
+    """Return the numbers of pseudonyms (n,) by the result of `read`; an unknown pseudonym is its own number."""
     if not known or not len(pseudonyms):
         return pseudonyms
     distinct, index = np.unique(pseudonyms, return_inverse=True)
@@ -136,7 +136,7 @@ def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
             continue
         data = path.read_bytes()
         lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
-        with written(path, _SECRET) as file:
+        with open_durably(path, _SECRET) as file:
             file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
 
 

@@ -1,8 +1,8 @@
-"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze,
-rebuild, certs, evaluate, completion.
+"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze, rebuild,
+certs, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
-it is chosen, so that help comes at once.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
+needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from contextlib import nullcontext
 from typing import Final
 
 from fleet_service.app import UNUSED
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "watch", "page")  # commands that go on until a signal
 
 COMMANDS: Final = (
-    Command("run", "fleet_service.cli.run", "take observations in, serve the map, keep the archive",
+    Command("run", "fleet_service.cli.run", "run the service: receive observations, serve the map, keep the archive",
             "fleet-service run --archive archive --config service.json"),
-    Command("query", "fleet_service.cli.query", "ask the map once",
+    Command("query", "fleet_service.cli.query", "query the map once",
             "fleet-service query --bbox -0.5,51.2,0.3,51.7 --out map.geojson"),
     Command("watch", "fleet_service.cli.watch", "print tiles and alerts as they change, until Ctrl-C",
             "fleet-service watch --bbox 11.9,57.6,12.1,57.8"),
-    Command("page", "fleet_service.cli.page", "the live map in a browser: now, alerts, the past, routes",
+    Command("page", "fleet_service.cli.page", "serve the live map for browsers: now, alerts, the past, routes",
             "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
-    Command("hand-over", "fleet_service.cli.hand_over", "a region goes to a service that stands by for it, live",
+    Command("hand-over", "fleet_service.cli.hand_over", "move a region to a standby while it runs",
             "fleet-service hand-over 1202/310/* --to north-b"),
-    Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, roll them up",
+    Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, and compute roll-ups",
             "fleet-service compact --archive archive"),
     Command("retention", "fleet_service.cli.retention", "remove old raw rows; their roll-ups stay",
             "fleet-service retention --archive archive --raw-days 92 --dry-run"),
     Command("forget", "fleet_service.cli.forget", "destroy the key of a month, or remove one vehicle's rows of it",
             "fleet-service forget --archive archive --period 2026-01 --vehicle car-one --dry-run"),
-    Command("export", "fleet_service.cli.export", "write a part as GeoParquet, GeoJSON or CSV",
+    Command("export", "fleet_service.cli.export", "write a part of the archive as GeoParquet, GeoJSON or CSV",
             "fleet-service export map --archive archive --out map.parquet"),
-    Command("roads", "fleet_service.cli.roads", "which link of a road network each cell lies on, for analyze contract",
+    Command("roads", "fleet_service.cli.roads", "assign cells to links of a road network, for analyze contract",
             "fleet-service roads city.osm.pbf --out roads.parquet"),
     Command(
         "analyze", "fleet_service.cli.analyze",
@@ -47,13 +47,15 @@ COMMANDS: Final = (
         "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
-    Command("rebuild", "fleet_service.cli.rebuild", "map and roll-ups anew from raw observations, here or on Spark",
+    Command("rebuild", "fleet_service.cli.rebuild", "compute map and roll-ups again from raw "
+                                                    "observations, here or on Spark",
             "fleet-service rebuild --archive archive --out rebuilt --engine spark"),
-    Command("certs", "fleet_service.cli.certs", "certificates and router configurations for everyone on a list",
+    Command("certs", "fleet_service.cli.certs", "create certificates and router configurations for everyone on a list",
             "fleet-service certs --fleet fleet.json --out certs"),
-    Command("evaluate", "fleet_service.cli.evaluate", "simulated fleets, beside truth and simple rules",
+    Command("evaluate", "fleet_service.cli.evaluate", "evaluate the fusion on simulated fleets, "
+                                                      "against truth and simple rules",
             "fleet-service evaluate --quick --out evaluation"),
-    Command("completion", "fleet_service.cli.completion", "print what completes these commands in a shell",
+    Command("completion", "fleet_service.cli.completion", "print the completion script for a shell",
             "fleet-service completion bash > ~/.local/share/bash-completion/completions/fleet-service"),
 )  # fmt: skip
 LINE: Final = ("fleet-service", "One live map of grip from many vehicles.", COMMANDS)
@@ -63,17 +65,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        its exit code; 2 after a one-line error that names the field and the fix.
+        the exit code; 2 after a one-line error that names the field and the fix.
     """
-    given = commandline.joined(sys.argv[1:] if argv is None else argv)
+    given = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in given if not argument.startswith("-")), None)
     if argv is None and chosen == "run":
         from schemas.runtime.process import limit_memory
 
         limit_memory(*UNUSED)
-    talk.speak(quiet=commandline.wants_quiet(given))
-    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
+    with (
+        nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
+    ):  # what it loads takes a second
         arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
         if arguments.verbose:
             logging.basicConfig(level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-        return commandline.guarded(lambda: int(arguments.run(arguments)))
+        return commandline.run_guarded(lambda: int(arguments.run(arguments)))

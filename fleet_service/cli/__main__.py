@@ -1,6 +1,6 @@
 """`python -m fleet_service.cli`."""
 
 from fleet_service.cli import main
-from schemas.runtime.process import leave
+from schemas.runtime.process import exit_fast
 
-leave(main())
+exit_fast(main())

@@ -1,4 +1,4 @@
-"""`fleet-service analyze`: one of the questions, on a part of an archive, in the terminal and as a file."""
+"""`fleet-service analyze`: ask one of the questions about a part of an archive; print the answer or write a file."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
-from fleet_service.analytics.questions import Question, known, question_of
-from fleet_service.cli.common import add_part, compacted_first, span
+from fleet_service.analytics.questions import Question, known_questions, question_of
+from fleet_service.cli.common import add_part, compact_first, span
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
 # which questions an option is for; to the others it would be one that is passed over in silence
@@ -28,28 +28,36 @@ UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known().values())
-    parser.add_argument("question", metavar="NAME", help=" | ".join(known()))
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="what waits in its log is compacted")
+    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known_questions().values())
+    parser.add_argument("question", metavar="NAME", help=" | ".join(known_questions()))
+    parser.add_argument(
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="archive; segments waiting in its log are compacted first",
+    )
     add_part(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
     parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
-    parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
+    parser.add_argument("--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map")
     parser.add_argument("--stations", metavar="FILE", type=Path, help="weather, change-rates: readings, CSV or Parquet")
-    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: between frames")
+    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: seconds between frames")
     vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
     parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
-    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: what `fleet-service roads` wrote")
-    parser.add_argument("--level", metavar="MU", type=float, help="contract: grip that was agreed, e.g. .35")
-    parser.add_argument("--within", metavar="TIME", help="contract: in which it is to be restored, e.g. 4h or 90min")
-    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: only compacted files are read")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one a line")
+    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`")
+    parser.add_argument("--level", metavar="MU", type=float, help="contract: agreed grip, e.g. .35")
+    parser.add_argument(
+        "--within", metavar="TIME", help="contract: time within which it must be restored, e.g. 4h or 90min"
+    )
+    parser.add_argument("--as-it-lies", action="store_true", help="do not compact the log; read compacted files only")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one per line")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print the answer, and write it on request."""
-    question = _checked(arguments)
-    talk.doing(f"{question.name}: loading DuckDB and Ibis")
+    question = _checked_question(arguments)
+    progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output
     from fleet_service.archive.export import Extract
     from schemas import query
@@ -59,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*span(arguments), bbox)
     if not arguments.as_it_lies:
-        compacted_first(arguments.archive)
+        compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
     at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
@@ -77,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _seconds(text: str | None) -> float | None:
-    """A length of time as people write it."""
+    """Return a duration in seconds from its usual notation."""
     if text is None:
         return None
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
@@ -86,11 +94,11 @@ def _seconds(text: str | None) -> float | None:
     return float(found[1]) * UNITS[found[2]]
 
 
-def _checked(arguments: argparse.Namespace) -> Question:
-    """The question; all that can be said before anything is computed is said now."""
+def _checked_question(arguments: argparse.Namespace) -> Question:
+    """Return the question, after all checks that need no computation."""
     question = question_of(arguments.question)
     if arguments.out is not None:
-        commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
+        commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
         if question.colour is None and arguments.out.name.endswith((".html", ".geojson", ".geo.parquet")):
             raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
     for name, takers in FOR.items():
@@ -106,4 +114,4 @@ def _checked(arguments: argparse.Namespace) -> Question:
 
 
 def _report(line: str) -> None:
-    talk.say(line)
+    progress_messages.report(line)

@@ -1,4 +1,4 @@
-"""`fleet-service certs`: checks its options, enrols, and says what is to be done next."""
+"""`fleet-service certs`: check options, enrol, and print the next steps."""
 
 from __future__ import annotations
 
@@ -15,15 +15,31 @@ SHOWN = 8  # names of a kind
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--fleet", metavar="FILE", type=Path, required=True, help="JSON: who takes part, by role")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="run it again to renew and to revoke")
-    parser.add_argument("--at", metavar="DIR", type=Path, help="where the routers' files will lie (default: --out)")
-    parser.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
-    parser.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
-    parser.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
+    parser.add_argument(
+        "--fleet",
+        metavar="FILE",
+        type=Path,
+        required=True,
+        help="enrolment file (JSON): everyone who takes part, by role",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="folder of the certificates; run again to renew and to revoke",
+    )
+    parser.add_argument(
+        "--at", metavar="DIR", type=Path, help="folder in which the routers find the files (default: --out)"
+    )
+    parser.add_argument("--days", type=float, default=365.0, help="validity of a certificate (default 365)")
+    parser.add_argument("--ca-days", type=float, default=3650.0, help="validity of a new authority (default 3650)")
+    parser.add_argument(
+        "--renew-days", type=float, default=30.0, help="renew certificates that end sooner (default 30)"
+    )
     parser.add_argument("--revoke", metavar="N", type=int, help=f"revoke so many names; more than {ASKED} want it said")
-    parser.add_argument("--dry-run", action="store_true", help="only say who would be revoked")
-    parser.add_argument("--ca", choices=("next", "switch", "drop"), help="a step on the way to another authority")
+    parser.add_argument("--dry-run", action="store_true", help="only print the names that would be revoked")
+    parser.add_argument("--ca", choices=("next", "switch", "drop"), help="next step of the change to another authority")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""What the commands share: signals, the router, which part of which archive."""
+"""Shared parts of the commands: signals, the router, the selected part of an archive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.config import moment
 from schemas.errors import InputError
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 if TYPE_CHECKING:
     from fleet_service.client.datex import Supplier
@@ -23,7 +23,7 @@ STATUSES: Final = ("real", "test", "technicalExercise", "securityExercise")
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and Ctrl-C set."""
+    """Return an event that SIGTERM and Ctrl-C set."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -37,17 +37,19 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
 
 
 def add_supplier(parser: argparse.ArgumentParser) -> None:
-    """Declare who answers for a DATEX II publication."""
-    parser.add_argument("--country", metavar="CC", help="datex: the supplier's, e.g. se")
-    parser.add_argument("--supplier", metavar="NAME", help="datex: the supplier's name at its National Access Point")
-    parser.add_argument("--status", choices=STATUSES, default="test", help="datex: of the information; default test")
+    """Declare the supplier of a DATEX II publication."""
+    parser.add_argument("--country", metavar="CC", help="datex: country of the supplier, e.g. se")
+    parser.add_argument("--supplier", metavar="NAME", help="datex: name of the supplier at its National Access Point")
+    parser.add_argument(
+        "--status", choices=STATUSES, default="test", help="datex: status of the information; default test"
+    )
 
 
 def supplier_of(arguments: argparse.Namespace) -> Supplier:
-    """Who answers for a DATEX II publication.
+    """Return the supplier of a DATEX II publication.
 
     Raises:
-        InputError: it is not said, or no country.
+        InputError: it is missing, or the country is not valid.
     """
     from fleet_service.client.datex import Supplier
 
@@ -58,38 +60,40 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:
-    """Declare which part of an archive is wanted."""
+    """Declare the options that select a part of the archive."""
     parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="likewise, excluded; default now")
-    parser.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
+    parser.add_argument("--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)")
+    parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
 
 
 def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
-    """Declare the archive of a command that works on one, and how it says what it did."""
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=required, help="of a service, running or not")
-    parser.add_argument("--json", action="store_true", help="say what was done as one line of JSON")
+    """Declare the archive of a command, and the form of its report."""
+    parser.add_argument(
+        "--archive", metavar="DIR", type=Path, required=required, help="archive of a service, running or not"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare the brakes of a command that destroys something."""
-    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
-    parser.add_argument("--yes", action="store_true", help="do not ask; on a terminal it asks")
+    """Declare the safety options of a destructive command."""
+    parser.add_argument("--dry-run", action="store_true", help="only print what would be done")
+    parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
-def confirmed(arguments: argparse.Namespace, what: str) -> bool:
-    """Whether a person on a terminal agrees; who is no terminal has decided already."""
+def confirm(arguments: argparse.Namespace, what: str) -> bool:
+    """Ask for confirmation on a terminal; return True without a terminal."""
     if arguments.yes or not sys.stdin.isatty():
         return True
-    talk.hush()
+    progress_messages.stop_status()
     print(f"{what}. This cannot be undone. Go on? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def span(arguments: argparse.Namespace) -> tuple[int, int]:
-    """From when until when [ns], of the options of `add_part`.
+    """Return begin and end [ns] from the options of `add_part`.
 
     Raises:
-        InputError: one of them is no time, or they are the wrong way round.
+        InputError: one of them is no time, or the end is not after the begin.
     """
     since = 0 if arguments.since is None else moment(arguments.since, "from")
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
@@ -99,21 +103,21 @@ def span(arguments: argparse.Namespace) -> tuple[int, int]:
 
 
 class ArchiveReport(NamedTuple):
-    """What a command did: a line for people, values for programs."""
+    """Report of a command: a line for people, values for programs."""
 
     line: str
     values: dict[str, object]
 
 
 def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]) -> int:
-    """Run a command on its archive and print what it did.
+    """Run a command on its archive and print its report.
 
     Raises:
         InputError: there is no such archive, or it cannot be read or written.
     """
-    from fleet_service.archive.layout import insist_on_archive
+    from fleet_service.archive.layout import require_archive
 
-    insist_on_archive(arguments.archive)
+    require_archive(arguments.archive)
     try:
         done = command(arguments)
         print(json.dumps({"command": arguments.command, **done.values}) if arguments.json else done.line)
@@ -122,23 +126,23 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     return 0
 
 
-def compacted_first(root: Path) -> None:
-    """Count what waits in the log too; where that cannot be done, say how much is left out.
+def compact_first(root: Path) -> None:
+    """Compact waiting segments so that they count; if that is impossible, print how much is left out.
 
     Raises:
-        InputError: it is no archive.
+        InputError: the folder is no archive.
     """
     from fleet_service.archive import layout, segments
     from fleet_service.archive.compaction import compact
     from schemas.wire import Kind
 
-    layout.insist_on_archive(root)
+    layout.require_archive(root)
     waiting = len(segments.paths(root, Kind.OBSERVATION))
     if not waiting:
         return
-    talk.doing(f"compacting {waiting} segments of the log")
+    progress_messages.set_status(f"compacting {waiting} segments of the log")
     try:
         done = compact(root)
-        talk.say(f"compacted first: {done.rows:,} rows of {done.segments} segments")
+        progress_messages.report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
     except (OSError, InputError) as error:
         print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)

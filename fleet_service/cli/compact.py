@@ -1,4 +1,4 @@
-"""`fleet-service compact`: the log as files by date and zone. The service may run meanwhile."""
+"""`fleet-service compact`: sort the log into files by date and zone. The service may run meanwhile."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument(
-        "--put-to", "--to", dest="to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder"
+        "--put-to", "--to", dest="to", metavar="URI", help="then copy new files there, e.g. s3://bucket/folder"
     )  # --to: its name until 0.2
     parser.add_argument(
         "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"
@@ -36,6 +36,6 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     summary = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
     values: dict[str, object] = {"rows": done.rows, "segments": done.segments, "files": done.files, "rolled_up": parts}
     if arguments.to is not None:
-        put = mirror.put(arguments.archive, arguments.to)
+        put = mirror.copy_new_files(arguments.archive, arguments.to)
         summary, values = f"{summary}, {put} put", {**values, "put": put}
     return ArchiveReport(summary, values)

@@ -1,4 +1,4 @@
-"""`fleet-service completion`: the script that completes its commands and options in a shell."""
+"""`fleet-service completion`: print the completion script for a shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fleet-service evaluate`: simulated fleets, beside truth and simple rules."""
+"""`fleet-service evaluate`: simulated fleets, compared with the truth and with simple rules."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from schemas.errors import InputError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
-    parser.add_argument("--quick", action="store_true", help="one seed, to see that it works; judges nothing")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots")
+    parser.add_argument("--quick", action="store_true", help="one seed, to check that it runs; judges nothing")
     # the second names are those of earlier versions
     way = parser.add_mutually_exclusive_group()
     way.add_argument(
-        "--skip-end-to-end", "--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out"
+        "--skip-end-to-end", "--skip-whole-way", action="store_true", help="omit the vehicles with real estimators"
     )
     way.add_argument(
-        "--end-to-end", "--whole-way", action="store_true", help="those alone, in a level town and on hills"
+        "--end-to-end", "--whole-way", action="store_true", help="only those, in a level town and on hills"
     )
 
 

@@ -1,7 +1,7 @@
-"""`fleet-service export`: a part of the archive as a file for other programs; the map as it stands now, or stood.
+"""`fleet-service export`: write a part of the archive, or the map as of a moment, as a file for other programs.
 
-`export datex` asks the running services instead, and writes the slippery stretches as road authorities read them.
-`export iceberg` writes no file: it names the compacted ones in Iceberg tables.
+`export datex` queries the running services instead, and writes the slippery stretches for road authorities. `export
+iceberg` writes no file: it registers the compacted files in Iceberg tables.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fleet_service.cli.common import (
     supplier_of,
 )
 from schemas.errors import InputError
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.thresholds import NS
 
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
@@ -47,28 +47,37 @@ _NEEDS: Final = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser, required=False)
-    parser.add_argument("what", choices=(*WHAT, DATEX, ICEBERG), metavar="|".join((*WHAT, DATEX, ICEBERG)))
+    parser.add_argument(
+        "what",
+        choices=(*WHAT, DATEX, ICEBERG),
+        metavar="|".join((*WHAT, DATEX, ICEBERG)),
+        help="the part of the archive, or of the live map",
+    )
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
     add_part(parser)
     parser.add_argument(
-        "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells of K vehicles or more"
+        "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells with at least K vehicles"
     )
-    parser.add_argument("--snapshot", action="store_true", help="map: the service's last hourly one, at once")
+    parser.add_argument("--snapshot", action="store_true", help="map: use the service's last hourly snapshot, at once")
     add_connection(parser)
     add_supplier(parser)
-    parser.add_argument("--follow", action="store_true", help="datex: keep the file up until a signal")
+    parser.add_argument("--follow", action="store_true", help="datex: keep the file current until a signal")
     parser.add_argument(
-        "--catalog", metavar="NAME|URI", help="iceberg: of pyiceberg's configuration, or sqlite:///FILE, postgresql+…"
+        "--catalog",
+        metavar="NAME|URI",
+        help="iceberg: name in pyiceberg's configuration, or sqlite:///FILE, postgresql+…",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="iceberg: of the tables observations, states; or gripmap")
-    parser.add_argument("--at", metavar="URL", help="iceberg: where readers find the archive's files; default: there")
+    parser.add_argument("--namespace", metavar="NAME", help="iceberg: namespace of the tables (default: gripmap)")
+    parser.add_argument(
+        "--at", metavar="URL", help="iceberg: URL at which readers find the archive's files (default: its path)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command: on its archive, or on what the services say.
+    """Run the command on its archive, or on the answers of the services.
 
     Raises:
-        InputError: an option is missing, or of the other kind of export.
+        InputError: an option is missing, or belongs to another kind of export.
     """
     for name in _NOT[arguments.what]:
         if getattr(arguments, name):
@@ -97,7 +106,7 @@ def _datex(arguments: argparse.Namespace) -> int:
     from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish
     from fleet_service.client.map_client import settings
 
-    commandline.ending("out", commandline.out_folder("out", arguments.out), (".xml",))
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".xml",))
     feed = DatexFeed(DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True)))
     publish(settings(arguments.connect, arguments.config), feed, stop_on_signals() if arguments.follow else None)
     return 0
@@ -107,7 +116,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive import export
     from schemas import query
 
-    commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
     if arguments.min_vehicles < 1:
         raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
@@ -116,7 +125,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     if arguments.what == "map" and not arguments.snapshot:
         from fleet_service.analytics.past_map import map_at
 
-        talk.doing("replaying the archive")
+        progress_messages.set_status("replaying the archive")
         table = map_at(arguments.archive, part)
         as_of = _text(part.until)
     else:
@@ -124,7 +133,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
         if arguments.what == "map":
             as_of = _text(export.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
-        table = export.seen_by(table, arguments.min_vehicles)
+        table = export.with_vehicles(table, arguments.min_vehicles)
     export.write(table, arguments.out)
     line = f"{table.num_rows} rows in {arguments.out}" + (f": the map as of {as_of}" if as_of else "")
     return ArchiveReport(

@@ -1,4 +1,4 @@
-"""`fleet-service forget`: a vehicle, or a month of all; where a service runs, it does it itself."""
+"""`fleet-service forget`: forget a vehicle or a complete month; a running service does it itself."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirmed, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirm, on_archive
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
     from fleet_service.archive.requests import Erasure
-    from fleet_service.archive.retention import Forgotten
+    from fleet_service.archive.retention import ErasureResult
 
 ASK_S: Final = 0.5  # between two looks whether the service has answered
 LOOK_S: Final = 5.0  # ... and whether it is still there
@@ -24,9 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
-    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle; its rows are removed")
-    parser.add_argument("--config", metavar="FILE", help="the service's: how the archive's copy is reached")
-    parser.add_argument("--put-to", metavar="URI", help="the mirror, where what was rewritten is put again")
+    parser.add_argument("--vehicle", metavar="NAME", help="remove only the rows of this vehicle")
+    parser.add_argument("--config", metavar="FILE", help="the service's configuration, with the archive's copy")
+    parser.add_argument("--put-to", metavar="URI", help="mirror to which rewritten files are copied again")
     add_dry_run(parser)
 
 
@@ -46,9 +46,9 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     what = f"the key of {month} is destroyed" if vehicle is None else f"{rows} rows of {vehicle} are removed"
     if arguments.dry_run:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
-    if not confirmed(arguments, what):
+    if not confirm(arguments, what):
         return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
-    done = _erased(root, Erasure(month, vehicle), arguments.config)
+    done = _erase(root, Erasure(month, vehicle), arguments.config)
     still = "" if done.kept is None else f"; the copy holds it still, and the service tries again ({done.kept})"
     if vehicle is None:
         return ArchiveReport(what + still, {"rows": 0, "key": True, "copy": done.kept})
@@ -56,12 +56,12 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     line = removed + still
     report: dict[str, object] = {"rows": done.rows, "key": False, "files": len(done.files), "copy": done.kept}
     if arguments.put_to is not None:
-        report["put"] = mirror.put(root, arguments.put_to, done.files)
+        report["put"] = mirror.copy_new_files(root, arguments.put_to, done.files)
         line += f", {report['put']} files put to {arguments.put_to}"
     return ArchiveReport(line, report)
 
 
-def _erased(root: Path, wanted: Erasure, config: str | None) -> Forgotten:
+def _erase(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
     """Erase, in the archive's copy too, or let the service that holds the archive do it.
 
     Raises:
@@ -69,51 +69,51 @@ def _erased(root: Path, wanted: Erasure, config: str | None) -> Forgotten:
         OSError: a file cannot be read or written.
     """
     from fleet_service.archive import requests
-    from fleet_service.archive.files import held
-    from fleet_service.archive.retention import Forgotten, forget_period, forget_vehicle
+    from fleet_service.archive.files import is_served
+    from fleet_service.archive.retention import ErasureResult, forget_period, forget_vehicle
 
-    question = requests.ask(root, wanted) if held(root) else None
+    question = requests.write_request(root, wanted) if is_served(root) else None
     looked = time.monotonic()
     while question is not None:  # a service that ends meanwhile leaves it to us
         if (answer := requests.answer_to(question)) is not None:
-            return Forgotten(answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy"))
+            return ErasureResult(answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy"))
         time.sleep(ASK_S)
         if time.monotonic() - looked > LOOK_S:
             looked = time.monotonic()
-            if not held(root):
+            if not is_served(root):
                 question.unlink(missing_ok=True)
                 question = None
-    with _copied(root, config):
+    with _sync_copy(root, config):
         if wanted.vehicle is None:
             forget_period(root, wanted.month)
-            return Forgotten(0, ())
+            return ErasureResult(0, ())
         return forget_vehicle(root, wanted.vehicle, wanted.month)
 
 
 @contextmanager
-def _copied(root: Path, path: str | None) -> Iterator[None]:
+def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     """Let the archive's copy follow, if it has one.
 
     Raises:
-        InputError: it is not known how to reach it, and nothing was done; or it was not reached.
+        InputError: its settings are unknown, and nothing was done; or it was not reached.
     """
-    from fleet_service.archive.copied import copy_of
-    from fleet_service.archive.copies import Copy
+    from fleet_service.archive.copied import last_copy_url
+    from fleet_service.archive.copies import BucketReplica
     from schemas.config import ServiceConfig, load
 
     config = load(path, ServiceConfig)
-    url = config.archive.second or copy_of(root)
+    url = config.archive.second or last_copy_url(root)
     if url is None:
         yield
         return
     if config.archive.second is None:
         fix = "give --config with the service's configuration"
         raise InputError("config", f"the archive has a copy at {url}, where it is to be forgotten too", fix)
-    with closing(Copy(root, url, config.archive.options)) as copy:
+    with closing(BucketReplica(root, url, config.archive.options)) as copy:
         copy.begin(config.name)  # what only the copy has comes first, or it would be found there later
         yield
         try:
-            copy.follow()
+            copy.sync()
         except OSError as error:
             fix = "start the service, which goes on with it, when the copy is reached"
             raise InputError("archive.copy", f"it is forgotten here, and not yet at {url} ({error})", fix) from error

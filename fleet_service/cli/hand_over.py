@@ -1,4 +1,4 @@
-"""`fleet-service hand-over`: a region goes from the service that has it to one that stands by."""
+"""`fleet-service hand-over`: move a region from its service to a standby."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from fleet_service.cli.common import add_connection
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("region", metavar="REGION", help="as services are given it, e.g. 1202/310/*")
-    parser.add_argument("--to", metavar="NAME", required=True, help="the standby that is to serve it")
+    parser.add_argument("region", metavar="REGION", help="region key expression, e.g. 1202/310/*")
+    parser.add_argument("--to", metavar="NAME", required=True, help="name of the standby that takes over")
     add_connection(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Hand over, and say how long nobody served it."""
+    """Hand over, and print how long the region had no service."""
     from fleet_service.client import map_client
     from fleet_service.shards.moving import hand_over
     from schemas.config import REGION_PATTERN
@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not re.fullmatch(REGION_PATTERN, arguments.region):
         raise InputError("region", f"{arguments.region!r} is none", "give chunks of 4, 3 and 3 digits, or * for all")
-    with map_client.joined(map_client.settings(arguments.connect, arguments.config)) as session:
+    with map_client.open_connected(map_client.settings(arguments.connect, arguments.config)) as session:
         moved = hand_over(session, arguments.region, arguments.to, print)
     if moved is None:
         print(f"{arguments.to} serves {arguments.region} already")

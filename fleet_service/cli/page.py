@@ -16,18 +16,26 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--archive", metavar="DIR", type=Path, help="of a service on this machine: past and history")
-    parser.add_argument("--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)")
-    parser.add_argument("--port", type=int, default=8080, help="0: a free one (default 8080)")
-    parser.add_argument("--name", action="append", default=[], help="host name under which a proxy passes it on")
     parser.add_argument(
-        "--metrics", metavar="URL", action="append", default=[], help="metrics of a service, for the health view"
+        "--archive", metavar="DIR", type=Path, help="archive of a service on this machine, for past and history"
     )
-    parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to lay over the map")
+    parser.add_argument("--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)")
+    parser.add_argument("--port", type=int, default=8080, help="port; 0 selects a free one (default 8080)")
+    parser.add_argument("--name", action="append", default=[], help="host name under which a proxy forwards requests")
+    parser.add_argument(
+        "--metrics",
+        metavar="URL",
+        action="append",
+        default=[],
+        help="metrics address of a service, for the health view",
+    )
+    parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to draw over the map")
     parser.add_argument(
         "--base-map", metavar="URL|FILE", help="raster tiles below the cells: URL with {z}, {x} and {y}, or .mbtiles"
     )
-    parser.add_argument("--datex", metavar="FILE", type=Path, help="keep a DATEX II publication up in it, and serve it")
+    parser.add_argument(
+        "--datex", metavar="FILE", type=Path, help="keep a DATEX II publication current in this file, and serve it"
+    )
     add_supplier(parser)
     add_connection(parser)
 
@@ -43,9 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
         fix = "pip install 'gripmap[page]'"
         raise InputError("page", f"the package {error.name} is missing", fix) from error
     if arguments.archive is not None:
-        from fleet_service.archive.layout import insist_on_archive
+        from fleet_service.archive.layout import require_archive
 
-        insist_on_archive(arguments.archive)
+        require_archive(arguments.archive)
     settings = server.PageSettings(
         connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
         names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
@@ -63,5 +71,5 @@ def _publication(arguments: argparse.Namespace) -> DatexFile | None:
         return None
     from fleet_service.client.datex_feed import DatexFile
 
-    commandline.ending("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
+    commandline.ending_of("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
     return DatexFile(supplier_of(arguments), arguments.datex, lambda line: print(line, flush=True))

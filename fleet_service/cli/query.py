@@ -1,4 +1,4 @@
-"""`fleet-service query`: the map asked once."""
+"""`fleet-service query`: query the map once."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some o
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
-    parser.add_argument("--route", metavar="LON,LAT|LON,LAT", help="the cells ahead, in their order")
-    parser.add_argument("--min-vehicles", metavar="K", help="only cells of K vehicles or more")
-    parser.add_argument("--at", metavar="TIME", help="the map as it was, e.g. 2026-01-31T07:00:00Z; UTC without a zone")
-    parser.add_argument("--basis", metavar="borrowed", help="also cells that only neighbours speak for")
+    parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
+    parser.add_argument("--route", metavar="LON,LAT|LON,LAT", help="route; returns the cells ahead in driving order")
+    parser.add_argument("--min-vehicles", metavar="K", help="only cells with at least K vehicles")
+    parser.add_argument("--at", metavar="TIME", help="moment of the map, e.g. 2026-01-31T07:00:00Z; UTC without a zone")
+    parser.add_argument("--basis", metavar="borrowed", help="borrowed: also unvisited cells, imputed from neighbours")
     parser.add_argument("--format", metavar="arrow|geojson|json", help="arrow (default) prints a table")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help=f"write it there, as the ending says: {', '.join(FORMS)}"
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, and print or write the answer; 1 where nobody serves some of what was asked for."""
+    """Query, and print or write the answer; 1 if a part of the area has no service."""
     form = _form(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
@@ -61,7 +61,7 @@ def _form(out: Path | None, given: str | None) -> str | None:
     commandline.out_folder("out", out)
     if not out.suffix:
         return given
-    form = FORMS[commandline.ending("out", out, tuple(FORMS))]
+    form = FORMS[commandline.ending_of("out", out, tuple(FORMS))]
     if given not in (None, form):
         raise InputError("format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}")
     return form

@@ -1,4 +1,4 @@
-"""`fleet-service rebuild`: the map and the roll-ups of an archive, made anew from its raw observations."""
+"""`fleet-service rebuild`: compute the map and the roll-ups of an archive again from raw observations."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import argparse
 import time
 from pathlib import Path
 
-from fleet_service.cli.common import ArchiveReport, add_archive, compacted_first, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, compact_first, on_archive
 from schemas.config import moment
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder: map/ and rollup/ by zone")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="of the map; default now")
+    parser.add_argument("--to", dest="until", metavar="TIME", help="moment of the map (default: now)")
     parser.add_argument("--engine", default="local", metavar="local|spark", help="default %(default)s")
-    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: roll-ups of what is compacted")
+    parser.add_argument(
+        "--as-it-lies", action="store_true", help="do not compact the log; roll up compacted files only"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -26,13 +28,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.analytics.rebuilding import Rebuild, insist_on_empty, rebuild
+    from fleet_service.analytics.rebuilding import Rebuild, rebuild, require_empty
 
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
-    insist_on_empty(arguments.out)
+    require_empty(arguments.out)
     if not arguments.as_it_lies:
-        compacted_first(arguments.archive)
-    talk.doing("replaying the archive by zone")
+        compact_first(arguments.archive)
+    progress_messages.set_status("replaying the archive by zone")
     done = list(rebuild(Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine))
     cells, parts = sum(one.cells for one in done), sum(one.parts for one in done)
     line = f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"

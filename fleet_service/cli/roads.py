@@ -1,11 +1,11 @@
-"""`fleet-service roads`: which link of a road network each cell and sector lies on; for `analyze contract`."""
+"""`fleet-service roads`: assign each cell and sector to a link of a road network, for `analyze contract`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,16 +24,16 @@ def run(arguments: argparse.Namespace) -> int:
     """
     import pyarrow.parquet as pq
 
-    from fleet_service.analytics.roads.join import joined
+    from fleet_service.analytics.roads.join import join_roads
     from fleet_service.analytics.roads.network import read_network
-    from schemas.runtime.durable import written
+    from schemas.runtime.durable import open_durably
 
-    commandline.ending("out", commandline.out_folder("out", arguments.out), (".parquet",))
-    talk.doing(f"reading {arguments.extract}")
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".parquet",))
+    progress_messages.set_status(f"reading {arguments.extract}")
     network = read_network(arguments.extract, arguments.id, arguments.name)
-    talk.doing(f"joining {len(network.links)} directed links")
-    table = joined(network)
-    with commandline.writing(arguments.out), written(arguments.out) as file:
+    progress_messages.set_status(f"joining {len(network.links)} directed links")
+    table = join_roads(network)
+    with commandline.report_write_errors(arguments.out), open_durably(arguments.out) as file:
         pq.write_table(table, file, compression="zstd")
     licence = network.source.get("licence")
     print(f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"

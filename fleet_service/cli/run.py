@@ -1,4 +1,4 @@
-"""`fleet-service run`: the service, until a signal."""
+"""`fleet-service run`: run the service until a signal."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 from fleet_service.cli.common import stop_on_signals
 from schemas.errors import InputError
-from schemas.runtime import talk
-from schemas.runtime.process import end_now, line_logger, log_as
+from schemas.runtime import progress_messages
+from schemas.runtime.process import force_exit, line_logger, log_as
 
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
-    from fleet_service.shards.holding import Holding
+    from fleet_service.shards.holding import Ownership
     from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
@@ -32,16 +32,23 @@ FREEING_S = 0.4  # of them, for a bucket to take a word
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
-    parser.add_argument("--archive", metavar="DIR", type=Path, help="one service per archive; else the configuration's")
     parser.add_argument(
-        "--standby", action="store_true", help="wait until the service with this copy is gone; go on as it"
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        help="folder of the archive, one service per archive (default: the configuration's)",
     )
-    parser.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
+    parser.add_argument(
+        "--standby", action="store_true", help="run as standby: take over when the active service on this replica stops"
+    )
+    parser.add_argument(
+        "--weather", metavar="FILE", type=Path, help="Parquet file of road weather to read at the start"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve."""
-    with talk.busy("loading"):
+    """Run the service."""
+    with progress_messages.show_status("loading"):
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service
         from schemas.config import ServiceConfig, load
@@ -60,13 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
         if config.standby:
-            with talk.busy("compiling"):
+            with progress_messages.show_status("compiling"):
                 warm_up()  # compiled when it is needed
-        holding = _waited(config, root, stop, log_line)
+        holding = _open_archive(config, root, stop, log_line)
         if holding is None:
             return 0
         try:
-            with talk.busy("starting"):
+            with progress_messages.show_status("starting"):
                 service = Service(config, root, log_line, holding)
         except BaseException:
             holding.close()
@@ -78,24 +85,24 @@ def run(arguments: argparse.Namespace) -> int:
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
     stopped = threading.Event()
-    threading.Thread(target=_leave_at_last, args=(stop, stopped, service, log_line), daemon=True).start()
+    threading.Thread(target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True).start()
     service.run(stop)
     stopped.set()
     return service.exit_code if holding.lease is not None else 0
 
 
-def _waited(
+def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
-) -> Holding | None:  # fmt: skip
-    """The archive, once it is this service's; None if stopped before. A standby shows itself while it waits."""
-    from fleet_service.app.metrics import of_standby
-    from fleet_service.shards.holding import hold
-    from fleet_service.shards.serving import standing_by
+) -> Ownership | None:  # fmt: skip
+    """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
+    from fleet_service.app.metrics import standby_metrics
+    from fleet_service.shards.holding import acquire
+    from fleet_service.shards.serving import standby_signs
     from schemas.runtime import watchdog
-    from schemas.runtime.metrics import serving
+    from schemas.runtime.metrics import serve_metrics
 
     if not config.standby:
-        return hold(config, root, stop, log_line)
+        return acquire(config, root, stop, log_line)
     latest = [""]
 
     def say(line: str) -> None:
@@ -103,32 +110,32 @@ def _waited(
         log_line(f"{line}, {address}" if address else line)
 
     with (
-        serving(
-            config.metrics_host, config.metrics_port, lambda: of_standby(config),
+        serve_metrics(
+            config.metrics_host, config.metrics_port, lambda: standby_metrics(config),
             lambda: [line for line in latest if "cannot" in line],
         ) as address,
-        standing_by(config, stop, watchdog.patient()) as signs,
+        standby_signs(config, stop, watchdog.notify_waiting()) as signs,
     ):  # fmt: skip
-        return None if stop.is_set() else hold(config, root, stop, say, signs)
+        return None if stop.is_set() else acquire(config, root, stop, say, signs)
 
 
-def _leave_at_last(
+def _force_exit_when_stuck(
     stop: threading.Event, stopped: threading.Event, service: Service, log_line: Callable[[str], None]
 ) -> None:
-    """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
+    """End a service whose shutdown hangs, on a frozen router or a long compaction.
 
-    Whatever it was doing may end at any instant: what is not acknowledged its senders keep. The exit code is the one
-    that it would have ended with. A lease is given free, or who stands by would wait until it has run out.
+    Whatever it is doing may end at any instant: senders keep what is not acknowledged. The exit code is that of a
+    normal end. The lease is released, because a standby would otherwise wait until it expires.
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):
-        log_line("left at last: a session or a job did not end in time")
+        log_line("shutdown incomplete: a session or a job did not end in time")
         faulthandler.dump_traceback()  # which one, and where
         if service.failure is not None:
             traceback.print_exception(service.failure)
         code = service.exit_code
         if code == 0:
-            freeing = threading.Thread(target=service.engine.holding.give_free, daemon=True)
+            freeing = threading.Thread(target=service.engine.holding.release, daemon=True)
             freeing.start()
             freeing.join(FREEING_S)
-        end_now(code)
+        force_exit(code)

@@ -1,4 +1,4 @@
-"""`fleet-service watch`: tiles and alerts as they change."""
+"""`fleet-service watch`: print tiles and alerts as they change."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
     parser.add_argument("--alerts", action="store_true", help="only alerts: one per stretch, with length and direction")
-    parser.add_argument("--json", action="store_true", help="a JSON object a line")
-    parser.add_argument("--webhook", metavar="URL", help="send alerts there too, as Alertmanager sends them")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
+    parser.add_argument("--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format")
     add_connection(parser)
 
 
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.client.webhook import Webhook
 
     stop = stop_on_signals()
-    wishes = watching.Wishes(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
+    wishes = watching.WatchOptions(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
     settings = map_client.settings(arguments.connect, arguments.config)
     if arguments.webhook is None:
         watching.watch(settings, wishes, stop, _say)

@@ -1,1 +1,1 @@
-"""Asking the map and watching it, as a third party would."""
+"""Clients of the map: query it, watch it, forward its alerts."""

@@ -1,10 +1,11 @@
-"""Slippery stretches as a DATEX II publication (version 3): what a National Access Point takes. Pure.
+"""Slippery stretches as a DATEX II publication (version 3) for a National Access Point. Pure.
 
 A stretch is a situation of category a of the safety-related traffic information (Regulation (EU) 886/2013, temporary
-slippery road). It says `slippery`, never `ice`: grip is known, its cause is not. A situation keeps its id; its record's
-version counts up when something of it changes; when the alert is over it is told with its end for KEPT_S more.
+slippery road). Its condition is `slippery`, never `ice`: grip is known, its cause is not. A situation keeps its id. The
+version of its record increases with every change. When the alert is over, the record is published with its end for
+another KEPT_S.
 
-The publication of before is all that has to be kept: the next one is made from it and from the alerts that stand.
+Only the previous publication must be kept: the next one is made from it and from the standing alerts.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _BEARINGS: Final = {name: (90.0 - 90.0 * sector) % 360.0 for sector, name in enu
 
 @dataclass(frozen=True)
 class Supplier:
-    """Who answers for a publication.
+    """Supplier of a publication.
 
     Attributes:
         country: two letters, ISO 3166.
@@ -44,7 +45,7 @@ class Supplier:
         status: real, or one of the exercises of the standard.
 
     Raises:
-        InputError: the country is none, or the name is empty.
+        InputError: the country is not valid, or the name is empty.
     """
 
     country: str
@@ -52,7 +53,7 @@ class Supplier:
     status: Literal["real", "test", "technicalExercise", "securityExercise"] = "test"
 
     def __post_init__(self) -> None:
-        """Refuse what no reader would take."""
+        """Check country and name."""
         if not re.fullmatch("[a-z]{2}", self.country):
             raise InputError("country", f"{self.country!r} is no country", "give two letters, e.g. se")
         if not self.name.strip():
@@ -66,17 +67,17 @@ def publication(
     before: bytes | None = None,
     is_heard: Callable[[float, float], bool] = lambda *_: True,
 ) -> bytes:
-    """The publication as of now [ns UTC].
+    """Return the publication as of now [ns UTC].
 
     Args:
-        supplier: who answers for it.
-        standing: every stretch that is under an alert.
+        supplier: of the publication.
+        standing: every stretch under alert.
         now: [ns UTC].
-        before: the publication of before; None begins anew.
-        is_heard: whether a service speaks for a place (latitude, longitude); where none does, silence ends nothing.
+        before: the previous publication; None to start a new one.
+        is_heard: returns True if a service answers for a place (latitude, longitude); elsewhere nothing ends.
 
     Raises:
-        InputError: `before` is none.
+        InputError: `before` is not a publication.
     """
     old = {} if before is None else _records(before)
     root = ET.Element(_name("d2:payload"), {_name("xsi:type"): "sit:SituationPublication", "lang": "en",
@@ -90,7 +91,7 @@ def publication(
         known = alert.id if alert.id in old else _same_place(alert, old, written)
         record = _record(alert, known or alert.id, now)
         if known is not None:
-            record = _versioned(record, old[known])
+            record = _next_version(record, old[known])
         written.add(record.get("id", ""))
         root.append(_situation(supplier, record))
     for name, record in old.items():
@@ -99,7 +100,7 @@ def publication(
         place = (
             float(child.text or "nan") for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
         )
-        ended = _ended(record, now) if _has_ended(record) or is_heard(*place) else record
+        ended = _end_record(record, now) if _has_ended(record) or is_heard(*place) else record
         if ended is not None:
             root.append(_situation(supplier, ended))
     ET.indent(root)
@@ -109,7 +110,7 @@ def publication(
 
 
 def same_but_for_time(one: bytes, other: bytes) -> bool:
-    """Whether two publications say the same of the road."""
+    """Return True if two publications describe the same road conditions."""
     cut = re.compile(rb"<com:publicationTime>[^<]*</com:publicationTime>")
     return cut.sub(b"", one) == cut.sub(b"", other)
 
@@ -144,7 +145,7 @@ def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
 
 
 def _location(alert: StretchAlert) -> ET.Element:
-    """A line from end to end, the way that vehicles head; a point where the stretch is one cell."""
+    """Return a line from end to end in driving direction; a point if the stretch is one cell."""
     points, line = list(alert.points), len(alert.points) > 1
     kind = "loc:LinearLocation" if line else "loc:PointLocation"
     place = ET.Element(_name("sit:locationReference"), {_name("xsi:type"): kind})
@@ -166,8 +167,8 @@ def _location(alert: StretchAlert) -> ET.Element:
     return place
 
 
-def _versioned(record: ET.Element, old: ET.Element) -> ET.Element:
-    """A record as the next version of an old one; the old one where nothing but times has changed."""
+def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
+    """Return a record as the next version of an old one; the old one if nothing but times has changed."""
     for tag in ("sit:situationRecordCreationTime", "sit:validity/com:validityTimeSpecification/com:overallStartTime"):
         _found(record, tag).text = _found(old, tag).text
     times = ("sit:situationRecordVersionTime", "sit:situationRecordObservationTime")
@@ -182,8 +183,8 @@ def _versioned(record: ET.Element, old: ET.Element) -> ET.Element:
     return record
 
 
-def _ended(record: ET.Element, now: int) -> ET.Element | None:
-    """A record with its end; None where that was told long enough."""
+def _end_record(record: ET.Element, now: int) -> ET.Element | None:
+    """Return a record with its end; None if the end was published long enough."""
     period = _found(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)
     if end is not None:
@@ -201,7 +202,7 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """The situation that has a cell of a stretch, where a reader began anew and names it otherwise."""
+    """Return the situation that has a cell of a stretch, if a restarted reader gave it another name."""
     cells = {f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points}
     for name, record in old.items():
         if name not in written and not _has_ended(record) and cells & _cells(record):
@@ -218,7 +219,7 @@ def _cells(record: ET.Element) -> set[str]:
 
 
 def _records(document: bytes) -> dict[str, ET.Element]:
-    """The records of a publication by id."""
+    """Return the records of a publication by id."""
     problem = InputError("out", "holds something else than a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)

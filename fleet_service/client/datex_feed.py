@@ -1,4 +1,4 @@
-"""The DATEX II publication as a file that others fetch: written once, or kept up while alerts come and go."""
+"""DATEX II publication as a file: written once, or updated while alerts come and go."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Final
 import zenoh
 
 from fleet_service.client.datex import Supplier, publication, same_but_for_time
-from fleet_service.client.map_client import is_place_served, is_served, joined
+from fleet_service.client.map_client import is_place_served, is_served, open_connected
 from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.client.watching import GATHER_S, standing_alerts
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime import commandline
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
 
 
 class DatexFile:
-    """One publication, kept in a file and gone on with.
+    """One publication, stored in a file and continued from it.
 
     Args:
-        supplier: who answers for it.
-        path: the file; what it holds is gone on with.
-        say: takes a line when it changes.
+        supplier: of the publication.
+        path: the file; its content is continued.
+        say: called with a line when it changes.
 
     Raises:
-        InputError: the file holds something else.
+        InputError: the file has other content.
     """
 
     def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
@@ -44,18 +44,18 @@ class DatexFile:
 
     @property
     def is_due(self) -> bool:
-        """Whether its time of publication is to be renewed."""
+        """Return True if the time of publication must be renewed."""
         return time.monotonic() >= self._written + REFRESH_S
 
     def keep_up(self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
-        """Write the publication where it says something new, or has not been written for long.
+        """Write the publication if its content changed, or if it is old.
 
         Args:
-            standing: every stretch that is under an alert.
-            is_heard: whether a service speaks for a place (latitude, longitude).
+            standing: every stretch under alert.
+            is_heard: returns True if a service answers for a place (latitude, longitude).
 
         Raises:
-            InputError: the file cannot be written; `document` is the new one all the same.
+            InputError: the file cannot be written; `document` is the new one nevertheless.
         """
         before = self.document
         new = publication(self._supplier, standing, time.time_ns(), before, is_heard)
@@ -63,14 +63,14 @@ class DatexFile:
         if not changed and not self.is_due:
             return
         self.document, self._written = new, time.monotonic()
-        with commandline.writing(self._path), written(self._path) as file:
+        with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(new)
         if changed:
             self._say(f"{len(standing)} slippery stretches in {self._path}")
 
 
 class DatexFeed:
-    """What keeps a publication up, from the alerts that are heard.
+    """Keeps a publication current with received alerts.
 
     Args:
         file: the publication.
@@ -83,13 +83,13 @@ class DatexFeed:
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
 
     def take(self, alert: wire.Alert) -> None:
-        """An alert was raised or cleared, or still stands."""
+        """Record that an alert was raised or cleared, or still stands."""
         with self._lock:
             self._stretches.take(alert)
             self._has_news = True
 
     def look(self, session: zenoh.Session) -> None:
-        """Ask for all that stands. What a service no longer speaks for has not ended."""
+        """Query all standing alerts. Alerts of places without a service do not end."""
         found, self._heard = standing_alerts(session), {}
 
         def is_heard(latitude: float, longitude: float) -> bool:
@@ -104,7 +104,7 @@ class DatexFeed:
             self._has_news = True
 
     def write(self) -> None:
-        """Keep the publication up, where there is news or its time is due.
+        """Write the publication if it changed or its time is due.
 
         Raises:
             InputError: the file cannot be written.
@@ -119,12 +119,12 @@ class DatexFeed:
 
 
 def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None) -> None:
-    """Write the publication once, or, given `stop`, keep it up until that is set.
+    """Write the publication once, or with `stop` keep it current until that is set.
 
     Raises:
-        InputError: no router, or no service answers at the start: an absent service is no dry road.
+        InputError: no router, or no service answers at the start: an absent service does not mean a dry road.
     """
-    with joined(connection) as session:
+    with open_connected(connection) as session:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))
         if not is_served(session, query.parse({})):
             raise InputError("connect", "no service answers for the map", "start one; its silence ends no situation")

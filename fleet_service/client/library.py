@@ -1,4 +1,4 @@
-"""The map asked by a program, in one line."""
+"""Query of the live map from a program."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def ask_map(
     min_vehicles: int = 1,
     at: datetime | None = None,
 ) -> pa.Table:
-    """The cells of the map, a row per cell and heading sector, as schemas.tables.MAP_CELL has them.
+    """Return the cells of the map, one row per cell and heading sector, with the columns of schemas.tables.MAP_CELL.
 
     Args:
         endpoint: of a router, e.g. tcp/127.0.0.1:7447; or settings with certificates.
         bbox: west, south, east, north [deg].
-        route: longitude, latitude [deg] of points; the cells ahead in their order.
-        min_vehicles: only cells of so many vehicles or more.
-        at: the map as it was; without a zone it is UTC.
+        route: longitude, latitude [deg] of points; returns the cells ahead in driving order.
+        min_vehicles: minimum number of vehicles of a cell.
+        at: moment of the map; without a zone it is UTC.
 
     Raises:
-        InputError: the query is refused, no router answers, or no service does.
+        InputError: the query is refused, or no router or no service answers.
     """
     settings = ZenohSettings(connect=[endpoint]) if isinstance(endpoint, str) else endpoint
     asked: dict[str, Any] = {"min_vehicles": str(min_vehicles)}

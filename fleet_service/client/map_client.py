@@ -1,4 +1,4 @@
-"""A client of the map: ask once, or watch. What the commands `query` and `watch` do."""
+"""Client of the map for the commands `query` and `watch`."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Answer:
 
     Attributes:
         table: of an answer in Arrow.
-        document: of another.
-        served: whether a service was there.
-        missing: regions of what was asked for that nobody serves, or whose service went meanwhile.
-        regions: those that were served, where services tell them.
+        document: of an answer in another format.
+        served: True if a service answered.
+        missing: requested regions without a service, or whose service left meanwhile.
+        regions: served regions, where services announce them.
     """
 
     table: pa.Table | None
@@ -53,7 +53,7 @@ class Answer:
 
     @property
     def gap(self) -> str | None:
-        """What of the answer is missing, in words."""
+        """Return a description of the missing part of the answer."""
         if not self.missing:
             return None
         more = f" and {len(self.missing) - NAMED} more" if len(self.missing) > NAMED else ""
@@ -61,34 +61,34 @@ class Answer:
 
 
 def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
-    """Connection from the command line: the configuration's, with `connect` in place of its endpoints."""
+    """Return the connection settings: the configuration's, with `connect` instead of its endpoints."""
     found = load(config, ServiceConfig).zenoh
     return found if connect is None else found.model_copy(update={"connect": [connect]})
 
 
 def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
-    """Ask all services for the map.
+    """Query all services for the map.
 
     Raises:
         InputError: the query is refused, here or by a service, or no router answers.
     """
     asked = query.parse(parameters)
-    with joined(connection) as session, tokens.watched(session) as services:
-        before = services.here
+    with open_connected(connection) as session, tokens.track_tokens(session) as services:
+        before = services.active
         payloads = sorted(replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)
-        after = services.asked(session)  # who came meanwhile may not have been asked
+        after = services.refresh(session)  # who came meanwhile may not have been asked
         # and who went may have been asked in place of who followed it, even if it is back
-        withdrawn = {token.region for token in services.fell | (before - after)}
+        withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
         whole = {one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)}
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
-        if not declared and services.asked(session):  # it came while it was looked for
+        if not declared and services.refresh(session):  # it came while it was looked for
             declared, served = True, bool(payloads)
         elif not declared and served and not payloads:  # likewise, and its token is on the way; or it has none
             payloads = sorted(replies(session, EVERYWHERE, parameters))
-    answer = replace(_joined(asked, [payload for _, payload in payloads]), served=served)
+    answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
     if not declared:  # services of a former version, or an access list of one
         return answer
     tiles = {regions.region_of(tile) for key, _ in payloads if (tile := keys.parse(key).quadint) is not None}
@@ -100,10 +100,10 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
 
 
 def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> Iterator[tuple[str, bytes]]:
-    """Key and payload of every reply for a key expression of the map.
+    """Yield key and payload of every reply for a key expression of the map.
 
     Raises:
-        InputError: a service refused the question.
+        InputError: a service refused the query.
     """
     text = ";".join(f"{name}={value}" for name, value in parameters.items())
     timeout = PAST_S if "at" in parameters else TIMEOUT_S
@@ -116,10 +116,10 @@ def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> 
 
 
 def served_table(answer: Answer) -> pa.Table:
-    """The cells of an answer in Arrow; what is missing of it is logged, and named in the schema's metadata.
+    """Return the cells of an Arrow answer; missing regions are logged and named in the schema's metadata.
 
     Raises:
-        InputError: no service answered, or there is nothing of what was asked for and nobody serves some of it.
+        InputError: no service answered, or the answer is empty and part of the area has no service.
     """
     if not answer.served or answer.table is None:
         raise InputError("connect", "no service answers for the map", "start one; that is not the same as an empty map")
@@ -132,11 +132,11 @@ def served_table(answer: Answer) -> pa.Table:
 
 
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
-    """Whether any service answers for the map: an empty answer of one is not the silence of none.
+    """Return True if any service answers for the map. This distinguishes an empty answer from no answer.
 
-    A service has a token, which not every reader may see; and it answers for the tiles of its regions. A router matches
-    only who answers for all of a key expression: where no place is asked for, a service of the whole world is found by
-    any tile, and one of a region by its answer.
+    A service has a token, which not every reader may see, and it answers for the tiles of its regions. A router matches
+    only services that answer for all of a key expression. Without a place, a service of the whole world is found by any
+    tile, and a service of a region by its answer.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
@@ -147,7 +147,7 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
-    """Whether a service answers for the tile of a place [deg]; no takes SERVED_S."""
+    """Return True if a service answers for the tile of a place [deg]; a negative result takes SERVED_S."""
     tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
     querier: Any = session.declare_querier(keys.map_key(int(tile)))
     deadline = time.monotonic() + SERVED_S
@@ -158,11 +158,11 @@ def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -
     return True
 
 
-def joined(connection: ZenohSettings) -> zenoh.Session:
-    """A session with a router.
+def open_connected(connection: ZenohSettings) -> zenoh.Session:
+    """Return a session that is connected to a router.
 
     Raises:
-        InputError: none is there.
+        InputError: no router answers.
     """
     try:
         return zenoh.open(zenoh_session.configuration(connection))
@@ -170,8 +170,8 @@ def joined(connection: ZenohSettings) -> zenoh.Session:
         raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
 
 
-def _joined(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
-    """Replies as one; along a route in its order, whatever came first."""
+def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
+    """Join replies into one answer; along a route in driving order."""
     rank = regions.Rank(asked.route) if asked.route else None
     if asked.format is Format.ARROW:
         parts = [decode_tile(payload) for payload in payloads]
@@ -197,12 +197,12 @@ def _first(rank: regions.Rank) -> Callable[[dict[str, Any]], int]:
 
 
 def write(answer: Answer, path: Path) -> None:
-    """Write an answer: an Arrow stream, or JSON.
+    """Write an answer as an Arrow stream or JSON.
 
     Raises:
         InputError: the file cannot be written.
     """
-    with commandline.writing(path):
+    with commandline.report_write_errors(path):
         if answer.table is None:
             path.write_text(json.dumps(answer.document))
         else:
@@ -211,7 +211,7 @@ def write(answer: Answer, path: Path) -> None:
 
 
 def text(answer: Answer) -> str:
-    """An answer for the terminal."""
+    """Return an answer for the terminal."""
     if answer.table is None:
         return json.dumps(answer.document, indent=1)
     lines = ["  ".join(f"{name:>12}" for name in SHOWN)]

@@ -1,8 +1,8 @@
-"""Alerts of cells and headings as alerts of stretches of road: what an operator can send somebody to. Pure.
+"""Alerts of stretches of road, made from alerts of cells and headings. Pure.
 
-Cells under an alert that lie within LINK_CELLS of each other are one stretch, both directions of travel together. A
-stretch keeps its id from the first cell to the last: when two grow together the older id stays, when one falls apart
-the larger part keeps it.
+Cells under alert within LINK_CELLS of each other are one stretch, both driving directions together. A stretch keeps its
+id from the first cell to the last. When two grow together the older id stays; when one splits, the larger part keeps
+it.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ ROUND: Final = 1.3  # a stretch less elongated than that has no direction
 
 @dataclass(frozen=True)
 class StretchAlert:
-    """A stretch of road that is slippery, or ceased to be.
+    """Stretch of road that is slippery, or no longer is.
 
     Attributes:
         id: the same from the first cell to the last.
-        state: raised; changed: it grew or shrank; cleared.
-        since, time: when it began, and of what is said now [ns since 1970, UTC].
-        length_m: along its road direction, a cell at the least.
+        state: raised; changed (it grew or shrank); cleared.
+        since, time: begin, and time of this state [ns since 1970, UTC].
+        length_m: along its road direction, at least a cell.
         direction: of the road, e.g. north-south; headings: of the vehicles that found it.
-        latitude, longitude: its middle [deg]; bbox: west, south, east, north [deg].
-        mu, mu_lower, mu_upper, p_slippery: least of the cells', with that cell's interval.
-        vehicles: most of any cell.
+        latitude, longitude: its centre [deg]; bbox: west, south, east, north [deg].
+        mu, mu_lower, mu_upper, p_slippery: of the cell with the lowest mu.
+        vehicles: largest number of any cell.
         reason: of the last cell that changed it.
         points: latitude and longitude [deg] of the cells from one end to the other; branches are left out.
     """
@@ -66,11 +66,11 @@ class StretchAlert:
     points: tuple[tuple[float, float], ...]
 
     def values(self) -> dict[str, Any]:
-        """All of it as JSON has it; times as ISO 8601, UTC."""
+        """Return all values for JSON; times as ISO 8601, UTC."""
         return asdict(self) | {"since": iso(self.since), "time": iso(self.time)}
 
     def line(self) -> str:
-        """All of it in a line."""
+        """Return the alert as one line of text."""
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
         return (
             f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m {self.direction}, "
@@ -80,12 +80,12 @@ class StretchAlert:
 
 
 def iso(ns: int) -> str:
-    """A time as text."""
+    """Return a time as text."""
     return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
 
 class Stretches:
-    """The stretches that stand, from alerts of cells as they come."""
+    """Standing stretches, updated by alerts of cells."""
 
     def __init__(self) -> None:
         self._standing: dict[tuple[int, int], Alert] = {}
@@ -94,7 +94,7 @@ class Stretches:
         self._last: Alert | None = None
 
     def take(self, alert: Alert) -> None:
-        """A cell's alert was raised or cleared; the same twice is as once."""
+        """Record that a cell's alert was raised or cleared; repetition has no effect."""
         place = (alert.cell, alert.sector)
         if alert.raised:
             self._standing[place] = alert
@@ -103,7 +103,7 @@ class Stretches:
         self._last = alert
 
     def take_all(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
-        """These stand; of the others those ended, unheard, for whose place a service speaks."""
+        """Replace the standing alerts; others end if a service answers for their place."""
         present = {(alert.cell, alert.sector): alert for alert in standing}
         self._standing = {place: one for place, one in self._standing.items() if place in present or not is_heard(one)}
         for alert in present.values():
@@ -111,11 +111,11 @@ class Stretches:
 
     @property
     def standing(self) -> list[StretchAlert]:
-        """All that stand, as `changes` told them last."""
+        """Return all standing stretches, as `changes` returned them last."""
         return list(self._known.values())
 
     def changes(self) -> list[StretchAlert]:
-        """What has changed since this was asked last."""
+        """Return the changes since the last call."""
         found, out = self._groups(), []
         for name, group in found.items():
             if name not in self._known:
@@ -133,9 +133,9 @@ class Stretches:
         return out
 
     def _groups(self) -> dict[str, list[Alert]]:
-        """The standing alerts by stretch."""
+        """Return the standing alerts by stretch."""
         alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
-        label = linked(np.array([one.cell for one in alerts], np.int64))
+        label = link_cells(np.array([one.cell for one in alerts], np.int64))
         parts: list[list[Alert]] = [[] for _ in range(int(label.max(initial=-1)) + 1)]
         for one, k in zip(alerts, label.tolist(), strict=True):
             parts[k].append(one)
@@ -164,8 +164,8 @@ class Stretches:
         )  # fmt: skip
 
 
-def linked(cell: IntArray) -> IntArray:
-    """Number of the stretch of each cell, (n,): cells at most LINK_CELLS apart are of one."""
+def link_cells(cell: IntArray) -> IntArray:
+    """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong together."""
     if not len(cell):
         return np.zeros(0, np.int64)
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
@@ -183,7 +183,7 @@ def _new(first: Alert) -> str:
 
 
 def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
-    """Centres [deg] of distinct cells along the longest way from neighbour to neighbour."""
+    """Return the centres [deg] of distinct cells along the longest path from neighbour to neighbour."""
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
     apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
@@ -199,7 +199,8 @@ def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
 
 
 def _shape(cell: IntArray) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
-    """Length [m], direction, middle [deg] and box [deg] of cells; the direction is that of the largest spread."""
+    """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of the largest
+    spread."""
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
     x, y = (west + east) / 2 * scale, (south + north) / 2 * METRES_PER_DEGREE

@@ -1,4 +1,4 @@
-"""The map watched: a line per changed tile, per stretch that turned slippery or ended, and where nobody serves."""
+"""Watching of the map: a line per changed tile, per stretch alert, and per region that loses or gets a service."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from schemas.wire.tile import decode_tile
 GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
 
 
-class Wishes(NamedTuple):
-    """What is to be heard of.
+class WatchOptions(NamedTuple):
+    """Selection of what to watch.
 
     Attributes:
-        bbox: west,south,east,north as text; None: everything.
-        only_alerts: no lines of tiles.
-        as_json: lines for programs.
+        bbox: west,south,east,north as text; None for everything.
+        only_alerts: True to omit lines of tiles.
+        as_json: True for lines in JSON.
     """
 
     bbox: str | None = None
@@ -36,15 +36,15 @@ class Wishes(NamedTuple):
 
 def watch(
     connection: ZenohSettings,
-    wishes: Wishes,
+    wishes: WatchOptions,
     stop: threading.Event,
     say: Callable[[str], None],
     hear: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Say a line per changed tile and stretch until `stop` is set; waits for a router. `hear` gets the stretches too.
+    """Print a line per change until `stop` is set; wait for a router. `hear` is called with the stretches too.
 
     Raises:
-        InputError: the box cannot be read.
+        InputError: the box is not valid.
     """
     asked = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox})
     box = asked.bbox
@@ -78,17 +78,17 @@ def watch(
 
     def tell_services() -> None:
         nonlocal away
-        here = {token.region for token in services.here}
-        left = {token.region for token in services.withdrawn} - here
+        here = {token.region for token in services.active}
+        left = {token.region for token in services.lost} - here
         now = set(regions.unserved(asked, here)) if asked.bbox else left
-        if now != away and (here or services.withdrawn):
+        if now != away and (here or services.lost):
             _say_regions(say, now - away, away - now, as_json=wishes.as_json)
             away = now
 
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
-    with session, tokens.watched(session) as services:
+    with session, tokens.track_tokens(session) as services:
         if not wishes.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
@@ -104,7 +104,7 @@ def watch(
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
-    """The alerts that stand, of all services that answer."""
+    """Return the standing alerts of all services that answer."""
     replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S) if reply.ok is not None)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 

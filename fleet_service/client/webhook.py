@@ -1,7 +1,7 @@
-"""Alerts of stretches to an HTTP receiver, in the format that Alertmanager sends to its webhook receivers (version 4).
+"""Webhook for alerts of stretches, in the format of Alertmanager's webhook receivers (version 4).
 
-Whatever takes Alertmanager's webhooks takes these: paging services, chat bridges, a script. A receiver that is away is
-tried again, longer and longer; what it missed is sent in order, as far as MOST_WAITING reaches.
+Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts. If the receiver is away,
+delivery is repeated at growing intervals. Missed alerts are sent in order, up to MOST_WAITING.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OPEN: Final = "0001-01-01T00:00:00Z"  # Alertmanager's end of what has not ende
 
 
 def body(alert: StretchAlert) -> dict[str, Any]:
-    """One alert as a webhook message."""
+    """Return one alert as a webhook message."""
     status = "resolved" if alert.state == "cleared" else "firing"
     labels = {
         "alertname": "SlipperyRoad", "id": alert.id, "direction": alert.direction, "headings": ",".join(alert.headings),
@@ -50,14 +50,14 @@ def body(alert: StretchAlert) -> dict[str, Any]:
 
 
 class Webhook:
-    """Sends alerts from a thread of its own; `close` sends what is left, once.
+    """Sender of alerts with a thread of its own; `close` sends the rest once.
 
     Args:
         url: of the receiver, http or https.
-        say: takes a line when the receiver goes away or comes back.
+        say: called with a line when the receiver goes away or returns.
 
     Raises:
-        InputError: the URL is none of these.
+        InputError: the URL is not valid.
     """
 
     def __init__(self, url: str, say: Callable[[str], None]) -> None:
@@ -75,7 +75,7 @@ class Webhook:
         self._more.set()
 
     def close(self) -> None:
-        """Try once what is left, and end."""
+        """Try to send the rest once, and stop."""
         self._stop.set()
         self._more.set()
         self._thread.join(2 * TIMEOUT_S)

@@ -1,1 +1,1 @@
-"""Who takes part: the list of names, their certificates, and what each may do at the routers."""
+"""Enrolment: the list of names, their certificates, and their rights at the routers."""

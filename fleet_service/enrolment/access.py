@@ -1,17 +1,17 @@
-"""The configuration of a router: mutual TLS, and an access list that denies what is not written here. Pure.
+"""Configuration of a router: mutual TLS, and an access list that denies everything not listed here. Pure.
 
-| role    | puts                                     | hears and asks                      |
+| role    | may publish                              | may read and query                  |
 |---------|------------------------------------------|-------------------------------------|
 | vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, token alive/NAME | map, alert and serves; ack/NAME, PRIVATE |
 | owner   | nothing                                  | map, alert, serves; PRIVATE of its own |
 | reader  | nothing                                  | map, alert and serves               |
 | weather | weather/**                               | nothing                             |
-| service | everything under gripmap/ but PRIVATE    | likewise                            |
-| router  | what others were let put, between routers | likewise                           |
+| service | everything under gripmap/ but PRIVATE    | the same                            |
+| router  | messages that others may publish, between routers | the same                   |
 
-PRIVATE is ahead/NAME and vss/NAME: what lies ahead of a vehicle, and under it.
-Zenoh decides by the common name of the certificate and reads the list once, at its start. Denials are silent for the
-sender. A put on a wildcard counts as a put on every key of it, so that it must lie within a rule as a whole.
+PRIVATE is ahead/NAME and vss/NAME: the map ahead of a vehicle, and the friction at it. Zenoh decides by the common name
+of the certificate and reads the list once, at its start. Denials are silent for the sender. A put on a wildcard counts
+as a put on every matching key, so it must lie completely within a rule.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Section = dict[str, Any]
 
 
 def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Section:
-    """What router `name` is started with; `certificates` is the folder with its certificate and key."""
+    """Return the configuration of router `name`; `certificates` is the folder with its certificate and key."""
     router = fleet.routers[name]
     before = list(fleet.routers)[: list(fleet.routers).index(name)]
     certificate, key = (str(certificates / f"{name}.{ending}") for ending in ("pem", "key"))
@@ -76,7 +76,7 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
 
 
 def access_control(fleet: Enrolment) -> Section:
-    """The access list of all routers."""
+    """Return the access list of all routers."""
     rules = [
         _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
         _rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*")) | {"permission": "deny"},
@@ -159,7 +159,7 @@ def _rule(name: str, flows: Sequence[str], messages: Sequence[str], expressions:
 
 
 def _no_larger() -> Section:
-    """No batch larger than the service reads travels further than the first router."""
+    """Stop batches at the first router if they are larger than the service reads."""
     return {
         "id": "batches",
         "flows": ["ingress"],
@@ -170,7 +170,7 @@ def _no_larger() -> Section:
 
 
 def _no_payload() -> Section:
-    """A question is its key and its parameters: what comes with it travels no further than the first router."""
+    """Stop payloads of queries at the first router: a query is its key and its parameters."""
     return {
         "id": "questions",
         "flows": ["ingress"],
@@ -181,7 +181,7 @@ def _no_payload() -> Section:
 
 
 def _priority(topic: keys.Topic) -> Section:
-    """A vehicle's own idea of its importance does not count: the priority is that of the topic."""
+    """Replace the sender's priority by that of the topic."""
     return {
         "id": f"priority-{topic.name}",
         "flows": ["ingress"],

@@ -1,9 +1,7 @@
-"""A certificate authority in a folder, and the certificates that it issues (elliptic curve P-256, X.509 version 3).
+"""Certificate authority in a folder, and the certificates that it issues (elliptic curve P-256, X.509 version 3).
 
-DIR/authority/ca.pem  ca.key      signs; stays on this machine
-DIR/authority/next.*  old.pem     another authority on its way in, or out
-DIR/trust.pem                     what everyone trusts
-DIR/NAME.pem  NAME.key            of each name
+DIR/authority/ca.pem  ca.key      signs; stays on this machine DIR/authority/next.*  old.pem     another authority on
+its way in, or out DIR/trust.pem                     what everyone trusts DIR/NAME.pem  NAME.key            of each name
 DIR/revoked/NAME.pem              of names that were taken off the list
 """
 
@@ -22,20 +20,20 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the authority's
 Key = ec.EllipticCurvePrivateKey
 
 
 class KeyPair(NamedTuple):
-    """A certificate and its private key."""
+    """Certificate and its private key."""
 
     certificate: x509.Certificate
     key: Key
 
     def write(self, stem: Path) -> None:
-        """To STEM.pem and STEM.key; a pair that was cut off half way is seen by `read`."""
+        """Write STEM.pem and STEM.key; `read` detects a pair that was written half."""
         secret = self.key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
@@ -44,21 +42,21 @@ class KeyPair(NamedTuple):
 
 
 def pem(certificate: x509.Certificate) -> bytes:
-    """A certificate as text."""
+    """Return a certificate as text."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def write(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file whole; it never has a wider mode than `mode`."""
-    with written(path, mode) as file:
+    """Replace a file atomically; its mode is never wider than `mode`."""
+    with open_durably(path, mode) as file:
         file.write(data)
 
 
 def read(stem: Path) -> KeyPair | None:
-    """The pair at STEM.pem and STEM.key; None where it is missing or its halves do not belong together.
+    """Return the pair at STEM.pem and STEM.key; None if it is missing or its halves do not match.
 
     Raises:
-        InputError: a file is there and is none.
+        InputError: a file exists and is not valid.
     """
     certificate = read_certificate(stem.with_name(stem.name + ".pem"))
     path = stem.with_name(stem.name + ".key")
@@ -74,10 +72,10 @@ def read(stem: Path) -> KeyPair | None:
 
 
 def read_certificate(path: Path) -> x509.Certificate | None:
-    """A certificate; None where there is none.
+    """Return a certificate; None if there is none.
 
     Raises:
-        InputError: the file is none.
+        InputError: the file is not a certificate.
     """
     if not path.exists():
         return None
@@ -88,7 +86,7 @@ def read_certificate(path: Path) -> x509.Certificate | None:
 
 
 def new_authority(days: float, now: datetime) -> KeyPair:
-    """An authority that signs itself, and nobody else's authority."""
+    """Create a self-signed authority that cannot sign other authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _subject(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
     certificate = (
@@ -101,7 +99,7 @@ def new_authority(days: float, now: datetime) -> KeyPair:
 
 
 def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime) -> KeyPair:
-    """A certificate for a name; with `hosts` it may also be that of a server under them.
+    """Issue a certificate for a name; with `hosts` it is also valid for a server under them.
 
     Raises:
         InputError: it would outlive the authority.
@@ -127,7 +125,7 @@ def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now:
 
 
 def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
-    """The names and addresses that a certificate is good for."""
+    """Return the names and addresses that a certificate is valid for."""
     found: list[x509.GeneralName] = [x509.DNSName(name)]
     for host in hosts:
         try:
@@ -137,8 +135,8 @@ def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
     return found
 
 
-def signed(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Whether the authority issued the certificate."""
+def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Return True if the authority issued the certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):  # another key, another name, another kind of key

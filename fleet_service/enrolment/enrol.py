@@ -1,6 +1,6 @@
-"""From the enrolment file to certificates and router configurations: what is missing is made, what is gone is revoked.
+"""Enrolment: creates missing certificates and router configurations from the enrolment file, and revokes removed names.
 
-Running it again changes nothing but what changed in the file or comes to its end.
+A repeated run changes only what changed in the file or is about to expire.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ PRIVATE: Final = 0o700  # of the authority's folder
 
 @dataclass(frozen=True)
 class Terms:
-    """For how long, in days.
+    """Validity in days.
 
     Attributes:
         days: of a certificate.
         ca_days: of an authority.
-        renew_days: a certificate that ends sooner is issued anew.
+        renew_days: a certificate that ends sooner is renewed.
     """
 
     days: float = 365.0
@@ -37,8 +37,8 @@ class Terms:
 
 
 @dataclass
-class Done:
-    """Names by what became of them."""
+class EnrolmentResult:
+    """Names by result."""
 
     made: list[str] = field(default_factory=list)
     kept: list[str] = field(default_factory=list)
@@ -46,10 +46,10 @@ class Done:
 
 
 class Registry:
-    """The folder of an authority.
+    """Folder of an authority.
 
     Args:
-        folder: DIR of `authority`; made if it is not there.
+        folder: DIR of `authority`; created if it does not exist.
         terms: validity.
         now: the time, with zone.
         used_at: folder in which the routers will find their files (default: `folder`).
@@ -63,18 +63,18 @@ class Registry:
         for inner in (self._authority, self._revoked):
             inner.mkdir(mode=PRIVATE, exist_ok=True)
 
-    def enrol(self, fleet: Enrolment, step: Step | None = None) -> Done:
+    def enrol(self, fleet: Enrolment, step: Step | None = None) -> EnrolmentResult:
         """Bring certificates and router configurations up to date.
 
         Args:
-            fleet: who takes part.
-            step: of the way to another authority.
+            fleet: everybody who takes part.
+            step: of the change to another authority.
 
         Raises:
             InputError: a file is damaged, a name was revoked, or a step is out of order.
         """
         signer = self._signer(step)
-        done = Done()
+        done = EnrolmentResult()
         for name in fleet.names:
             hosts = fleet.routers[name].hosts if name in fleet.routers else []
             if self._good(name, hosts, signer.certificate):
@@ -109,7 +109,7 @@ class Registry:
         return signer
 
     def _switch(self) -> None:
-        """Let the next authority sign; cut off half way, it can be done again."""
+        """Let the next authority sign; an interrupted call can be repeated."""
         following, leaving = ca.read(self._authority / "next"), ca.read_certificate(self._authority / "ca.pem")
         if following is None or leaving is None:
             raise InputError("ca", "there is no next authority", "begin with --ca next, and bring trust.pem to all")
@@ -127,15 +127,15 @@ class Registry:
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         soon = self._now + timedelta(days=self._terms.renew_days)
         return (
-            ca.signed(found, signer)
+            ca.is_signed_by(found, signer)
             and found.not_valid_after_utc > soon
             and list(names) == ca.alternatives(name, hosts)
         )
 
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
-        """The access list knows names, so that a lost certificate would be good again with its name."""
+        """Refuse a revoked name: the access list knows names, so a lost certificate would be valid again."""
         lost = ca.read_certificate(self._revoked / f"{name}.pem")
-        if lost is None or lost.not_valid_after_utc < self._now or not ca.signed(lost, signer):
+        if lost is None or lost.not_valid_after_utc < self._now or not ca.is_signed_by(lost, signer):
             return
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
         raise InputError(
@@ -143,23 +143,23 @@ class Registry:
         )
 
     def leaving(self, fleet: Enrolment) -> list[str]:
-        """Names that have a certificate of this authority and are no longer on the list: `enrol` would revoke them."""
+        """Return names that have a certificate of this authority and are not on the list: `enrol` would revoke them."""
         found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))
         signers = [signer for signer in found if signer is not None]
         return [path.stem for path in sorted(self._folder.glob("*.pem")) if self._leaves(path, fleet, signers)]
 
     def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
-        """Whether a file is a certificate made here, for a name that is off the list; others are left alone."""
+        """Return True if a file is a certificate of this authority for a name that is not on the list."""
         if path.stem in {*fleet.names, "trust"}:
             return False
         try:
             found = ca.read_certificate(path)
         except InputError:
             return False
-        return found is not None and any(ca.signed(found, signer) for signer in signers)
+        return found is not None and any(ca.is_signed_by(found, signer) for signer in signers)
 
     def _revoke(self, gone: list[str]) -> list[str]:
-        """Certificates and keys of names that are no longer on the list go aside."""
+        """Move certificates and keys of removed names to `revoked/`."""
         for name in gone:
             for ending in (".key", ".json5", ".pem"):  # the certificate last: cut off half way, it is done again
                 path = self._folder / f"{name}{ending}"

@@ -1,4 +1,4 @@
-"""The enrolment file: every name that may open a session, by role. The one source of certificates and of the ACL."""
+"""Enrolment file: every name that may open a session, by role; the only source of certificates and access list."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Router(Settings):
 
     @property
     def endpoint(self) -> str:
-        """Where others reach it."""
+        """Return its endpoint for others."""
         return _endpoint(self.hosts[0], self.port)
 
     @property
     def listens(self) -> str:
-        """Where it listens."""
+        """Return its listen address."""
         return _endpoint(self.listen, self.port)
 
 
@@ -53,7 +53,7 @@ def _endpoint(host: str, port: int) -> str:
 
 
 class Enrolment(Settings):
-    """Names by role. A name has one role, because the certificate bears nothing but the name."""
+    """Names by role. A name has one role, because the certificate contains only the name."""
 
     routers: dict[VehicleName, Router] = Field(min_length=1, description="each connects to those before it")
     services: list[VehicleName] = Field(default=["shard-0"], description="everything under gripmap/")
@@ -66,7 +66,7 @@ class Enrolment(Settings):
 
     @property
     def names(self) -> list[str]:
-        """Everybody."""
+        """Return all names."""
         return [*self.routers, *self.services, *self.readers, *self.weather, *self.vehicles, *self.owners]
 
     @model_validator(mode="after")

@@ -1,1 +1,1 @@
-"""Messages in: queue, rate limits, validation, dedup, acknowledgements; weather."""
+"""Input of messages: queue, rate limits, validation, dedup, acknowledgements; weather."""

@@ -1,4 +1,4 @@
-"""Acknowledgements: settled sequence numbers, gathered per vehicle and stream, as messages."""
+"""Acknowledgements: settled sequence numbers, collected per vehicle and stream, as messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """Acknowledgements that are due, by stream."""
+    """Due acknowledgements, by stream."""
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
@@ -26,23 +26,23 @@ class Acks:
             lambda: defaultdict(list)
         )
 
-    def durable(self, batches: Iterable[BatchId]) -> None:
-        """The batches are on disk."""
+    def record_durable(self, batches: Iterable[BatchId]) -> None:
+        """Record that batches are on disk."""
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)
 
-    def late(self, batches: Iterable[BatchId]) -> None:
-        """The batches came when the map had gone on; told with what is durable of them."""
+    def record_late(self, batches: Iterable[BatchId]) -> None:
+        """Record that batches arrived after the map had moved on; sent with those of them that are durable."""
         for stream, seq in batches:
             self._late[stream].add(seq)
 
-    def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
-        """The batch was refused for good."""
+    def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
+        """Record that a batch was rejected."""
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
 
     def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
-        """Vehicle and `Ack` bytes of everything gathered, with the service's `time` [ns]; starts anew."""
+        """Return vehicle and `Ack` bytes of everything collected, with the service's `time` [ns]; reset."""
         settled: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
         late: dict[tuple[str, AckedStream], set[int]] = defaultdict(set)
         for stream, seqs in self._durable.items():
@@ -80,14 +80,14 @@ def _parts(
     stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...],
     late: tuple[tuple[int, int], ...],
 ) -> Iterator[StreamAck]:  # fmt: skip
-    """Acknowledgements of a stream that are due, in pieces."""
+    """Yield the due acknowledgements of a stream in pieces."""
     for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)
         yield StreamAck(*stream, durable[some], rejected[some], late[some])
 
 
 def ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """Runs of consecutive numbers, each of which may come more than once; both ends included."""
+    """Return runs of consecutive numbers, both ends included; numbers may repeat."""
     ordered = sorted(set(numbers))
     if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often
         return ((ordered[0], ordered[-1]),)

@@ -1,7 +1,7 @@
-"""What one valid vehicle may cost beyond its bytes: places that nobody knows yet, and streams. Pure but for the counts.
+"""Budgets of one vehicle besides its bytes: new places, and streams. Pure except for the counts.
 
-A row beyond its vehicle's budget, or where the vehicle cannot be, is archived and acknowledged as any other, and does
-not reach the map: so nothing is lost, nothing is sent again, and no car fills the memory or is in two towns at once.
+A row beyond its vehicle's budget, or at an impossible place, is archived and acknowledged like any other, but does not
+reach the map. So nothing is lost, nothing is sent again, and no car fills the memory or is in two towns at once.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ HOUR: Final = 3600.0
 
 
 class Bucket:
-    """Budgets by vehicle: so much at once, and so much an hour."""
+    """Budgets by vehicle: an amount at once, and an amount per hour."""
 
     def __init__(self, at_once: float, per_hour: float) -> None:
         self._at_once, self._rate = at_once, per_hour / HOUR
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """How much of what is wanted there is; it is taken. now [s]."""
+        """Take up to `wanted` from a vehicle's budget; return the amount taken. now [s]."""
         left, since = self._left.get(vehicle, (self._at_once, now))
         left = min(self._at_once, left + max(now - since, 0.0) * self._rate)
         given = min(wanted, int(left))
@@ -46,13 +46,13 @@ class Bucket:
 
 
 class NewCells:
-    """Budgets of cells that nobody was in before."""
+    """Budgets of cells without earlier visits."""
 
     def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
         self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Rows (n,) in new cells that are beyond what their vehicle may bring; the others are taken. now [s]."""
+        """Return rows (n,) in new cells beyond their vehicle's budget; the others are charged. now [s]."""
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))
         who, where = vehicle[order], cell[order]
@@ -69,7 +69,7 @@ class NewCells:
 
 
 class Tracks:
-    """Where each vehicle was last, and whether it can be where it says next."""
+    """Last place of each vehicle, to check whether it can be at its next one."""
 
     def __init__(self) -> None:
         self._places: dict[int, int] = {}  # place in the arrays, by vehicle
@@ -77,7 +77,7 @@ class Tracks:
         self._last_place = np.zeros((64, 2))
 
     def impossible(self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray) -> BoolArray:
-        """Rows (n,) too far from where their vehicle was by the row before, in the order of the rows; time [ns]."""
+        """Return rows (n,) too far from their vehicle's previous row, in the order of the rows; time [ns]."""
         names, inverse = np.unique(vehicle, return_inverse=True)
         if len(self._places) + len(names) > max(VEHICLES, len(names)):
             self._places.clear()
@@ -94,7 +94,7 @@ class Tracks:
 def _impossible(
     vehicle: IntArray, time: IntArray, place: FloatArray, last_time: IntArray, last_place: FloatArray
 ) -> BoolArray:
-    """As `Tracks.impossible`; rows' places (n, 2), and the vehicles' (k,) and (k, 2), which are written."""
+    """Compute `Tracks.impossible`; places of rows (n, 2) and of vehicles (k,), (k, 2), which are updated."""
     out = np.zeros(len(vehicle), np.bool_)
     stop = 0
     while stop < len(vehicle):
@@ -118,7 +118,7 @@ def _impossible(
 
 @compiled
 def _leap(apart: int, there: FloatArray, here: FloatArray) -> bool:
-    """Whether two places (2,) [deg] are further from each other than a vehicle gets in the time between them [ns]."""
+    """Return True if two places (2,) [deg] are farther apart than a vehicle can drive in the time between them [ns]."""
     north, east = here[0] - there[0], (here[1] - there[1] + 180.0) % 360.0 - 180.0  # around the date line the short way
     metres = np.hypot(north, east * np.cos(np.radians(here[0]))) * METRES_PER_DEGREE
     return bool(metres > LEAP_M + FASTEST * abs(apart) / NS)

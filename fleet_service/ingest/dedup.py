@@ -1,7 +1,7 @@
-"""Which batches were accepted: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
+"""Record of accepted batches: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
 
-Bounded by what was accepted: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of them,
-and a stream whose newest record is older than the service accepts is forgotten.
+It is bounded by accepted data: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of
+them, and a stream whose newest record is older than the service accepts is dropped.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.ingest.grouping import grouped, largest_of
+from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
@@ -24,14 +24,14 @@ StreamKey = tuple[int, int, Kind, int]  # numbers of the vehicle's pseudonym and
 
 
 class SequenceTracker:
-    """Which batches of one stream were accepted.
+    """Accepted batches of one stream.
 
     Attributes:
         key: its name.
-        vehicle: enrolled name of the sender; empty until it is heard.
-        boot: as its sender calls it; 0 until it is heard.
-        witness: number that the map knows it by, in every month; 0 until it is heard.
-        low: every seq up to here is settled, or will never come.
+        vehicle: enrolled name of the sender; empty until it sends.
+        boot: as sent; 0 until it sends.
+        witness: number of the vehicle in the map, in every month; 0 until it sends.
+        low: every seq up to here is settled, or will never arrive.
         seen: the accepted ones above.
         newest: newest time of an accepted record, by which a batch is too old [ns].
     """
@@ -44,11 +44,12 @@ class SequenceTracker:
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Whether this seq was accepted before."""
+        """Return True if this seq was accepted before."""
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Note a seq and the newest time of its records [ns]; False if too many are missing before it (not noted)."""
+        """Record a seq and the newest time of its records [ns]; False (and no record) if too many are missing before
+        it."""
         if seq == self.low + 1:
             self.low = seq
             self._close()
@@ -63,7 +64,7 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """These, which rise, were accepted."""
+        """Record ascending accepted seqs."""
         if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:  # as most often: a run that goes on
             self.raise_to(seqs[-1] + 1)
         else:
@@ -71,7 +72,7 @@ class SequenceTracker:
                 self.accept(seq)
 
     def raise_to(self, first_held: int) -> None:
-        """Older than `first_held` never comes."""
+        """Raise the watermark: seqs below `first_held` never arrive."""
         if first_held - 1 > self.low:
             if isinstance(self.seen, set):
                 if first_held - self.low > len(self.seen):
@@ -116,11 +117,11 @@ class SequenceTrackers:
 
     @property
     def newest(self) -> int:
-        """Time of the newest accepted batch of all [ns], or 0."""
+        """Return the time of the newest accepted batch [ns], or 0."""
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Which batches were accepted: `names` is (n, 4) of vehicle, boot, region and seq."""
+        """Return which batches were accepted: `names` is (n, 4) of vehicle, boot, region and seq."""
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
         return np.array(
@@ -128,7 +129,7 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """All streams as columns (n,), `above` being how many seqs of the second value are each one's."""
+        """Return all streams as columns (n,); `above` is how many seqs of the second value belong to each."""
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
         table = {
@@ -144,7 +145,7 @@ class SequenceTrackers:
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
-        """The streams of these columns, as `columns` gives them."""
+        """Restore the streams from the result of `columns`."""
         out, at, seqs = SequenceTrackers(), 0, above.tolist()
         order = ("vehicle", "boot", "kind", "region", "low", "newest", "above")
         for vehicle, boot, kind, region, low, newest, n in zip(
@@ -158,7 +159,7 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams without a batch from `before` [ns] on: one that came again would be refused as too old."""
+        """Drop streams without a batch from `before` [ns] on; a repeated batch would be refused as too old."""
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]
 
@@ -166,10 +167,10 @@ class SequenceTrackers:
         self, kind: Kind, vehicle: IntArray, boot: IntArray, region: IntArray,
         seq: IntArray, first_held: IntArray, time: IntArray,
     ) -> None:  # fmt: skip
-        """Note archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
+        """Record archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
         if not len(seq):
             return
-        group, first = grouped(vehicle, boot, region)
+        group, first = group_rows(vehicle, boot, region)
         streams = [
             self[one, start, kind, where]
             for one, start, where in zip(*(column[first].tolist() for column in (vehicle, boot, region)), strict=True)

@@ -1,4 +1,4 @@
-"""Rows by the stream that they belong to, in one pass: a restart goes through tens of millions. Compiled, pure."""
+"""Grouping of rows by stream in one pass, because a restart processes tens of millions. Compiled, pure."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Int32Array = NDArray[np.int32]
 
 
 @compiled
-def grouped(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
-    """Group of each row (n,), numbered as they first come, and the first row of each group (k,): equal in all three."""
+def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
+    """Return the group of each row (n,), in order of first appearance, and the first row of each group (k,)."""
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)
     group, first, k = np.empty(len(a), np.int32), np.empty(len(a), np.int64), 0
@@ -36,7 +36,7 @@ def grouped(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray
 
 @compiled
 def largest_of(values: IntArray, group: Int32Array, groups: int) -> IntArray:
-    """Largest value of each group, (groups,); every group has one."""
+    """Return the largest value of each group, (groups,); every group has one."""
     out = np.full(groups, np.iinfo(np.int64).min, np.int64)
     for i in range(len(values)):
         if values[i] > out[group[i]]:

@@ -1,7 +1,7 @@
-"""Messages in: a bounded queue behind the Zenoh subscribers, and the way from bytes to accepted rows.
+"""Inbox: a bounded queue behind the Zenoh subscribers, and the path from bytes to accepted rows.
 
-The subscriber's callback only copies bytes into the queue. When the queue is full the message is dropped and counted;
-it is not acknowledged, so that its sender keeps it and sends it again: that is the back-pressure.
+The subscriber's callback only copies bytes into the queue. If the queue is full, the message is dropped and counted. It
+is not acknowledged, so its sender keeps it and sends it again: this is the back-pressure.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import zenoh
 from fleet_service.archive import erasures
 from fleet_service.archive.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
-from fleet_service.archive.segments import Rows, stepped
-from fleet_service.archive.witnesses import Witnesses
+from fleet_service.archive.segments import Rows, round_to_steps
+from fleet_service.archive.witnesses import VehicleIds
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket
@@ -63,12 +63,12 @@ class Message(NamedTuple):
 
 
 class Inbox:
-    """The bounded queue.
+    """Bounded queue.
 
     Args:
-        capacity: messages at the most; one more for each further thread of callbacks that puts at the same instant.
+        capacity: maximum number of messages; one more for each further callback thread that puts at the same instant.
         counts: where drops are counted, under `overload`.
-        limits: who may send how much.
+        limits: rate limits per vehicle.
     """
 
     def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
@@ -77,7 +77,7 @@ class Inbox:
         self._bytes, self._guard = 0, Lock()
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
-        """The subscriber's callback for one kind."""
+        """Return the subscriber's callback for one kind."""
 
         def take(sample: zenoh.Sample) -> None:
             key, payload = str(sample.key_expr), sample.payload
@@ -97,7 +97,8 @@ class Inbox:
         self._queue.put(message)
 
     def drain(self, wait_s: float) -> list[Message]:
-        """What is there, as much as a step takes; waits up to `wait_s` for the first, and then a moment for more."""
+        """Return waiting messages, as many as a step takes; wait up to `wait_s` for the first, then a moment for
+        more."""
         out: list[Message] = []
         size = 0
         try:
@@ -119,25 +120,25 @@ class Inbox:
 
 
 class AcceptedBatches(NamedTuple):
-    """Accepted batches of one kind, and their rows as the archive wants them (without `late` and `weight`)."""
+    """Accepted batches of one kind, and their rows for the archive (without `late` and `weight`)."""
 
     batches: list[BatchId]
     rows: Rows
 
 
 class BatchIntake:
-    """Decodes, validates, counts and settles refusals. Python is touched per message, not per row.
+    """Decodes, validates, counts and settles refusals. Python code runs per message, not per row.
 
     Args:
-        streams: what was accepted before; is brought up to date.
+        streams: accepted batches, which are updated.
         pseudonyms: of the vehicles.
         counts: refusals by rule, under `refused.RULE`, and duplicates.
-        acks: takes the refusals and what is durable already.
+        acks: receives refusals and batches that are durable already.
     """
 
     def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
-        self._witnesses = Witnesses(pseudonyms.folder)
+        self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
@@ -146,7 +147,7 @@ class BatchIntake:
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Rows of the good and new batches, by kind."""
+        """Return the rows of valid, new batches, by kind."""
         self.times.clear()
         self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
@@ -159,17 +160,17 @@ class BatchIntake:
         return out
 
     def sync(self) -> None:
-        """Make durable who the vehicles of accepted batches are.
+        """Make the identities of the vehicles of accepted batches durable.
 
         Raises:
             OSError: the disk is full or broken.
         """
         self._witnesses.sync()
 
-    def settled(self, batches: Sequence[BatchId]) -> None:
-        """The batches' rows are on disk: acknowledge them."""
+    def acknowledge(self, batches: Sequence[BatchId]) -> None:
+        """Acknowledge batches whose rows are on disk."""
         self._pending.difference_update(batches)
-        self._acks.durable(batches)
+        self._acks.record_durable(batches)
 
     def _accept(self, kind: Kind, messages: list[Message], clock: Clock) -> AcceptedBatches:
         found_owners = [validation.owner_of(message.key) for message in messages]
@@ -190,17 +191,17 @@ class BatchIntake:
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
-        for place in np.flatnonzero(good & self._forgotten(owners, time)).tolist():
+        for place in np.flatnonzero(good & self._is_erased(owners, time)).tolist():
             good[place] = False
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
         new = self._new(kind, found.heads, time, good)
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
-        """Streams too old to matter, and names of days of which next to nothing comes any more.
+        """Drop streams that are too old to matter, and names of days of which almost nothing arrives any more.
 
-        What goes on being sent stays where it lies: made anew, it would lie between other things, and each time the
-        process would be some megabytes larger.
+        Active streams keep their memory: allocated again, they would lie between other objects, and the process would
+        grow by some megabytes each time.
         """
         self._forgot = clock.now
         self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
@@ -210,9 +211,9 @@ class BatchIntake:
             for name in old:
                 del known[name]
 
-    def _forgotten(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Which batches (n,) are of a time that was forgotten, of everybody or of their vehicle."""
-        out = erasures.within(self._erased.months, time)
+    def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
+        """Return which batches (n,) belong to an erased time, of all vehicles or of theirs."""
+        out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():
                 with suppress(OSError):  # without its month's key it is not let in either
@@ -226,7 +227,7 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Those of the good batches that were not accepted before, each once, and their places."""
+        """Return valid batches that were not accepted before, each once, with their positions."""
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
         batches = zip(range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True)
@@ -241,7 +242,7 @@ class BatchIntake:
             if stream.accepted(seq):
                 again += 1
                 if batch not in pending:
-                    self._acks.durable([batch])
+                    self._acks.record_durable([batch])
             elif batch in out:
                 again += 1
             else:
@@ -251,13 +252,13 @@ class BatchIntake:
         return out
 
     def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> SequenceTracker | None:
-        """The stream of a (vehicle, boot, region, day); None without a key, or if the vehicle opens too many: it keeps
-        its batch until the disk is well again, or the hour is over."""
+        """Return the stream of a (vehicle, boot, region, day); None without a key, or if the vehicle opens too many.
+        The vehicle then keeps its batch until the disk works again, or the hour is over."""
         vehicle, boot, region, _ = name
         try:
             pseudonym = number(self._pseudonyms.of(vehicle, time))
             boot_pseudonym = self._pseudonyms.boot(vehicle, boot, time)
-            witness = self._witnesses.of(vehicle, self._pseudonyms.month(time), pseudonym)
+            witness = self._witnesses.id_of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
             self._counts["key_failures"] += 1
             return None
@@ -272,7 +273,7 @@ class BatchIntake:
         return stream
 
     def _rows(self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock) -> AcceptedBatches:
-        batches, (rows, heads, sizes) = list(new), _chosen(found, list(new.values()))
+        batches, (rows, heads, sizes) = list(new), _select_batches(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
@@ -298,20 +299,22 @@ class BatchIntake:
             rows = {name: column[good[owner]] for name, column in rows.items()}
             batches, heads, sizes = list(compress(batches, good)), heads.take(good), sizes[good]
         self._pending.update(batches)
-        return AcceptedBatches(batches, _named(kind, batches, heads, rows, sizes, clock))
+        return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
         if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream
-            self._acks.rejected(vehicle, head, refusal.row, refusal.reason)
+            self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 
     def _refuse_unusable(self, kind: Kind, owner: Parsed, message: Message, error: InputError) -> None:
-        """Refuse a batch whose records cannot be used: for good, where its head says which it is, or it would come
-        again for ever; else it is only counted."""
+        """Refuse a batch whose records cannot be used: with a rejection if its head can be read, because it would be
+        sent for ever otherwise; else it is only counted."""
         head = head_of(kind, message.payload, message.encoding)
         named = head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
         if head is not None and named and head.boot >= 0 and head.seq >= 1 and owner.quadint is not None:
-            self._acks.rejected(head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150])
+            self._acks.record_rejected(
+                head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150]
+            )
         self._count(error.field)
 
     def _count(self, rule: str, times: int = 1) -> None:
@@ -320,13 +323,13 @@ class BatchIntake:
 
 
 def _newest(time: IntArray, sizes: IntArray) -> IntArray:
-    """Newest time of each batch (k,), as the archive keeps it: a restart finds the same."""
+    """Return the newest time of each batch (k,), as the archive stores it, so that a restart finds the same."""
     newest = np.maximum.reduceat(time, np.cumsum(sizes) - sizes)
     return np.asarray(newest // US_STEP * US_STEP)
 
 
-def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
-    """Rows, heads and sizes of the batches at these places, which are in order."""
+def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
+    """Return rows, heads and sizes of the batches at these ascending positions."""
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):
         return rows, found.heads, found.sizes
@@ -336,8 +339,8 @@ def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
     return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
 
 
-def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
-    """Rows with what their batches say of themselves, as the archive wants them."""
+def _with_identity(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+    """Return rows with the identity of their batches, for the archive."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
         "vehicle": texts(numbers), "witness": np.array([stream.witness for stream, _ in batches], np.int64),
@@ -349,4 +352,4 @@ def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: 
     rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)
     if kind is Kind.STATE:
         rows["cell"] = cell_of(rows["latitude"], rows["longitude"])
-    return stepped(rows)
+    return round_to_steps(rows)

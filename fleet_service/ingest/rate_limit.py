@@ -1,8 +1,8 @@
-"""Who is listened to, and how much: a bucket of bytes per vehicle, before anything of a message is read.
+"""Rate limit: a token bucket of bytes per vehicle, applied before anything of a message is read.
 
-A bucket fills at a constant rate and holds a burst, so that a vehicle that comes back from an outage is not hindered.
-What does not fit is dropped, counted and not acknowledged: its sender keeps it and sends it again. It is no rejection.
-The name is the last chunk of the key; routers with an access list see to it that it is the sender's.
+A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage. Messages beyond it
+are dropped, counted and not acknowledged: the sender keeps them and sends them again. This is not a rejection. The name
+is the last chunk of the key; routers with an access list guarantee that it is the sender's.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _OTHERS: Final = ""
 
 
 class RateLimiter:
-    """The buckets of one service.
+    """Buckets of one service.
 
     Args:
         rate: [bytes/s] of a vehicle in the long run.
         burst: [bytes] that it may send at once.
-        known: names that are enrolled; None: any.
+        known: enrolled names; None for any.
         counts: takes `limited` and `refused.unknown`.
         clock: [s].
     """
@@ -45,7 +45,7 @@ class RateLimiter:
         self._swept = -float("inf")
 
     def allows(self, key: str, size: int, encoding: str = "") -> bool:
-        """Whether a message of `size` bytes on `key` is to be looked at; else it is counted."""
+        """Return True if a message of `size` bytes on `key` may be processed; otherwise count it."""
         name = key.rpartition("/")[2]
         if self._known is not None and name not in self._known:
             self._counts["refused.unknown"] += 1
@@ -66,7 +66,7 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop the buckets that are full again, but not at every message; whether there is room now."""
+        """Drop full buckets, but not at every message; return True if there is room now."""
         rate, burst = self._rate, self._burst
         if now - self._swept >= burst / rate:
             self._swept = now

@@ -1,12 +1,12 @@
-"""Who and what is accepted. Pure: the time and the batches are arguments.
+"""Validation of batches. Pure: time and batches are arguments.
 
-Three questions, in this order, the cheap ones first:
+Three checks in this order, cheap ones first:
     identity   is the key the sender's own, and has the batch the same place and name?           per message
     novelty    was this (vehicle, boot, kind, region, seq) accepted before?                      per message
     rows       is every value finite, in range, at its place and in its time?                    all rows at once
 
-A batch with one bad row is refused whole, with row and reason; the refusal settles it. Rules are tables: the reason
-that a sender reads is the text of the rule.
+One bad row refuses its batch, with row and reason; the refusal settles it. Rules are tables: the reason that a sender
+reads is the text of the rule.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
 class Range(NamedTuple):
-    """A column must lie in [least, most]; NaN, which is neither below nor above, is 'absent' where `optional`."""
+    """A column must lie in [least, most]; NaN, which is neither below nor above, means 'absent' where `optional`."""
 
     column: str
     least: float
@@ -60,12 +60,12 @@ class Clock(NamedTuple):
 
     @property
     def horizon(self) -> int:
-        """Older records are refused, and what is known of their streams is forgotten."""
+        """Oldest accepted time; streams before it are dropped."""
         return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
 
 
 class Refusal(NamedTuple):
-    """Why a batch was refused: the rule (what is counted), the row, and the text for the sender."""
+    """Reason for a refusal: the rule (for counting), the row, and the text for the sender."""
 
     rule: str
     row: int
@@ -75,17 +75,17 @@ class Refusal(NamedTuple):
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Whether batches are their keys' owners', for the keys' regions, with usable sequence numbers, and in time.
+    """Check that batches belong to their keys' owners and regions, have valid sequence numbers, and are in time.
 
     Args:
         kind: of the batches.
-        owners: whose key each came on, (k,).
+        owners: owner of each batch's key, (k,).
         heads: of the batches.
         time: of each one's first record [ns], (k,).
         clock: service time and bounds.
 
     Returns:
-        (k,) index of the first broken rule into the second value, -1 for a good one; and the rules.
+        (k,) index of the first broken rule into the second value, -1 for a valid one; and the rules.
     """
     topic, held = _TOPIC[kind], heads.first_held
     wrong_owner = [o.name != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
@@ -109,7 +109,7 @@ _HEAD_RULES: Final = (
 
 
 def _first(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
-    """Index of the first that is broken of each, -1 where none is."""
+    """Return the index of the first broken rule of each, -1 for none."""
     out = np.full(len(broken[0]), -1)
     for index in reversed(range(len(broken))):
         if broken[index].any():
@@ -124,7 +124,7 @@ def _is_estimator(name: str) -> bool:
 
 @lru_cache(KEYS_REMEMBERED)
 def owner_of(key: str) -> keys.Parsed | None:
-    """Whose key this is, and for which region; None if it is no concrete key of a vehicle."""
+    """Return vehicle and region of a key; None if it is not a concrete key of a vehicle."""
     try:
         parsed = keys.parse(key)
     except InputError:
@@ -133,7 +133,7 @@ def owner_of(key: str) -> keys.Parsed | None:
 
 
 def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """The first broken rule of every row.
+    """Return the first broken rule of every row.
 
     Args:
         kind: of the columns.
@@ -142,7 +142,7 @@ def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> 
         clock: service time and bounds.
 
     Returns:
-        (n,) index into the second value, -1 for a good row; and the rules.
+        (n,) index into the second value, -1 for a valid row; and the rules.
     """
     broken, rules = _broken_ranges(kind, columns)
     extra = _broken_observation(columns, clock) if kind is Kind.OBSERVATION else _broken_state(columns, clock)
@@ -158,7 +158,7 @@ TOO_LONG: Final = Refusal("time", BATCH, "time: more than an hour between the ba
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each batch (k,)."""
+    """Return which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each batch (k,)."""
     if not len(time):
         return np.zeros(len(sizes), bool)
     starts = np.cumsum(sizes) - sizes
@@ -175,7 +175,7 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
 
 
 def _cell_of(columns: Columns) -> IntArray:
-    """Cell of the pose; of nowhere, where the pose is not finite (which another rule refuses)."""
+    """Return the cell of the pose; an invalid cell if the pose is not finite (another rule refuses it)."""
     return grid.cell_of(*(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude")))
 
 

@@ -1,12 +1,14 @@
-"""Road weather in: from Zenoh and from a Parquet file, checked, archived, and then used by the map.
+"""Input of road weather: from Zenoh and from a Parquet file; checked, archived, and then used by the map.
 
-    weather/NAME-TIME.parquet     reports as they came, with the time from which the map used them
+    weather/NAME-TIME.parquet     reports as received, with the time from which the map used them
 
-Each file is written when reports come; `gather` makes one of a day's, so that a start and a look at the past read as
-many as there are days. What is read twice, since a power loss came in between, is the same report and changes nothing.
+Each file is written when reports arrive. `join_daily_files` joins the files of a day, so that a start and a past map
+read as many
+files as there are days. A report that is read twice, because of a power loss in between, is identical and changes
+nothing.
 
 A report acts on observations of which none was fused yet (`acts_from`). It is durable before it acts, so that a replay
-of the archive finds the weather that the map had, and gives the same map.
+of the archive finds the same weather and gives the same map.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import terms
 from fleet_service.archive.files import SEGMENT, write_table
 from fleet_service.archive.layout import DAY_NS, with_term
-from fleet_service.archive.load import Damaged, load, pass_over
+from fleet_service.archive.load import Damaged, load, skip_damaged
 from fleet_service.archive.segments import nanoseconds
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
@@ -51,7 +53,7 @@ class WeatherMessage(NamedTuple):
 
 
 class WeatherInbox:
-    """Takes reports in for one fusion.
+    """Input of reports for one fusion.
 
     Args:
         root: of the archive.
@@ -62,16 +64,16 @@ class WeatherInbox:
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
         self._folder, self.fusion, self._counts = root / FOLDER, fusion, counts
-        self._name = with_term(name, terms.of(root))
+        self._name = with_term(name, terms.read_epoch(root))
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
     def enqueue(self, message: WeatherMessage) -> None:
-        """Keep a sample for the next `take`; from any thread."""
+        """Queue a sample for the next `take`; thread-safe."""
         self._waiting.append(message)
 
     def take(self, now: int) -> Reports | None:
-        """Archive what was heard; returns it for the map, None where there is nothing."""
+        """Archive received reports; return them for the map, None if there are none."""
         found: list[tuple[int, Report]] = []
         while self._waiting:
             message = self._waiting.popleft()
@@ -82,7 +84,7 @@ class WeatherInbox:
         return self._archived(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
-        """Archive the reports of a file that may still act and are not `known`; returns them for the map.
+        """Archive the reports of a file that may still act and are not `known`; return them for the map.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.
@@ -136,16 +138,16 @@ def _reports(table: pa.Table) -> Reports:
     return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
 
 
-def archived(
+def archived_reports(
     root: Path,
     received_until: int | None = None,
     known: Collection[str] = (),
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> Reports:
-    """Every report that a map used, in the order in which they came, as far as received until a time [ns], and of
-    files whose names are not `known`.
+    """Return every report that a map used, in order of receipt up to a time [ns], from files whose names are not
+    `known`.
 
-    `damaged` is called with a damaged file: the roads of its reports age by the clock.
+    `damaged` is called with a damaged file: the roads of its reports age without weather.
 
     Raises:
         InputError: a file is of a newer major version.
@@ -167,19 +169,19 @@ def archived(
 
 
 def files(root: Path) -> list[Path]:
-    """Files of weather, in the order in which they came."""
+    """Return the weather files in order of receipt."""
     return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
 
 
-def gather(root: Path, damaged: Damaged = pass_over) -> int:
-    """Put the reports of each day into its newest file; returns how many files that saved.
+def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
+    """Join the reports of each day into its newest file; return the number of removed files.
 
     Raises:
         InputError: a file is of a newer major version.
         OSError: a file cannot be read or written; nothing is lost.
     """
     days: dict[int, list[Path]] = {}
-    term = terms.of(root)
+    term = terms.read_epoch(root)
     for path in files(root):
         days.setdefault(_day(path), []).append(path)
     saved = 0
@@ -199,7 +201,7 @@ def gather(root: Path, damaged: Damaged = pass_over) -> int:
 
 
 def retire(root: Path, until_day: int) -> int:
-    """Remove files whose reports acted until a day since 1970, or earlier; returns how many."""
+    """Remove files whose reports acted only up to a day since 1970; return their number."""
     removed = 0
     for path in files(root):
         table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
@@ -210,13 +212,15 @@ def retire(root: Path, until_day: int) -> int:
 
 
 def _day(path: Path) -> int:
-    """Days since 1970 when a file was written."""
+    """Return the days since 1970 of a file's writing."""
     return int(path.stem[-_DIGITS:]) // DAY_NS
 
 
 def read_file(path: Path) -> list[tuple[int, Report]]:
-    """Region and report of every row of a Parquet file: `region` (z10 quadint, or quadkey of 10 digits) and `time`
-    (timestamp, or ns), and any of the others; null or NaN is unknown.
+    """Return region and report of every row of a Parquet file.
+
+    It has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or ns), and any of the
+    others. Null or NaN is unknown.
 
     Raises:
         InputError: names the row, the column and the fix.

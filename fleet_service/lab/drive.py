@@ -92,9 +92,9 @@ class AlertWatch:
         known = slots >= 0
         belief = np.tile(mugrid.PRIOR, (CELLS, 1))
         belief[known] = self.fusion.beliefs(slots[known], now)
-        self.alerts.faded(now)
+        self.alerts.expire(now)
         self.beliefs[minute] = belief
-        self.alerted.append(np.isin(slots, list(self.alerts.raised)) & known)
+        self.alerted.append(np.isin(slots, list(self.alerts.slots)) & known)
 
 
 def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
@@ -115,7 +115,7 @@ def watch(rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None =
     for minute, part in enumerate(minutes(o, at, count), 1):
         if len(part.time):
             updated = fusion.update(part)
-            watched.alerts.updated(updated.slots)
+            watched.alerts.update(updated.slots)
             watched.late += int(updated.late.sum())
         if asked is None or minute in asked:
             watched.snapshot(minute)

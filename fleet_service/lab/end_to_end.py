@@ -20,7 +20,7 @@ from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.resampled import DrivenVisits, TrueVisits, driven
 from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe
 from fleet_service.serve.alerts import Alerts
-from fleet_service.serve.view import LOWER, UPPER, measured
+from fleet_service.serve.view import LOWER, UPPER, is_measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
@@ -80,7 +80,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
-    with_value = measured(lower, upper, fusion.live.values[slots])
+    with_value = is_measured(lower, upper, fusion.live.values[slots])
     pure = with_value & one_surface(fusion, visits)[slots]
     found = _figures(scores, with_value) | {
         "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5, "safe95": safe(scores),
@@ -96,7 +96,7 @@ def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
     second = (o.time - o.time.min()) // NS
     for rows in np.split(np.argsort(second, kind="stable"), np.cumsum(np.bincount(second))[:-1]):
         if len(rows):
-            raised += [alert for alert in alerts.updated(fusion.update(o.take(rows)).slots) if alert.raised]
+            raised += [alert for alert in alerts.update(fusion.update(o.take(rows)).slots) if alert.raised]
     return raised
 
 

@@ -28,7 +28,7 @@ from fleet_service.lab.score import (
     of_beliefs,
     slippery_scores,
 )
-from fleet_service.serve.view import LOWER, UPPER, measured
+from fleet_service.serve.view import LOWER, UPPER, is_measured
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray
 from schemas.thresholds import NS
@@ -63,7 +63,7 @@ def moments(folder: Path) -> list[AskedWay]:
         belief = fusion.beliefs(slots, until)
         lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
         scores = of_beliefs(belief, truth, end_to_end.excited(fusion, past)[slots])
-        out.append(AskedWay(scores, measured(lower, upper, fusion.live.values[slots])))
+        out.append(AskedWay(scores, is_measured(lower, upper, fusion.live.values[slots])))
     return out
 
 

@@ -138,7 +138,7 @@ def false_alert(rng: Generator) -> bool:
     o, fusion = observations_of(rows_of(visits), who), Fusion(LATENESS_S)
     alerts, raised = Alerts(fusion), False
     for k in range(n):
-        raised |= any(alert.raised for alert in alerts.updated(fusion.update(o.take(np.array([k]))).slots))
+        raised |= any(alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots))
     return raised
 
 

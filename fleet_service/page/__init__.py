@@ -1,1 +1,1 @@
-"""The live page: the map, its alerts and its past in a browser, asked as any reader asks."""
+"""The live page: the map, its alerts and its past in a browser, with the rights of a reader."""

@@ -1,4 +1,4 @@
-"""What browsers ask with: every parameter read as if a stranger had written it."""
+"""Parsing of request parameters from browsers; every parameter is treated as hostile."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 
 
 def moment(request: Request) -> int | None:
-    """`at` [s since 1970]; None: now."""
+    """Return `at` [s since 1970]; None for now."""
     return _number(request, "at", 0, 1 << 33) if "at" in request.query_params else None
 
 
 def level(request: Request) -> int:
-    """Zoom of the places, 14 to 21."""
+    """Return the zoom of the places, 14 to 21."""
     return _number(request, "level", LEAST_LEVEL, CELL_LEVEL) if "level" in request.query_params else CELL_LEVEL
 
 
 def tiles(request: Request) -> list[int]:
-    """z14 quadints, some hundred at the most."""
+    """Return z14 quadints, at most some hundred."""
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
         raise InputError("tiles", f"are {len(words)}", f"ask for {MOST_TILES} at once")
@@ -38,17 +38,17 @@ def tiles(request: Request) -> list[int]:
 
 
 def view(request: Request) -> View:
-    """What a watcher looks at."""
+    """Return the part of the map that a watcher looks at."""
     text = request.query_params.get("bbox")
     box = WORLD if text is None else query.parse({"bbox": text}).bbox or WORLD
     return View(box, level(request))
 
 
 def features(request: Request, now: int) -> FeatureQuestion:
-    """A question for features, now [ns].
+    """Return a query for features, now [ns].
 
     Raises:
-        InputError: a parameter that the interface does not know, or that cannot be read.
+        InputError: a parameter is unknown or not valid.
     """
     given = request.query_params
     if unknown := [name for name in given if name not in _OF_FEATURES]:
@@ -61,16 +61,16 @@ def features(request: Request, now: int) -> FeatureQuestion:
 
 
 def feature(text: str) -> int:
-    """Place (cell · 4 + sector) of a feature's id."""
+    """Return the place (cell · 4 + sector) of a feature's id."""
     cell, _, sector = text.partition("-")
     found = _whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
     return found + _whole("feature", sector, 0, grid.SECTORS - 1)
 
 
 def _interval(text: str, now: int) -> tuple[int, int | None]:
-    """Begin [ns] of what is wanted, and the moment [ns] of the map; None: now.
+    """Return the begin [ns] of the selected observations, and the moment [ns] of the map (None for now).
 
-    RFC 3339: an instant, or an interval of which a side may be open (`..` or nothing).
+    RFC 3339: an instant, or an interval of which one side may be open (`..` or nothing).
     """
     first, is_interval, last = text.partition("/")
     begin, end = _instant(first), _instant(last if is_interval else first)
@@ -92,13 +92,13 @@ def _instant(text: str) -> int | None:
 
 
 def place(request: Request) -> tuple[int, int]:
-    """Cell and sector."""
+    """Return cell and sector."""
     cell = _whole("cell", request.path_params["cell"], 0, 4**grid.CELL_ZOOM - 1)
     return cell, _whole("sector", request.path_params["sector"], 0, grid.SECTORS - 1)
 
 
 def route(request: Request) -> tuple[list[tuple[float, float]], str]:
-    """Points (longitude, latitude) of a route, and their text."""
+    """Return the points (longitude, latitude) of a route, and their text."""
     text = request.query_params.get("points", "")
     found = query.parse({"route": text}).route
     return list(found or ()), text

@@ -1,6 +1,6 @@
-"""What lies below the cells: raster tiles from an address, or from one file of the operator's own, served here.
+"""Base map below the cells: raster tiles from an address, or from a file of the operator, served here.
 
-The file is MBTiles 1.3 (github.com/mapbox/mbtiles-spec): pictures in a table of SQLite, rows counted from the south.
+The file is MBTiles 1.3 (github.com/mapbox/mbtiles-spec): images in a table of SQLite, rows counted from the south.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ DEEPEST: Final = 30
 
 
 class TileFile:
-    """Raster tiles of a file; any thread may ask.
+    """Raster tiles of a file; thread-safe.
 
     Args:
         path: ends in .mbtiles.
 
     Raises:
-        InputError: it is not there, or holds no pictures.
+        InputError: it does not exist, or has no images.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,7 +45,7 @@ class TileFile:
         self.kind, self.zooms = KINDS[form], (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """A tile, counted from the north-west; None where there is none."""
+        """Return a tile, counted from the north-west; None if there is none."""
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
         asked = "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
@@ -55,7 +55,7 @@ class TileFile:
 
 
 class BaseMap(NamedTuple):
-    """Where the tiles are asked for, with {z}, {x} and {y}; which zooms there are; the file, if they come of one."""
+    """Address of the tiles with {z}, {x} and {y}, its zoom levels, and the file, if there is one."""
 
     address: str
     zooms: tuple[int, int] = ZOOMS
@@ -63,10 +63,10 @@ class BaseMap(NamedTuple):
 
 
 def base_map(text: str) -> BaseMap:
-    """A base map as the command names it.
+    """Return a base map from the text of the option.
 
     Raises:
-        InputError: it is neither an address of tiles nor a file of them.
+        InputError: the text is neither an address of tiles nor a file of them.
     """
     if text.endswith(ENDING):
         file = TileFile(Path(text))

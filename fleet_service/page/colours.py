@@ -1,9 +1,9 @@
-"""What a cell is drawn in: the less is known the fewer colours, and none at all for a mere bound.
+"""Colours of cells: fewer colours for less certain cells, and none for a mere bound.
 
-Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu where its interval is narrow, two
-where it is middling, one grey where it is wide. What is slippery even at the upper end keeps its colour, however wide.
-Dark is slippery on light ground, and nothing is ever green: a safe colour would be a promise.
-`tests/fleet_service/page/test_colours.py` computes how far they lie apart for four kinds of sight.
+Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu if its interval is narrow, two if it
+is middling, one grey if it is wide. A cell that is slippery even at the upper end keeps its colour, however wide. Dark
+is slippery on light ground. Nothing is green, because a safe colour would be a promise.
+`tests/fleet_service/page/test_colours.py` computes the distances for four kinds of sight.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ALERT: Final = "#c4003a"
 
 
 def colour_of(mu: float, lower: float, upper: float) -> str:
-    """Colour of what was measured as mu, with its 5 % and 95 % quantiles."""
+    """Return the colour of a measured mu with its 5 % and 95 % quantiles."""
     width = round(upper - lower, 6)  # a step of the records is .005
     if upper < SLIPPERY_MU or width < NARROW:
         return FOUR[sum(mu >= edge for edge in EDGES)]
@@ -33,7 +33,7 @@ def colour_of(mu: float, lower: float, upper: float) -> str:
 
 
 def as_json() -> dict[str, Any]:
-    """All of it for the page."""
+    """Return the palette for the page."""
     return {
         "narrow": NARROW, "middling": MIDDLING, "edges": EDGES, "slippery": SLIPPERY_MU, "four": FOUR, "two": TWO,
         "little": LITTLE, "ground": GROUND, "alert": ALERT,

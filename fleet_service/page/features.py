@@ -1,7 +1,7 @@
-"""The documents of OGC API Features, Part 1: Core (OGC 17-069r4), of one collection: `grip`, the map's cells. Pure.
+"""Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection: `grip`, the map's cells. Pure.
 
-A feature is a cell and heading; its geometry is the quarter of the cell on the side that is headed for. A bound has no
-`mu`, what is unknown is null or not there. The time of a feature is that of its newest observation.
+A feature is a cell and heading. Its geometry is the quarter of the cell on the side of the heading. A bound has no
+`mu`, and unknown values are null or absent. The time of a feature is that of its newest observation.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ Box = tuple[float, float, float, float]
 
 
 class FeatureQuestion(NamedTuple):
-    """A question for features.
+    """Query for features.
 
     Attributes:
-        bbox: west, south, east, north [deg]; None: everywhere.
-        since: nothing whose newest observation is older [ns]; 0: everything.
-        at: the map as it was [ns]; None: now.
-        limit: features at the most.
-        after: place (cell · 4 + sector) after which to go on.
+        bbox: west, south, east, north [deg]; None for everywhere.
+        since: minimum time of the newest observation [ns]; 0 for no limit.
+        at: moment of the map [ns]; None for now.
+        limit: maximum number of features.
+        after: place (cell · 4 + sector) after which to continue.
     """
 
     bbox: Box | None = None
@@ -60,7 +60,7 @@ class FeatureQuestion(NamedTuple):
 
 
 def identity(cell: int, sector: int) -> str:
-    """Id of a feature."""
+    """Return the id of a feature."""
     return f"{cell}-{sector}"
 
 
@@ -69,7 +69,7 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 
 def landing(base: str) -> dict[str, Any]:
-    """What there is; `base` is the address without a slash at its end."""
+    """Return the landing page; `base` is the address without a final slash."""
     return {
         "title": "GripMap", "description": ABOUT,
         "links": [
@@ -83,18 +83,18 @@ def landing(base: str) -> dict[str, Any]:
 
 
 def conformance() -> dict[str, Any]:
-    """The parts of the standard that are kept."""
+    """Return the conformance classes."""
     return {"conformsTo": list(CONFORMANCE)}
 
 
 def collections(base: str, extent: Box | None) -> dict[str, Any]:
-    """The collections: one."""
+    """Return the list of collections, which has one entry."""
     links = [_link(f"{base}/collections", "self", JSON, "this document")]
     return {"links": links, "collections": [collection(base, extent)]}
 
 
 def collection(base: str, extent: Box | None) -> dict[str, Any]:
-    """The collection; `extent` is the box of all cells, where there are any."""
+    """Return the collection; `extent` is the box of all cells, if there are any."""
     own = f"{base}/collections/{COLLECTION}"
     found: dict[str, Any] = {
         "id": COLLECTION, "title": TITLE, "description": ABOUT, "itemType": "feature", "crs": [CRS84],
@@ -110,7 +110,8 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
 
 
 def schema(base: str) -> dict[str, Any]:
-    """A feature as JSON Schema, as GDAL takes it: who sees only bounds at first knows that `mu` is a number."""
+    """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds knows `mu` is a
+    number."""
     columns = {f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -123,7 +124,7 @@ def schema(base: str) -> dict[str, Any]:
 
 
 def api(base: str) -> dict[str, Any]:
-    """The definition of the interface, OpenAPI 3.0."""
+    """Return the definition of the interface, OpenAPI 3.0."""
 
     def route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
         answers = {"200": {"description": "the document"}, "400": {"description": "what was wrong, and how to mend it"}}
@@ -153,14 +154,14 @@ def api(base: str) -> dict[str, Any]:
 
 
 def page_of(features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str) -> dict[str, Any]:
-    """Features as an answer.
+    """Return features as one page of an answer.
 
     Args:
         features: each with its id.
-        more: whether there are more of them.
-        address: of this answer.
-        following: of the one after it.
-        stamp: when it was so, ISO 8601.
+        more: True if there are more.
+        address: of this page.
+        following: of the next page.
+        stamp: time of the data, ISO 8601.
     """
     found = list(features)
     links = [_link(address, "self", GEOJSON, "this document")]
@@ -173,7 +174,7 @@ def page_of(features: Iterable[dict[str, Any]], more: bool, address: str, follow
 
 
 def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Features with their id, and without what the geometry says."""
+    """Yield features with their id, and without the properties that repeat the geometry."""
     names = {field.name for field in COLUMNS}
     for feature in features:
         properties = {name: value for name, value in feature["properties"].items() if name in names}
@@ -181,7 +182,7 @@ def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]
 
 
 def extent_of(tiles: Iterable[int]) -> Box | None:
-    """The box of tiles [deg]; None of none."""
+    """Return the box of tiles [deg]; None without tiles."""
     sides = [grid.bounds(tile, grid.TILE_ZOOM) for tile in tiles]
     if not sides:
         return None

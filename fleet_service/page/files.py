@@ -1,4 +1,4 @@
-"""The page's own files, read and packed once; its modules as one script beside them."""
+"""Static files of the page, read and compressed once, with its modules bundled into one script."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from starlette.requests import Request
 from starlette.responses import Response
 
-from fleet_service.page.joined import joined
+from fleet_service.page.joined import bundle_modules
 
 LEVEL: Final = 9
 ENGLISH: Final = "texts.en.json"
@@ -26,20 +26,20 @@ class _File(NamedTuple):
 
 
 class Files:
-    """The files of a folder.
+    """Files of a folder.
 
     Args:
-        folder: is read once.
+        folder: read once.
     """
 
     def __init__(self, folder: Path) -> None:
         plain = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
         modules = {name.removesuffix(".js"): text.decode() for name, text in plain.items() if name.endswith(".js")}
-        plain[SCRIPT] = joined(modules, "main").encode()
+        plain[SCRIPT] = bundle_modules(modules, "main").encode()
         self._files = {name: _packed(name, text) for name, text in plain.items()}
 
     def texts(self, accepted: str) -> str:
-        """Name of the table of words in the first language that a browser takes and that there is; English else.
+        """Return the name of the text table in the browser's first available language; English otherwise.
 
         Args:
             accepted: the header `Accept-Language`, the best language first.
@@ -49,7 +49,7 @@ class Files:
         return next((name for name in names if name in self._files), ENGLISH)
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:
-        """A file as the browser takes it, or that it has it already; None: there is none of that name."""
+        """Return a file in a form the browser accepts, or "not modified"; None if there is no such file."""
         file = self._files.get(name)
         if file is None:
             return None

@@ -1,4 +1,4 @@
-"""What services say of themselves at `/metrics`, for the health view: a reader hears nothing of it over Zenoh."""
+"""Metrics of services for the health view, read over HTTP because a reader does not receive them over Zenoh."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LINE: Final = re.compile(rf'{PREFIX}(\w+?)(_total)?(?:\{{\w+="([^"]*)"\}})? (\S
 
 
 class ServiceHealth:
-    """The metrics of services, by address.
+    """Metrics of services, by address.
 
     Args:
         addresses: such as http://127.0.0.1:9464.
@@ -31,7 +31,7 @@ class ServiceHealth:
         self._before: dict[str, tuple[float, float]] = {}
 
     def services(self) -> list[dict[str, Any]]:
-        """One entry a service: `address`, `answers`, and what it says."""
+        """Return one entry per service: `address`, `answers`, and its values."""
         with self._lock:
             if time.monotonic() - self._asked >= KEPT_S:
                 self._answers = [self._ask(address) for address in self._addresses]
@@ -61,7 +61,7 @@ class ServiceHealth:
 
 
 def values(text: str) -> dict[str, dict[str, float]]:
-    """Values of an OpenMetrics text by name and label; "" is the label of a single one."""
+    """Return the values of an OpenMetrics text by name and label; "" is the label of a single value."""
     found: dict[str, dict[str, float]] = {}
     for line in text.splitlines():
         match = _LINE.fullmatch(line)

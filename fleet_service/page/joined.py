@@ -1,8 +1,8 @@
-"""The page's modules as one script. Pure.
+"""Bundler of the page's ES modules into one script. Pure.
 
-A browser asks for six files of a server at a time, and the first picture waits for the last of two dozen. So what is
-written as modules is sent as one: each module is a function that is called once, after those that it imports from,
-and gives what others import from it. There is no build step: the server joins them when it starts.
+Browsers open six connections per host, so two dozen modules delay the first paint. In the bundle each module is a
+function that is called once, after the modules it imports, and returns its exports. There is no build step: the server
+bundles when it starts.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _EXPORT: Final = re.compile(r"^export (?=(?:async )?function |class |const )", r
 _OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
-def joined(modules: Mapping[str, str], main: str) -> str:
-    """One script of modules that does what `main` does.
+def bundle_modules(modules: Mapping[str, str], main: str) -> str:
+    """Return one script that does what `main` does.
 
     Args:
-        modules: their text by name; `./NAME.js` is what the others import.
-        main: the module that is run, and that nobody imports.
+        modules: their text by name; imported as `./NAME.js`.
+        main: the module that is run, and that no module imports.
 
     Raises:
-        ValueError: an import or export of another form than `import { a, b } from "./name.js";`, or a circle of them.
-        KeyError: a module that is not there.
+        ValueError: an import or export has another form than `import { a, b } from "./name.js";`, or there is a circle.
+        KeyError: a module is missing.
     """
     wanted: defaultdict[str, set[str]] = defaultdict(set)
     needs: dict[str, list[str]] = {}
@@ -52,7 +52,7 @@ def _called(name: str, body: str, exported: list[str]) -> str:
 
 
 def _plain(text: str) -> str:
-    """A module's text with neither imports nor exports."""
+    """Return a module's text without imports and exports."""
     text = _IMPORT.sub(lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text))
     if other := _OTHER.search(text):
         raise ValueError(f"{other[0]!r} cannot be joined")

@@ -1,6 +1,6 @@
-"""Past moments from the snapshots that a service keeps: which there are, a map of then, a cell's history.
+"""Past of the map from the snapshots of a service: available moments, a past map, a cell's history.
 
-Snapshots hold public cells only, so what is read here is as public as the map itself.
+Snapshots hold public cells only, so this data is as public as the map itself.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehi
 
 
 class Moments:
-    """The snapshots of an archive.
+    """Snapshots of an archive.
 
     Args:
-        root: of the archive; None where the page has none.
+        root: of the archive; None without one.
     """
 
     def __init__(self, root: Path | None) -> None:
@@ -43,20 +43,20 @@ class Moments:
         self._lock = threading.Lock()
 
     def times(self) -> list[int]:
-        """The moments of all snapshots [s since 1970], oldest first."""
+        """Return the moments of all snapshots [s since 1970], oldest first."""
         return sorted(self._files())[-MOST:]
 
     def tiles(self, moment: int) -> list[int]:
-        """Tiles with cells then."""
+        """Return the tiles with cells at a moment."""
         return list(self._at(moment))
 
     def encoded(self, moment: int, tile: int, level: int) -> bytes:
-        """All of a tile then; empty where nothing was known of it."""
+        """Return a complete tile at a moment; empty if it had no cells."""
         cells = self._at(moment).get(tile)
         return b"" if cells is None else world.block_at(level, tile, cells, 1, float(moment))
 
     def history(self, cell: int, sector: int) -> list[dict[str, Any]]:
-        """What was believed of a cell at each moment at which it was public, oldest first."""
+        """Return the belief about a cell at each moment at which it was public, oldest first."""
         found = []
         files = self._files()
         for moment in sorted(files)[-HISTORY:]:

@@ -1,4 +1,4 @@
-"""The routes of OGC API Features: the map as QGIS, ArcGIS and GDAL open it."""
+"""Routes of OGC API Features: the map for QGIS, ArcGIS and GDAL."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fleet_service.client import map_client
 from fleet_service.page import asked, features
 from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
 from fleet_service.page.reader import Reader
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.tables import MAP_SCHEMA
 from schemas.thresholds import NS
@@ -28,51 +28,51 @@ _OWN: Final = f"/collections/{COLLECTION}"
 
 
 class FeatureRoutes:
-    """The answers, a method each.
+    """Handlers, one method per route.
 
     Args:
         world: knows which tiles have cells now.
-        reader: asks for cells.
+        reader: queries cells.
     """
 
-    def __init__(self, world: HeldWorld, reader: Reader) -> None:
+    def __init__(self, world: MapMirror, reader: Reader) -> None:
         self._world, self._reader = world, reader
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
-        """What answers which path."""
+        """Return the handlers by path."""
         return {
             "/conformance": self.conformance, "/collections": self.collections, _OWN: self.collection, "/api": self.api,
             f"{_OWN}/schema": self.schema, f"{_OWN}/items": self.items, f"{_OWN}/items/{{feature}}": self.item,
         }  # fmt: skip
 
     async def landing(self, request: Request) -> Response:
-        """What there is, for programs."""
+        """Return the landing page for programs."""
         return JSONResponse(features.landing(_base(request)), headers={"Vary": "Accept"})
 
     async def conformance(self, _: Request) -> Response:
-        """What is kept of the standard."""
+        """Return the conformance classes."""
         return JSONResponse(features.conformance())
 
     async def collections(self, request: Request) -> Response:
-        """The one collection, in a list."""
+        """Return the list with the one collection."""
         return JSONResponse(features.collections(_base(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
-        """The collection."""
+        """Return the collection."""
         return JSONResponse(features.collection(_base(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:
-        """Its columns."""
+        """Return its columns."""
         return JSONResponse(features.schema(_base(request)), media_type=features.SCHEMA_JSON)
 
     async def api(self, request: Request) -> Response:
-        """The interface."""
+        """Return the interface definition."""
         return JSONResponse(features.api(_base(request)), media_type=features.OPENAPI)
 
     async def items(self, request: Request) -> Response:
-        """Features by place, from `after` on; `next` goes on where this ends, whatever changes meanwhile."""
+        """Return features ordered by place, from `after` on; `next` continues there, whatever changes meanwhile."""
         question = asked.features(request, time.time_ns())
-        if not self._reader.served:
+        if not self._reader.is_served:
             message = "no service answers for the map; that is no empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         return await run_in_threadpool(self._items, request, question)
@@ -93,7 +93,7 @@ class FeatureRoutes:
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
 
     async def item(self, request: Request) -> Response:
-        """One feature, as it is now."""
+        """Return one feature as it is now."""
         place = asked.feature(request.path_params["feature"])
         table = await run_in_threadpool(self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1))
         cell, sector = divmod(place, grid.SECTORS)
@@ -104,10 +104,10 @@ class FeatureRoutes:
         return PlainTextResponse("nobody was there: nothing is known\n", 404)
 
     def _cells(self, question: FeatureQuestion) -> pa.Table:
-        """One more row than asked for, where there are so many, by place.
+        """Return the rows by place, with one more than requested if there are more.
 
         Raises:
-            InputError: a service refused the question.
+            InputError: a service refused the query.
         """
         found, rows = [MAP_SCHEMA.empty_table()], 0
         for table in self._tiles(question):
@@ -122,7 +122,7 @@ class FeatureRoutes:
         return pa.concat_tables(found).slice(0, question.limit + 1)
 
     def _tiles(self, question: FeatureQuestion) -> Iterator[pa.Table]:
-        """Cells a tile at a time, in the order of tiles."""
+        """Yield cells one tile at a time, in the order of tiles."""
         parameters = {}
         if question.bbox is not None:
             parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)
@@ -143,7 +143,7 @@ class FeatureRoutes:
 
 
 def wants_json(request: Request) -> bool:
-    """Whether a program asks, which wants the landing page of the interface and not the map that people see."""
+    """Return True for a program, which gets the landing page of the interface and not the map for people."""
     form = request.query_params.get("f")
     if form is not None:
         return form == "json"

@@ -1,6 +1,6 @@
-"""Another map to lay over this one, such as a simulation's truth: a Parquet file of cell, sector and mu.
+"""Overlay map, such as a simulation's truth: a Parquet file of cell, sector and mu.
 
-The file is read when it is asked for: it may come into being while the page runs.
+The file is read on request, because it may appear while the page runs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from schemas.errors import InputError
 
 
 def cells(path: Path | None) -> dict[str, list[Any]] | None:
-    """Cell (as text), sector and mean mu of each place; None where there is no file, or none yet.
+    """Return cell (as text), sector and mean mu of each place; None if there is no file yet.
 
     Raises:
         InputError: the file has other columns.

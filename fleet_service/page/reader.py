@@ -1,7 +1,7 @@
-"""The page's subscriber: a reader's session. Hears tiles and alerts, asks for what it missed, sees which regions
-are served.
+"""Subscriber of the page, with the rights of a reader: receives tiles and alerts, queries what it missed, and tracks
+served regions.
 
-What it puts: nothing. What it may not hear of (tokens, where the access list holds) it does without.
+It publishes nothing. If the access list hides tokens, it works without them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import zenoh
 
 from fleet_service.client import map_client
 from fleet_service.client.watching import standing_alerts
-from fleet_service.page.world import HeldWorld, box_of
+from fleet_service.page.world import MapMirror, box_of
 from schemas import grid, keys, regions, tables, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError, WireError
@@ -38,10 +38,10 @@ class Reader:
 
     Args:
         connection: how to reach the router.
-        world: takes what is heard.
+        world: receives the data.
     """
 
-    def __init__(self, connection: ZenohSettings, world: HeldWorld) -> None:
+    def __init__(self, connection: ZenohSettings, world: MapMirror) -> None:
         self._connection, self._world = connection, world
         self._session: zenoh.Session | None = None
         self._queriers: dict[int, Any] = {}
@@ -52,11 +52,11 @@ class Reader:
         self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
-        """Listen until `stop` is set."""
+        """Receive until `stop` is set."""
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
-        with session, tokens.watched(session) as services:
+        with session, tokens.track_tokens(session) as services:
             self._session = session
             session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
@@ -75,22 +75,22 @@ class Reader:
             self._session = None
 
     @property
-    def connected(self) -> bool:
-        """Whether a router is there."""
+    def is_connected(self) -> bool:
+        """True if a router is connected."""
         session = self._session
         return session is not None and bool(list(session.info.routers_zid()))
 
     @property
-    def served(self) -> bool:
-        """Whether any service answers."""
-        return self._served and self.connected
+    def is_served(self) -> bool:
+        """True if any service answers."""
+        return self._served and self.is_connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
-        """Whether a service answers for a place [deg]."""
+        """Return True if a service answers for a place [deg]."""
         return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
 
     def regions(self) -> list[dict[str, Any]]:
-        """Regions with cells: their box, whether a service answers for them, since when none does."""
+        """Return regions with cells: their box, whether a service answers, and since when none does."""
         return [
             {"region": grid.quadkey(region, grid.REGION_ZOOM), "box": box_of(region, grid.REGION_ZOOM),
              "served": region not in self._away_since, "since": self._away_since.get(region)}
@@ -100,12 +100,12 @@ class Reader:
             for region, since in self._fallen.copy().items()
         ]  # fmt: skip
 
-    def _note_fallen(self, services: tokens.Watched) -> None:
-        """Regions without a service that had one, if no cell of theirs is known: those are seen by themselves."""
-        here = {token.region for token in services.here}
+    def _note_fallen(self, services: tokens.PresenceTracker) -> None:
+        """Record regions that lost their service and have no known cell; others are found through their cells."""
+        here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
-            token.region for token in services.withdrawn
+            token.region for token in services.lost
             if token.region.startswith(tuple("0123"))
             and not any(regions.covers(one, token.region) for one in here)
             and not any(regions.overlap(one, token.region) for one in known)
@@ -113,14 +113,14 @@ class Reader:
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
-        """Names with a token; empty where this reader may not hear of them."""
+        """Return names with a token; empty if the access list hides them."""
         return sorted(self._names[kind])
 
     def ask(self, selector: str, parameters: Mapping[str, str]) -> Iterator[tuple[int, pa.Table]]:
-        """Tile and cells of every reply.
+        """Yield tile and cells of every reply.
 
         Raises:
-            InputError: a service refused the question, or no router is there.
+            InputError: a service refused the query, or no router is connected.
         """
         session = self._session
         if session is None:
@@ -147,7 +147,7 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """What was there before this page; it subscribed first, so that nothing is missed in between."""
+        """Query everything that existed before this page. It subscribed first, so nothing is missed in between."""
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
                 self._world.take_tile(tile, table, time.time())
@@ -191,15 +191,15 @@ class Reader:
         return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
-        """Whether a service answers for any place: by its token, or, where none may be heard, by what it serves.
+        """Return True if a service answers for any place: by its token, or by its answers if tokens are hidden.
 
-        A router matches only who answers for all of a key expression: a service of the whole world is found by any
-        tile, one of a region by the regions that are known, and before any is known by its answer.
+        A router matches only services that answer for all of a key expression. A service of the whole world is found by
+        any tile, a service of a region by the known regions, and before any region is known by its answer.
         """
         if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True
         session = self._session
-        if session is None or not self.connected:
+        if session is None or not self.is_connected:
             return False
         if self._anything is None:
             self._anything = session.declare_querier(f"{keys.ROOT}/map/*/*/*/*")
@@ -214,14 +214,14 @@ class Reader:
 
 
 def _box_of_expression(region: str) -> list[float]:
-    """West, south, east, north [deg] of what its first digits name."""
+    """Return west, south, east, north [deg] of the square that its first digits name."""
     digits = region.partition("*")[0].replace("/", "")
     return box_of(grid.from_quadkey(digits), len(digits))
 
 
 @contextlib.contextmanager
 def _refusals_logged(sample: zenoh.Sample) -> Iterator[None]:
-    """What a stranger put is no reason to end: it is said, and the next is heard."""
+    """Log a malformed message and continue."""
     try:
         yield
     except (InputError, WireError, KeyError) as error:

@@ -1,8 +1,8 @@
-"""Cells of the map as 13-byte records, a tile a block: what the page is sent. Worst first where it is zoomed out. Pure.
+"""Cells of the map as 13-byte records, one block per tile, for the page. When zoomed out, worst first. Pure.
 
-A block is a head of 32 bytes and its columns one after the other, each little-endian, so that a browser lays arrays
-over them without copying: `last` (4 bytes a cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`, `basis`,
-`vehicles`, `unknown` (1 each). It ends at a multiple of four bytes.
+A block is a head of 32 bytes followed by its columns, little-endian, so that a browser can use them without copying:
+`last` (4 bytes per cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`, `basis`, `vehicles`, `unknown` (1 each).
+It ends at a multiple of four bytes.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ LEAST_LEVEL: Final = grid.TILE_ZOOM
 
 
 class TileBlock(NamedTuple):
-    """What is known of a tile, or what changed of it.
+    """Complete tile, or its changes.
 
     Attributes:
         tile: z14 quadint.
         level: zoom of the places, 14 to 21.
         version: counts the changes of a tile, from 1.
-        base: the version that this changes; 0: this is all of the tile.
-        moment: when it was so [s since 1970].
-        records: by place; `basis` GONE takes a place away.
+        base: the version that this changes; 0 for a complete tile.
+        moment: of the data [s since 1970].
+        records: by place; `basis` GONE removes a place.
     """
 
     tile: int
@@ -56,7 +56,7 @@ class TileBlock(NamedTuple):
     records: Records
 
     def encoded(self) -> bytes:
-        """The block as bytes."""
+        """Return the block as bytes."""
         head = HEAD.pack(self.tile, self.version, self.base, len(self.records), self.level, self.moment)
         names: tuple[str, ...] = RECORD.names or ()
         body = b"".join(self.records[name].tobytes() for name in names)
@@ -64,9 +64,9 @@ class TileBlock(NamedTuple):
 
 
 def of_table(table: pa.Table) -> Records:
-    """Cells of one tile (the schema of the map, n rows) as records (n,), by place.
+    """Return cells of one tile (the schema of the map, n rows) as records (n,), by place.
 
-    An interval is rounded outwards and P(slippery) upwards: no cell reads drier than it was told.
+    An interval is rounded outwards and P(slippery) upwards, so no cell appears drier than reported.
     """
     found = np.zeros(table.num_rows, RECORD)
     found["last"] = np.clip(table["last_time"].cast(pa.int64()).to_numpy() // NS, 0, 2**32 - 1)
@@ -89,11 +89,11 @@ def _steps(rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray
     return np.where(np.isfinite(value), whole, NO_NUMBER).astype(np.uint8)
 
 
-def worst(records: Records, level: int) -> Records:
-    """Records of cells (n,) as those of their ancestors at `level`, 14 to 21, all headings together.
+def aggregate_worst(records: Records, level: int) -> Records:
+    """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings together.
 
-    An ancestor has the least of each quantile of what was measured below it, which is the largest P(slippery): no cell
-    below is more slippery than it says. `unknown` is the share of cells and headings below that were only passed.
+    An ancestor has the minimum of each quantile of the measured cells below it, and so the largest P(slippery): no cell
+    below is more slippery than its ancestor. `unknown` is the share of cells and headings below with bounds only.
     """
     if not len(records):
         return records
@@ -117,8 +117,8 @@ def worst(records: Records, level: int) -> Records:
     return found
 
 
-def changed(before: Records, after: Records) -> Records:
-    """What must be laid over `before` to have `after`, both by place."""
+def changed_records(before: Records, after: Records) -> Records:
+    """Return the records that turn `before` into `after`, both by place."""
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))
     for one, records in ((old, before), (new, after)):

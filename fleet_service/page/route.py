@@ -1,6 +1,6 @@
-"""Grip along a route: stretches of the same cell and heading in their order, what is measured of them and what is not.
+"""Grip along a route: stretches of the same cell and heading in order, measured or not.
 
-What nobody measured is a stretch of its own without a number: it is neither dry nor slippery, and is counted.
+An unmeasured part is a stretch of its own without a number. It is neither dry nor slippery, and it is counted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Points = Sequence[tuple[float, float]]
 
 
 def profile(points: Points, table: pa.Table) -> dict[str, Any]:
-    """Stretches along a route of (longitude, latitude) [deg], with the cells that a service told of it.
+    """Return the stretches along a route of (longitude, latitude) [deg], with the cells that a service returned.
 
     Returns:
         `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis and, where measured,
@@ -33,7 +33,7 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
         lower end, or None.
 
     Raises:
-        InputError: the route is too long or no route.
+        InputError: the route is too long or not valid.
     """
     longitude, latitude, along, sector = _samples(points)
     keys = grid.cell_of(latitude, longitude) * grid.SECTORS + sector
@@ -62,7 +62,7 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
 
 
 def safe_speeds(mu_lower: float) -> dict[str, float]:
-    """Speed [m/s] from which one stops on the lower end of what is known, by metres of sight."""
+    """Return the speed [m/s] from which a car stops with the lower end of grip, by metres of sight."""
     return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
 
 
@@ -76,7 +76,7 @@ def _described(cell: dict[str, Any]) -> dict[str, Any]:
 
 
 def _samples(points: Points) -> tuple[Any, Any, Any, Any]:
-    """Longitude and latitude [deg], metres along and heading sector, each step of the route."""
+    """Return longitude and latitude [deg], metres along and heading sector of each step of the route."""
     corners = np.array(points)
     if corners.ndim != 2 or len(corners) < 2:
         raise InputError("route", "needs two points", "click two or more")

@@ -1,4 +1,4 @@
-"""The page's process: a reader's session in a thread, a web server on loopback, until a signal."""
+"""Process of the page: a reader's session in a thread and a web server on loopback, until a signal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
 from fleet_service.page.watchers import MOST, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 
@@ -36,18 +36,18 @@ LOOK_S: Final = 0.1
 
 @dataclass(frozen=True)
 class PageSettings:
-    """What a page is started with.
+    """Settings of the page.
 
     Attributes:
         connection: how to reach the router.
-        host, port: where to listen; port 0 is a free one.
-        names: host names under which a proxy passes questions on; none, and not on loopback: any.
-        archive: of the service, for the past; None: there is none.
+        host, port: where to listen; port 0 selects a free one.
+        names: host names under which a proxy forwards requests; empty and not on loopback accepts any.
+        archive: of the service, for the past; None without one.
         metrics: addresses of services' metrics, for the health view.
-        overlay: Parquet of cell, sector, mu to lay over the map.
-        base_map: raster tiles below the cells; None: there are none.
-        datex: a DATEX II publication to keep up and to serve; None: there is none.
-        most: watchers at once.
+        overlay: Parquet of cell, sector, mu to draw over the map.
+        base_map: raster tiles below the cells; None without one.
+        datex: a DATEX II publication to maintain and to serve; None without one.
+        most: maximum number of watchers.
     """
 
     connection: ZenohSettings
@@ -63,18 +63,18 @@ class PageSettings:
 
 
 def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve until `stop` is set; says `page: ADDRESS` when it listens.
+    """Serve until `stop` is set; print `page: ADDRESS` when it listens.
 
     Raises:
-        InputError: the port is taken.
+        InputError: the port is in use.
     """
     listening = _listen(settings.host, settings.port)
-    world = HeldWorld()
+    world = MapMirror()
     reader = Reader(settings.connection, world)
 
     def state() -> dict[str, Any]:
         away = [region for region in reader.regions() if not region["served"]]
-        return {"router": reader.connected, "served": reader.served, "away": away}
+        return {"router": reader.is_connected, "served": reader.is_served, "away": away}
 
     watchers = Watchers(world, state, settings.most)
     sources = web.Sources(
@@ -85,14 +85,16 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        async with web.pushing(watchers):
+        async with web.push_changes(watchers):
             yield
 
     app = web.application(sources, hosts, lifespan)
     listener = threading.Thread(target=reader.run, args=(stop,), name="reader", daemon=True)
     listener.start()
     if settings.datex is not None:
-        threading.Thread(target=keep_up, args=(settings.datex, world, reader, stop), name="datex", daemon=True).start()
+        threading.Thread(
+            target=update_publication, args=(settings.datex, world, reader, stop), name="datex", daemon=True
+        ).start()
     try:
         asyncio.run(_serve(app, listening, stop, watchers, say))
     finally:
@@ -100,11 +102,11 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         listener.join(LEAVE_S)
 
 
-def keep_up(file: DatexFile, world: HeldWorld, reader: Reader, stop: threading.Event) -> None:
-    """Keep a publication up with the alerts that the page hears, until `stop` is set."""
+def update_publication(file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event) -> None:
+    """Keep a publication current with the received alerts until `stop` is set."""
     seen = -1
     while not stop.wait(GATHER_S):
-        if not reader.served or (world.alerts_heard == seen and not file.is_due):
+        if not reader.is_served or (world.alerts_heard == seen and not file.is_due):
             continue  # where no service speaks nothing ends, and the publication's time says how old it is
         seen = world.alerts_heard
         try:
@@ -134,7 +136,7 @@ async def _serve(
 
 
 class _Server(uvicorn.Server):
-    """Signals are the command's, not the library's."""
+    """Web server that leaves signal handling to the command."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -1,9 +1,8 @@
-"""Server-sent events to browsers: each has its part of the world and a short queue; who is slow is told to reload.
+"""Server-sent events to browsers: each has a view and a short queue; a slow one is told to reload.
 
-tiles    blocks in base64, one a line: what changed of the cells, or all of a tile where the map is zoomed out
-alerts   all stretches that stand
-beat     the time, what is served, what stands: each two seconds
-reload   this watcher missed something: ask anew
+tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out alerts   all standing
+stretches beat     time, served regions, standing alerts: every two seconds reload   this watcher missed something and
+must query again
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any, Final, NamedTuple
 
 from fleet_service.page.records import CELL_LEVEL, TileBlock
-from fleet_service.page.world import HeldWorld, box_of
+from fleet_service.page.world import MapMirror, box_of
 from schemas import grid
 
 FLUSH_S: Final = 0.1  # changes of so long are one event
@@ -28,11 +27,11 @@ _RELOAD: Final = b"event: reload\ndata: {}\n\n"
 
 
 class TooManyWatchersError(Exception):
-    """As many watch as may."""
+    """The maximum number of watchers is reached."""
 
 
 class View(NamedTuple):
-    """What a watcher looks at: west, south, east, north [deg], and the level of its places."""
+    """Part of the map of a watcher: west, south, east, north [deg], and the level of its places."""
 
     box: Box
     level: int
@@ -44,15 +43,15 @@ class _OpenPage(NamedTuple):
 
 
 class Watchers:
-    """All browsers that watch; lives in one event loop.
+    """All watching browsers; used in one event loop.
 
     Args:
-        world: what they watch.
-        state: of services and health, as a beat tells it.
-        most: how many may watch.
+        world: the map.
+        state: returns services and health for a beat.
+        most: maximum number of watchers.
     """
 
-    def __init__(self, world: HeldWorld, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
+    def __init__(self, world: MapMirror, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
         self._world, self._state, self._most = world, state, most
         self._watchers: set[_OpenPage] = set()
         self.reloads = 0
@@ -61,10 +60,10 @@ class Watchers:
         return len(self._watchers)
 
     def enter(self, view: View) -> AsyncIterator[bytes]:
-        """Events for a view, from now on, until the watcher goes.
+        """Yield events for a view from now on, until the watcher leaves.
 
         Raises:
-            TooManyWatchersError: it has to come again later.
+            TooManyWatchersError: the browser must come again later.
         """
         if len(self._watchers) >= self._most:
             raise TooManyWatchersError
@@ -82,7 +81,7 @@ class Watchers:
             self._watchers.discard(watcher)
 
     async def run(self) -> None:
-        """Push what changes, until cancelled."""
+        """Push changes until cancelled."""
         beaten = 0.0
         while True:
             await asyncio.sleep(FLUSH_S)
@@ -95,7 +94,7 @@ class Watchers:
                 self._tell(_event("beat", self._beat()))
 
     def close(self) -> None:
-        """Let all go."""
+        """End all streams."""
         for watcher in list(self._watchers):
             self._put(watcher, None)
 
@@ -103,7 +102,7 @@ class Watchers:
         return {"now": time.time(), "heard": self._world.heard, **self._state()}
 
     def push(self, changes: list[TileBlock]) -> None:
-        """Tell what changed to those who look at it."""
+        """Send changes to the watchers whose view they touch."""
         lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
         for watcher in list(self._watchers):
             found = []

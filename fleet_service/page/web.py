@@ -1,6 +1,6 @@
-"""The routes of the page: files, cells by tile, events, one cell, moments, a route, health.
+"""Routes of the page: files, cells by tile, events, one cell, moments, a route, health.
 
-Every answer forbids what it does not need: no inline script, nothing from elsewhere, no frame around it.
+Every answer forbids inline scripts, foreign content, and framing.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.errors import InputError, WireError
 from schemas.thresholds import NS, REACTION_S
@@ -38,9 +38,9 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 
 
 class Sources(NamedTuple):
-    """What the routes answer from."""
+    """Data sources of the routes."""
 
-    world: HeldWorld
+    world: MapMirror
     reader: Reader
     moments: Moments
     health: ServiceHealth
@@ -51,12 +51,12 @@ class Sources(NamedTuple):
 
 
 def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]) -> ASGIApp:
-    """The routes, with compression and the headers of every answer.
+    """Return the web application, with compression and the headers of every answer.
 
     Args:
-        sources: what is answered from.
-        hosts: names under which the page is asked for; none: any.
-        lifespan: what runs beside it.
+        sources: of the answers.
+        hosts: accepted host names; empty accepts any.
+        lifespan: runs next to it.
     """
     routes, base = Routes(sources), sources.base_map
     paths: dict[str, Callable[[Request], Awaitable[Response]]] = {
@@ -77,14 +77,14 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
 
 
 class Routes:
-    """The answers, a method each."""
+    """Handlers, one method per route."""
 
     def __init__(self, sources: Sources) -> None:
         self._of, self._files = sources, Files(STATIC)
         self.features = FeatureRoutes(sources.world, sources.reader)
 
     async def index(self, request: Request) -> Response:
-        """The page; to a program the landing page of OGC API Features."""
+        """Return the page; to a program, the landing page of OGC API Features."""
         if ogc.wants_json(request):
             return await self.features.landing(request)
         found = self._files.answer("index.html", request, "Accept, Accept-Encoding")
@@ -92,19 +92,19 @@ class Routes:
         return found
 
     async def file(self, request: Request) -> Response:
-        """One of its files, none else."""
+        """Return one of the page's files."""
         found = self._files.answer(request.path_params["name"], request)
         return PlainTextResponse("no such file\n", 404) if found is None else found
 
     async def texts(self, request: Request) -> Response:
-        """Every word of the page, in the language that the browser asks for, where there is a file of it."""
+        """Return the texts of the page in the browser's language, if there is a file for it."""
         name = self._files.texts(request.headers.get("accept-language", ""))
         found = self._files.answer(name, request, "Accept-Encoding, Accept-Language")
         assert found is not None
         return found
 
     async def settings(self, _: Request) -> Response:
-        """Numbers and colours that the page computes with."""
+        """Return the numbers and colours that the page computes with."""
         base = self._of.base_map
         return JSONResponse({
             "colours": colours.as_json(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
@@ -113,7 +113,7 @@ class Routes:
         })  # fmt: skip
 
     async def picture(self, request: Request) -> Response:
-        """A tile of the operator's own file; nothing where it has none."""
+        """Return a tile of the operator's file; empty if there is none."""
         file = self._of.base_map and self._of.base_map.file
         if not file:
             return PlainTextResponse("this page has no tiles of its own; see --base-map\n", 404)
@@ -122,13 +122,13 @@ class Routes:
         return Response(found, 200 if found else 204, headers, media_type=file.kind if found else None)
 
     async def tiles(self, request: Request) -> Response:
-        """Which tiles have cells, now or `at` a moment."""
+        """Return the tiles with cells, now or `at` a moment."""
         at = asked.moment(request)
         found = self._of.world.tiles() if at is None else await run_in_threadpool(self._of.moments.tiles, at)
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
-        """Blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, what neighbours speak for too."""
+        """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed cells too."""
         wanted, level, at = asked.tiles(request), asked.level(request), asked.moment(request)
         if at is not None:
             made = await run_in_threadpool(lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted])
@@ -147,7 +147,7 @@ class Routes:
         )
 
     async def events(self, request: Request) -> Response:
-        """What changes in `bbox` at a `level`, from now on."""
+        """Stream the changes in `bbox` at a `level`, from now on."""
         try:
             stream = self._of.watchers.enter(asked.view(request))
         except TooManyWatchersError:
@@ -156,7 +156,7 @@ class Routes:
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
     async def cell(self, request: Request) -> Response:
-        """One cell and heading, as the service says it now."""
+        """Return one cell and heading as the service knows it now."""
         cell, sector = asked.place(request)
         return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
 
@@ -172,15 +172,15 @@ class Routes:
         return None
 
     async def history(self, request: Request) -> Response:
-        """What was believed of a cell at the kept moments."""
+        """Return the belief about a cell at the stored moments."""
         return JSONResponse(await run_in_threadpool(self._of.moments.history, *asked.place(request)))
 
     async def times(self, _: Request) -> Response:
-        """The moments that are kept."""
+        """Return the stored moments."""
         return JSONResponse(await run_in_threadpool(self._of.moments.times))
 
     async def route(self, request: Request) -> Response:
-        """The grip along `points`."""
+        """Return the grip along `points`."""
         points, text = asked.route(request)
         return JSONResponse(await run_in_threadpool(self._profile, points, text))
 
@@ -193,17 +193,17 @@ class Routes:
         return route.profile(points, pa.concat_tables(replies) if replies else MAP_SCHEMA.empty_table())
 
     async def health(self, _: Request) -> Response:
-        """What services say of themselves, and this page of itself."""
+        """Return the health of services and of this page."""
         services = await run_in_threadpool(self._of.health.services)
         reader, watchers = self._of.reader, self._of.watchers
         return JSONResponse({
             "services": services, "names": reader.names("shard"), "vehicles": len(reader.names("alive")),
-            "regions": reader.regions(), "router": reader.connected,
+            "regions": reader.regions(), "router": reader.is_connected,
             "watchers": len(watchers), "reloads": watchers.reloads,
         })  # fmt: skip
 
     async def situations(self, _: Request) -> Response:
-        """The slippery stretches as a DATEX II publication: a snapshot to pull."""
+        """Return the slippery stretches as a DATEX II publication (snapshot pull)."""
         if self._of.datex is None:
             return PlainTextResponse("this page publishes no situations; see --datex\n", 404)
         if self._of.datex.document is None:
@@ -212,12 +212,12 @@ class Routes:
         return Response(self._of.datex.document, media_type="application/xml", headers={"Cache-Control": "no-store"})
 
     async def overlay(self, _: Request) -> Response:
-        """The other map, or null."""
+        """Return the overlay map, or null."""
         return JSONResponse(await run_in_threadpool(overlay.cells, self._of.overlay))
 
 
 def with_errors(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
-    """An answer that says what was wrong with a question, and how to mend it."""
+    """Wrap a handler so that a bad request gets an answer with the problem and the fix."""
 
     async def wrapped(request: Request) -> Response:
         try:
@@ -229,7 +229,7 @@ def with_errors(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[R
 
 
 class Guarded:
-    """Headers of every answer; another host's name is refused, so that no page from elsewhere reads this one by DNS."""
+    """Adds the headers of every answer, and refuses foreign host names against DNS rebinding."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
         self._app, self._hosts = app, hosts
@@ -245,7 +245,7 @@ class Guarded:
         ]  # fmt: skip
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on, with the headers."""
+        """Forward a request and add the headers."""
 
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -267,14 +267,14 @@ def _host(scope: Scope) -> str:
 
 
 def origin(address: str) -> str:
-    """Scheme, host and port of an address; what lies on this host itself has none."""
+    """Return scheme, host and port of an address; empty for this host."""
     parts = urlsplit(address)
     return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""
 
 
 @contextlib.asynccontextmanager
-async def pushing(watchers: Watchers) -> AsyncIterator[None]:
-    """Push changes while the block runs; then let all go."""
+async def push_changes(watchers: Watchers) -> AsyncIterator[None]:
+    """Push changes while the block runs; then end all streams."""
     import asyncio
 
     task = asyncio.create_task(watchers.run())

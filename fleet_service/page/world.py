@@ -1,4 +1,4 @@
-"""What the page knows of now: tiles as records, alerts as stretches, which regions are served. No network in it."""
+"""Mirror of the live map: tiles as records, alerts as stretches, served regions. No network."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _EMPTY: Final = np.zeros(0, records.RECORD)
 
 
 @dataclass
-class HeldTile:
-    """A tile: its records, how often they changed, when they were heard [s since 1970], blocks made of them."""
+class MirroredTile:
+    """Tile: its records, number of changes, time of receipt [s since 1970], cached blocks."""
 
     cells: Records = field(default_factory=lambda: _EMPTY)
     version: int = 0
@@ -34,12 +34,12 @@ class _Before(NamedTuple):
     version: int
 
 
-class HeldWorld:
-    """All tiles and alerts that were heard of; any thread may call."""
+class MapMirror:
+    """All received tiles and alerts; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._tiles: dict[int, HeldTile] = {}
+        self._tiles: dict[int, MirroredTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
         self._stretches = Stretches()
         self._alerts_changed = False
@@ -47,11 +47,11 @@ class HeldWorld:
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
-        """A tile is so now."""
+        """Replace a tile."""
         cells = records.of_table(table)
         with self._lock:
             self.heard = now
-            held = self._tiles.setdefault(tile, HeldTile())
+            held = self._tiles.setdefault(tile, MirroredTile())
             held.heard = now
             if np.array_equal(held.cells, cells):
                 return
@@ -59,67 +59,67 @@ class HeldWorld:
             held.cells, held.version, held.made = cells, held.version + 1, {}
 
     def take_alert(self, alert: Alert, now: float) -> None:
-        """An alert of a cell was raised, repeated or cleared."""
+        """Record that an alert of a cell was raised, repeated or cleared."""
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
             self._stretches.take(alert)
 
     def take_standing(self, standing: Iterable[Alert], served: Callable[[int], bool], now: float) -> None:
-        """These alerts stand; of the cells that are served no others do."""
+        """Replace the standing alerts of all served cells."""
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
             self._stretches.take_all(standing, lambda alert: served(alert.cell))
 
     def changes(self) -> list[TileBlock]:
-        """What has changed of each tile since this was asked last."""
+        """Return the changes of each tile since the last call."""
         with self._lock:
             before, self._before = self._before, {}
             found = []
             for tile, (cells, version) in before.items():
                 held = self._tiles[tile]
-                delta = records.changed(cells, held.cells)
+                delta = records.changed_records(cells, held.cells)
                 block = TileBlock(tile, records.CELL_LEVEL, held.version, version, held.heard, delta)
                 found.append(block)
             return found
 
     def alerts_changed(self) -> bool:
-        """Whether stretches changed since this was asked last."""
+        """Return True if stretches changed since the last call."""
         with self._lock:
             found, self._alerts_changed = bool(self._stretches.changes()) or self._alerts_changed, False
             return found
 
     def stretches(self) -> list[StretchAlert]:
-        """The stretches that stand, with all that was said until now."""
+        """Return the standing stretches with everything received until now."""
         with self._lock:
             self._alerts_changed |= bool(self._stretches.changes())
             return self._stretches.standing
 
     def standing(self) -> list[dict[str, Any]]:
-        """The stretches that stand, newest first."""
+        """Return the standing stretches, newest first."""
         with self._lock:
             return [one.values() for one in sorted(self._stretches.standing, key=lambda one: -one.since)]
 
     def tiles(self) -> list[int]:
-        """All tiles that have cells."""
+        """Return all tiles that have cells."""
         with self._lock:
             return [tile for tile, held in self._tiles.items() if len(held.cells)]
 
     def oldest(self, before: float, most: int) -> list[int]:
-        """Tiles that were not heard of since `before` [s since 1970], those first that wait longest."""
+        """Return tiles not received since `before` [s since 1970], oldest first."""
         with self._lock:
             late = [(held.heard, tile) for tile, held in self._tiles.items() if held.heard < before and len(held.cells)]
         return [tile for _, tile in sorted(late)[:most]]
 
     def touch(self, tile: int, now: float) -> None:
-        """A tile was asked for and is as it was, or nobody answers for it."""
+        """Record that a tile was queried and is unchanged, or that no service answers for it."""
         with self._lock:
             if tile in self._tiles:
                 self._tiles[tile].heard = now
 
     def encoded(self, tile: int, level: int) -> bytes:
-        """All of a tile at a level; empty where nothing is known of it."""
+        """Return a complete tile at a level; empty if it is unknown."""
         with self._lock:
             held = self._tiles.get(tile)
             if held is None or not held.version:
@@ -129,22 +129,22 @@ class HeldWorld:
             return held.made[level]
 
     def version(self, tile: int) -> int:
-        """How often a tile has changed; 0: nothing is known of it."""
+        """Return how often a tile has changed; 0 if it is unknown."""
         with self._lock:
             return self._tiles[tile].version if tile in self._tiles else 0
 
     def rows(self, tiles: Iterable[int]) -> int:
-        """How many records tiles have."""
+        """Return the number of records of tiles."""
         with self._lock:
             return sum(len(self._tiles[tile].cells) for tile in tiles if tile in self._tiles)
 
 
 def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
-    """All of a tile at a level, as bytes."""
-    seen = cells if level == records.CELL_LEVEL else records.worst(cells, level)
+    """Return a complete tile at a level as bytes."""
+    seen = cells if level == records.CELL_LEVEL else records.aggregate_worst(cells, level)
     return TileBlock(tile, level, version, 0, moment, seen).encoded()
 
 
 def box_of(tile: int, zoom: int = grid.TILE_ZOOM) -> list[float]:
-    """West, south, east, north [deg]."""
+    """Return west, south, east, north [deg]."""
     return [float(side) for side in grid.bounds(tile, zoom)]

@@ -1,1 +1,1 @@
-"""From the archive back to what a service knows: restarts, checkpoints and past moments."""
+"""Reconstruction of a service's state from the archive: restarts, checkpoints and past moments."""

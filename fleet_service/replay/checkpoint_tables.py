@@ -1,7 +1,6 @@
-"""A fusion as Arrow tables and back, exactly: what a restart or a look at the past can begin from instead of a replay.
+"""Lossless conversion of a fusion to Arrow tables and back, so that a restart needs no complete replay.
 
-The archive decides where the tables lie and which rows of the log are younger (`received_at`); nothing is read or
-written here.
+The caller stores the tables and decides which rows of the log are newer (`received_at`); this module does no I/O.
 """
 
 from __future__ import annotations
@@ -21,23 +20,23 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Everything that a fusion holds, one table per name; columns of unequal length (rows of several numbers) are kept
-    as one list each."""
+    """Return the complete state of a fusion, one table per name; columns of different length are stored as one list
+    each."""
     out = {}
     for name, columns in image_of(fusion).items():
-        arrays = [_listed(column) for column in columns.values()]
+        arrays = [_to_list(column) for column in columns.values()]
         fields = [pa.field(key, a.type) for key, a in zip(columns, arrays, strict=True)]
         out[name] = pa.Table.from_arrays(arrays, schema=pa.schema(fields, {_KEY: VERSION.encode()}))
     return out
 
 
-def _listed(column: NDArray[Any]) -> pa.Array[Any]:
-    """One list that holds a column."""
+def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
+    """Return one list that holds a column."""
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
 
-def _unlisted(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
-    """The column that a list holds; a view, where Arrow's own way to an array looks for another library first."""
+def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
+    """Return the column that a list holds; a view if Arrow's own conversion would import another library."""
     whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()  # which copies what is one piece
     values = cast("pa.LargeListArray[Any]", whole).flatten()
     if pa.types.is_boolean(values.type):
@@ -47,15 +46,15 @@ def _unlisted(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """The fusion that was; it goes on as the one that `tables_of` was given would have.
+    """Restore a fusion; it continues exactly like the one passed to `tables_of`.
 
     Raises:
-        InputError: tables of another version, or not all of them.
+        InputError: tables are of another version, or incomplete.
     """
     versions = {(table.schema.metadata or {}).get(_KEY, b"").decode() for table in tables.values()}
     if versions != {VERSION}:
         raise InputError("checkpoint", f"is not of version {VERSION}", "replay the archive instead")
-    image = {name: {key: _unlisted(table[key]) for key in table.column_names} for name, table in tables.items()}
+    image = {name: {key: _from_list(table[key]) for key in table.column_names} for name, table in tables.items()}
     try:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:

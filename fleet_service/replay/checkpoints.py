@@ -1,12 +1,12 @@
-"""Checkpoints: what a service knew when everything up to a segment was on disk; a restart replays the rest.
+"""Checkpoints: state of a service when everything up to a segment was on disk; a restart replays the rest.
 
-    checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that is in it
-    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it knows
+    checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that it includes
+    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it includes
 
-A folder appears when it is whole. Compiled code follows the numbers in a checkpoint without asking: nothing of it is
-used before all digests were found right, and one with which a service died several times before it had run for a moment
-is not tried again. The log decides: a checkpoint that is missing, damaged or of another version only costs the time of
-a replay.
+A folder appears when it is complete. Compiled code follows the numbers in a checkpoint without checks, so nothing of it
+is used before all digests are verified. A checkpoint with which a service died several times shortly after the start is
+not tried again. The log is the authority: a checkpoint that is missing, damaged or of another version only costs the
+time of a replay.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import pyarrow as pa
 from fleet_service.archive.layout import CHECKPOINTS, Cut
 from fleet_service.archive.version import KEY, VERSION
 from schemas.errors import InputError
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
 TRIES: Final = 4  # a service that is killed again and again, by whatever, begins from the log at last
@@ -35,12 +35,12 @@ _CHUNK: Final = 1 << 22
 
 
 class Taken(NamedTuple):
-    """What is to be kept.
+    """Content of a checkpoint.
 
     Attributes:
         tables: by name.
-        cut: everything up to this segment is in them.
-        weather: names of the files of weather that are.
+        cut: the last segment that they include.
+        weather: names of the weather files that they include.
     """
 
     tables: dict[str, pa.Table]
@@ -49,22 +49,22 @@ class Taken(NamedTuple):
 
 
 def save(root: Path, taken: Taken) -> Path:
-    """Keep a checkpoint, and the one before it.
+    """Store a checkpoint, and keep the one before it.
 
     Raises:
-        OSError: the disk is full; the checkpoints before stay.
+        OSError: the disk is full; earlier checkpoints stay.
     """
     folder = root / CHECKPOINTS
     draft, path = folder / _DRAFT, folder / f"{taken.cut.epoch:010d}-{taken.cut.number:012d}"
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     for name, table in taken.tables.items():
-        with written(draft / f"{name}.arrow", named=False) as file:
+        with open_durably(draft / f"{name}.arrow", named=False) as file:
             metadata = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
             with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
                 writer.write_table(table.replace_schema_metadata(metadata))
     content = {"files": {file.name: digest(file) for file in sorted(draft.iterdir())}, "weather": list(taken.weather)}
-    with written(draft / _MANIFEST, named=False) as file:
+    with open_durably(draft / _MANIFEST, named=False) as file:
         file.write(json.dumps({"content": content, "digest": _digest_of(content)}).encode())
     sync_directory(draft)
     shutil.rmtree(path, ignore_errors=True)
@@ -77,12 +77,12 @@ def save(root: Path, taken: Taken) -> Path:
 
 
 def newest(root: Path) -> list[Path]:
-    """Checkpoints, newest first."""
+    """Return the checkpoints, newest first."""
     return _folders(root)[::-1]
 
 
 def load(path: Path) -> Taken:
-    """A checkpoint, whole and as it was written.
+    """Return a checkpoint after verification.
 
     Raises:
         InputError: it is damaged, of a former form, or a service died with it too often.
@@ -107,19 +107,19 @@ def load(path: Path) -> Taken:
 
 
 def begin(path: Path) -> None:
-    """Note that a service begins from a checkpoint; `survived` takes it back."""
+    """Record that a service begins from a checkpoint; `mark_survived` removes the record."""
     with suppress(OSError):  # a full disk does not keep a service from its start
         (path / _TRIED).write_text(str(_tries(path) + 1))
 
 
-def survived(root: Path) -> None:
-    """The service runs well with what it began from."""
+def mark_survived(root: Path) -> None:
+    """Record that the service runs well with its checkpoint."""
     for path in _folders(root):
         (path / _TRIED).unlink(missing_ok=True)
 
 
 def digest(path: Path) -> str:
-    """Hash of a file; of none, where it is gone."""
+    """Return the hash of a file; that of nothing if it does not exist."""
     state = blake2b(digest_size=16)
     with suppress(FileNotFoundError), path.open("rb") as file:
         while chunk := file.read(_CHUNK):

@@ -1,4 +1,4 @@
-"""From the archive back to what a service knows, or knew: which batches it holds, and what it believes."""
+"""Replay of an archive: the batches that a service holds and the beliefs of its fusion, now or at a past moment."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, reading, segments, witnesses
-from fleet_service.archive.between import Between, groups, those
-from fleet_service.archive.load import Damaged, pass_over
+from fleet_service.archive.between import ValueRange, filter_table, matching_row_groups
+from fleet_service.archive.load import Damaged, skip_damaged
 from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
 from fleet_service.ingest.dedup import SequenceTrackers
-from fleet_service.ingest.weather import archived
+from fleet_service.ingest.weather import archived_reports
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
@@ -45,7 +45,7 @@ MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's posit
 
 
 class Begin(NamedTuple):
-    """Where an archive begins to matter: the first day of measurement, and the place in the log after which it does."""
+    """Where a replay begins: the first day of measurement, and the position in the log."""
 
     day: int | None = None
     after: layout.Cut | None = None
@@ -53,15 +53,15 @@ class Begin(NamedTuple):
 
 
 def restore_streams(
-    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = pass_over  # noqa: B008 immutable
+    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = skip_damaged  # noqa: B008 immutable
 ) -> None:  # fmt: skip
-    """Note every archived batch as admitted, file by file.
+    """Record every archived batch as admitted, file by file.
 
     Args:
         root: of the archive.
-        streams: those that are noted already; brought up to date.
-        begin: where the archive begins to matter.
-        damaged: is told of a damaged file.
+        streams: recorded batches, which are updated.
+        begin: where the replay begins.
+        damaged: called with a damaged file.
     """
     for kind, first in layout.FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
@@ -73,7 +73,7 @@ def restore_streams(
 
 
 def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Pseudonyms (n,) as numbers."""
+    """Return pseudonyms (n,) as numbers."""
     chunked = pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
     coded = chunked.combine_chunks().dictionary_encode()
     if not len(coded):
@@ -83,11 +83,11 @@ def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
 
 
 class Since(NamedTuple):
-    """Which rows a replay takes: from a place in the log and a day on, received until `until` [ns], near `box` [deg].
+    """Selection of a replay: from a position in the log and a day on, received until `until` [ns], near `box` [deg].
 
-    Cells do not depend on each other once weights are known, so that those well inside a box come out as in a whole
-    replay. Of compacted files that reach over the place in the log, the batches that `known` has are left out. More
-    rows than `most` are an error.
+    Cells do not depend on each other once weights are known, so cells well inside a box get the same belief as in a
+    complete replay. Of compacted files that extend beyond the position, the batches in `known` are left out. More rows
+    than `most` are an error.
     """
 
     begin: Begin = Begin()
@@ -97,19 +97,19 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """The box with twice the margin, in which the zones lie whose files hold the rows."""
+        """Return the box with twice the margin; zones that touch it have the files with the rows."""
         if self.box is None:
             return None
         west, south, east, north = self.box
         return west - 2 * MARGIN_DEG, south - 2 * MARGIN_DEG, east + 2 * MARGIN_DEG, north + 2 * MARGIN_DEG
 
-    def where(self) -> list[Between] | None:
-        """The rows as ranges, or None for all."""
-        found = [] if self.until is None else [Between("received_at", most=self.until // US_STEP)]
+    def where(self) -> list[ValueRange] | None:
+        """Return the row filters; None for all rows."""
+        found = [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
         if self.box is not None:
             west, south, east, north = self.box
-            found.append(Between("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
-            found.append(Between("latitude", south - MARGIN_DEG, north + MARGIN_DEG))
+            found.append(ValueRange("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
+            found.append(ValueRange("latitude", south - MARGIN_DEG, north + MARGIN_DEG))
         return found or None
 
 
@@ -117,37 +117,38 @@ Heard = Callable[[Observations], None]
 
 
 def nobody(_: Observations) -> None:
-    """Listens to no observation."""
+    """Ignore observations."""
 
 
 def too_much() -> InputError:
-    """A question about the past that asks for too many rows."""
+    """Return the error for a past map that needs too many rows."""
     return InputError("at", "would have to read too much of the archive", "narrow bbox")
 
 
-def weathered(root: Path, lateness_s: float, until: int) -> Fusion:
-    """A fusion that knows the weather received until a moment [ns], and no observation yet.
+def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
+    """Return a fusion with the weather received until a moment [ns], and no observation yet.
 
     Raises:
         OSError: the archive cannot be read.
     """
     fusion = Fusion(lateness_s)
-    fusion.update_weather(archived(root, received_until=until))
+    fusion.update_weather(archived_reports(root, received_until=until))
     return fusion
 
 
-def past(
+def past_fusion(
     root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:  # fmt: skip
-    """The fusion of a service that had received everything until a moment [ns], near a box [deg]; what it fuses is told
-    to what `listener` makes for it.
+    """Return the fusion of a service that had received everything until a moment [ns], near a box [deg].
+
+    The object that `listener` makes for it is called with the fused observations.
 
     Raises:
         InputError: there are more rows than `most`.
         OSError: the archive cannot be read.
     """
-    fusion = weathered(root, lateness_s, until)
+    fusion = fusion_with_weather(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
     wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
@@ -156,9 +157,9 @@ def past(
 
 
 def first_day(root: Path) -> int | None:
-    """The first day that matters to a service: layout.MAP_DAYS before the last that the archive has rows of.
+    """Return the first day that matters to a service: layout.MAP_DAYS before the last day with rows.
 
-    Neither batches that are older come again (ServiceConfig.oldest_s), nor does anything of them show in the map.
+    Older batches are not sent again (ServiceConfig.oldest_s), and they do not show in the map.
     """
     found = [layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])]
     return max(found) - layout.MAP_DAYS if found else None
@@ -168,19 +169,19 @@ def replay(
     root: Path,
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
     heard: Heard = nobody,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
+    """Replay the archive into `fusion` in order of time, with the weights that were used; yield once per epoch.
 
-    A day is read at a time, a large one in parts, so that memory does not grow with the archive.
+    One day is read at a time, a large one in parts, so that memory does not grow with the archive.
 
     Args:
         root: of the archive.
         fusion: a new one, or one that holds everything before `since`.
-        since: the rows wanted.
-        damaged: is told of a damaged file.
-        heard: is told of what was fused.
+        since: selection of rows.
+        damaged: called with a damaged file.
+        heard: called with fused observations.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -198,12 +199,12 @@ def replay(
             rows = {name: column[new] for name, column in rows.items()}
         o, before = observations_of(rows, witnesses.numbers_of(known, rows["vehicle"])), _before(rows)
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
-        o, before = _joined([*waiting, (o, before)])
+        o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
-        waiting = [_taken(o, before, epoch > end)]
-        yield from _fused(fusion, *_taken(o, before, epoch <= end), heard)
+        waiting = [_select_rows(o, before, epoch > end)]
+        yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), heard)
     if waiting:
-        yield from _fused(fusion, *waiting[0], heard)
+        yield from _fuse_epochs(fusion, *waiting[0], heard)
 
 
 def _before(rows: segments.Rows) -> Before:
@@ -211,8 +212,8 @@ def _before(rows: segments.Rows) -> Before:
     return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 
-def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
-    """Parts one after the other."""
+def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
+    """Return parts joined in order."""
     of = Observations(
         **{f.name: np.concatenate([getattr(o, f.name) for o, _ in parts]) for f in fields(Observations)}
     )  # fmt: skip
@@ -223,30 +224,30 @@ def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Bef
     )  # fmt: skip
 
 
-def _taken(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
-    """Some of the rows."""
+def _select_rows(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
+    """Return a selection of rows."""
     return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows])
 
 
-def _fused(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
-    """Fuse rows epoch by epoch of when they were fused."""
+def _fuse_epochs(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
+    """Fuse rows epoch by epoch, by the time at which they were fused originally."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
-    o, before = _taken(o, before, order)
+    o, before = _select_rows(o, before, order)
     borders = np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1
     for start, stop in pairwise([0, *borders.tolist(), len(order)]):
         if start < stop:
-            taken, used = _taken(o, before, slice(start, stop))
+            taken, used = _select_rows(o, before, slice(start, stop))
             updated = fusion.update(taken, used)
             heard(taken)
             yield updated
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
-    """The rows of a listing, CHUNK_ROWS at a time or so, each chunk later than the one before and cut between epochs.
+    """Yield the rows of a listing in chunks of about CHUNK_ROWS, each later than the one before and cut between epochs.
 
-    A file is read once, or once for each part of a day that has more than PART_ROWS; vehicles are numbers. Where the
-    rows are not bounded, a part is read while the one before is used.
+    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are numbers. If the number of rows
+    is not bounded, a part is read while the one before is used.
 
     Raises:
         InputError: there are more than `most` rows.
@@ -258,7 +259,8 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
 
 
 def _ahead(parts: Iterator[_Held]) -> Iterator[_Held]:
-    """The same, each made in a thread while the one before is used: reading takes a third of a start's time."""
+    """Yield the same parts, each made in a thread while the one before is used: reading is a third of a start's
+    time."""
     with ThreadPoolExecutor(1, "reads ahead") as thread:
         coming = thread.submit(next, parts, None)
         while (part := coming.result()) is not None:
@@ -267,7 +269,7 @@ def _ahead(parts: Iterator[_Held]) -> Iterator[_Held]:
 
 
 def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
-    """The rows of a listing, PART_ROWS at a time or so."""
+    """Yield the rows of a listing in parts of about PART_ROWS."""
     name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]
     inbox = pa.concat_tables(fresh).sort_by(name) if fresh else None
@@ -281,11 +283,11 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
         mine = None if inbox is None else inbox.slice(begin, end - begin)
         rows = end - begin + sum(_rows_of(path) for path in files[day])
         for low, high in pairwise(_borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)):
-            within = [Between(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
+            within = [ValueRange(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
             borders = _borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
             held = _Held(name, borders)
             if mine is not None:
-                held.take(those(mine, within))
+                held.take(filter_table(mine, within))
                 held.keep()
             for path in files[day]:
                 if listing.load_groups(path, within, held.take):
@@ -299,7 +301,7 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
 
 
 class _Held:
-    """Rows that wait, by the chunk that they belong to, compressed to a third of their memory.
+    """Rows that wait, by chunk, compressed to a third of their memory.
 
     Args:
         name: of the column of times.
@@ -313,10 +315,10 @@ class _Held:
         self.rows = 0
 
     def take(self, table: pa.Table) -> None:
-        """Put rows to those that are kept or forgotten next."""
+        """Add rows to those that `keep` or `forget` decides on."""
         time = segments.nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
-        table, places = _numbered(table).take(order), np.searchsorted(time[order], self._borders).tolist()
+        table, places = _with_numbers(table).take(order), np.searchsorted(time[order], self._borders).tolist()
         for k, (start, stop) in enumerate(pairwise(places)):
             if stop > start:
                 sink = pa.BufferOutputStream()
@@ -325,18 +327,18 @@ class _Held:
                 self._taken.append((k, stop - start, sink.getvalue()))
 
     def keep(self) -> None:
-        """Keep what was taken."""
+        """Keep the added rows."""
         for k, rows, packed in self._taken:
             self._kept[k].append(packed)
             self.rows += rows
         self._taken.clear()
 
     def forget(self) -> None:
-        """Forget what was taken: its file is damaged."""
+        """Drop the added rows: their file is damaged."""
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:
-        """The rows of each chunk that has any, in turn; once."""
+        """Yield the rows of each chunk that has any, in order; call it once."""
         for k, packed in enumerate(self._kept):
             self._kept[k] = []
             if packed:
@@ -344,27 +346,28 @@ class _Held:
 
 
 def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Times from `low` to `high` [ns], between epochs, with `most` rows between two if they are even in time."""
+    """Return times from `low` to `high` [ns], between epochs, with about `most` rows between two if rows are even in
+    time."""
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))
     return [low + int(part) * EPOCH_NS for part in np.linspace(0, epochs, parts + 1)]
 
 
-def _numbered(table: pa.Table) -> pa.Table:
-    """With numbers for pseudonyms: less than half the memory."""
+def _with_numbers(table: pa.Table) -> pa.Table:
+    """Return a table with numbers for pseudonyms, which takes less than half the memory."""
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(numbers(table["vehicle"])))
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
-    """Rows that `past` would have to read at the most, by footers alone; counts no further than beyond `most`.
+    """Return the maximum number of rows that `past` would read, by footers alone; counting stops beyond `most`.
 
     Raises:
         OSError: the archive cannot be read.
     """
     last = until // layout.DAY_NS + 1
     found = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION)) // SEGMENT_ROW_BYTES
-    for path in layout.compacted(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
+    for path in layout.compacted_files(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
         if found > most:
             break
         zone = grid.bounds(np.array([layout.partition_of(path).zone]), grid.ZONE_ZOOM)
@@ -374,10 +377,10 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
 
 
 def _rows_of(path: Path, box: Box | None = None) -> int:
-    """Rows of a file by its footer, of row groups near a box; 0 if it has none that can be read, or is gone."""
+    """Return the rows of a file by its footer, of row groups near a box; 0 if it cannot be read or does not exist."""
     try:
         footer = pq.read_metadata(path)
     except (OSError, pa.ArrowInvalid):
         return 0
     near = Since(box=box).where() or []
-    return sum(int(footer.row_group(group).num_rows) for group in groups(footer, near))
+    return sum(int(footer.row_group(group).num_rows) for group in matching_row_groups(footer, near))

@@ -1,4 +1,4 @@
-"""Where a restart begins: the newest checkpoint that can be read, or nothing; the log tells the rest."""
+"""Begin of a restart: the newest readable checkpoint, or nothing; the log supplies the rest."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ ABOVE: Final = "streams_above"
 
 
 class Restart(NamedTuple):
-    """What a service begins with.
+    """Initial state of a service.
 
     Attributes:
         fusion: of the checkpoint, or a new one.
-        streams: batches that were admitted then.
+        streams: batches admitted then.
         standing: alerts that stood then.
-        cut: everything up to this segment is in it; None: nothing is.
-        weather: names of the files of weather that are in it.
+        cut: the last segment it includes; None for none.
+        weather: names of the weather files it includes.
         refused: checkpoints that could not be read: damaged, or of another version.
-        beside: other tables of the checkpoint that were asked for, as columns.
+        beside: additional tables of the checkpoint, as columns.
     """
 
     fusion: Fusion
@@ -47,8 +47,9 @@ class Restart(NamedTuple):
     beside: dict[str, dict[str, IntArray]]
 
 
-def restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
-    """Begin from the archive in a folder; `beside`: tables that the service put to those of `image_of`."""
+def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
+    """Begin from the archive in a folder; `beside` names additional tables that the service stored with those of
+    `image_of`."""
     refused = 0
     for path in checkpoints.newest(root):
         try:
@@ -71,7 +72,7 @@ def restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restar
 
 
 def image_of(fusion: Fusion, standing: list[Alert], streams: SequenceTrackers) -> dict[str, pa.Table]:
-    """Tables of a checkpoint: what `restart` finds again."""
+    """Return the tables of a checkpoint from which `restart` restores the state."""
     columns, above = streams.columns()
     return tables_of(fusion) | {
         ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing]),

@@ -1,1 +1,1 @@
-"""The map out: cells, tiles, queries, alerts."""
+"""Output of the map: cells, tiles, queries, alerts."""

@@ -1,4 +1,5 @@
-"""Low-grip alerts: raised on firm belief of at least two vehicles, cleared with hysteresis and a reason. Pure."""
+"""Low-grip alerts: raised when at least two vehicles support a firm belief, cleared with hysteresis and a reason.
+Pure."""
 
 from __future__ import annotations
 
@@ -33,10 +34,10 @@ QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long m
 
 
 class Alerts:
-    """Which cells are under an alert.
+    """Set of cells under alert.
 
     Args:
-        fusion: whose cells they are.
+        fusion: owner of the cells.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -44,32 +45,33 @@ class Alerts:
         self._standing: dict[int, Alert] = {}
 
     @property
-    def raised(self) -> set[int]:
-        """Slots under an alert."""
+    def slots(self) -> set[int]:
+        """Return the slots under alert."""
         return set(self._standing)
 
     @property
-    def standing(self) -> list[Alert]:
-        """The alerts that were raised and not cleared, as they were raised."""
+    def standing_alerts(self) -> list[Alert]:
+        """Return the standing alerts as they were raised."""
         return list(self._standing.values())
 
     def resume(self, standing: Sequence[Alert]) -> None:
-        """Go on with alerts that stood before a restart."""
+        """Continue with alerts that stood before a restart."""
         slots = self._fusion.slots_of(
             np.array([a.cell for a in standing], np.int64), np.array([a.sector for a in standing], np.int64)
         )
         self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
 
-    def renumbered(self, place: IntArray) -> None:
-        """Slots of the fusion, of which none with an alert is gone, have other numbers now: `place` of each."""
+    def renumber(self, place: IntArray) -> None:
+        """Update slots after the fusion renumbered them; `place` is the new number of each. No slot under alert is
+        removed."""
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
-    def updated(self, slots: IntArray) -> list[Alert]:
-        """Alerts that the cells just updated raise or clear."""
+    def update(self, slots: IntArray) -> list[Alert]:
+        """Return the alerts that updated cells raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         likely = np.flatnonzero((slippery > LIKELY) & ~standing)
-        likely = likely[self._corroborated(slots[likely], ICE, time[likely])]
+        likely = likely[self._have_witnesses(slots[likely], ICE, time[likely])]
         likely = likely[self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
         out = []
@@ -80,11 +82,11 @@ class Alerts:
                 self._standing[slot] = self._alert(slot, when, True, reason)
                 out.append(self._standing[slot])
         gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing)
-        gripping = gripping[self._corroborated(slots[gripping], GRIP, time[gripping])]
+        gripping = gripping[self._have_witnesses(slots[gripping], GRIP, time[gripping])]
         reason = "later visits found grip"
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
-    def _corroborated(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
+    def _have_witnesses(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
         """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,) [ns].
 
         The least number of them, and one more for each opposite source that is newer than the second newest of them
@@ -97,8 +99,8 @@ class Alerts:
         needed = np.minimum(least + opposed, most)
         return np.asarray((found > 0).sum(axis=1) >= needed)
 
-    def faded(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared until `now` [ns]: less likely than not, and not confirmed for QUIET_NS."""
+    def expire(self, now: int) -> list[Alert]:
+        """Return the alerts that expire by `now` [ns]: less likely than not, and not confirmed for QUIET_NS."""
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten

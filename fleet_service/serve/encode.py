@@ -1,4 +1,4 @@
-"""A view of cells as Arrow, GeoJSON or JSON. Pure."""
+"""Encoding of a view of cells as Arrow, GeoJSON or JSON. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
-from fleet_service.serve.view import LOWER, UPPER, CellView, measured, view
+from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured, view
 from schemas import grid, tables
 from schemas.numeric import IntArray
 from schemas.query import Format
@@ -24,11 +24,11 @@ _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: t
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
-    """Cells in the schema of the map; their age is that at `now` [ns]. A bound has no mu."""
+    """Return cells in the schema of the map, with their age at `now` [ns]. A bound has no mu."""
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
-    basis = np.where(cells.imputed, _BORROWED, measured(lower, upper, cells.values))
+    basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values))
     columns: dict[str, Any] = {
         "cell": cells.cell, "sector": cells.sector, "mu": pa.array(middle, mask=basis == _BOUND), "mu_lower": lower,
         "mu_upper": upper, "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
@@ -43,12 +43,12 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
+    """Return the cells of `slots` as believed at `now` [ns], in the schema of the map."""
     return pa.Table.from_batches([batch_of(view(fusion, slots, now), now)])
 
 
 def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
-    """The cells of a tile in one of the three forms."""
+    """Return the cells of a tile in one of the three forms."""
     if form is Format.ARROW:
         return arrow_stream(cells)
     rows = _plain(cells)
@@ -63,17 +63,17 @@ def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
 
 
 def _joined(rows: Iterable[dict[str, Any]]) -> str:
-    """Rows as JSON, each on its own: one call for thousands keeps the interpreter from all others meanwhile."""
+    """Encode rows as JSON one by one; a single call for thousands would hold the interpreter lock too long."""
     return ", ".join(json.dumps(row, allow_nan=False) for row in rows)
 
 
 def arrow_stream(cells: pa.RecordBatch) -> bytes:
-    """Cells as an Arrow stream, of one batch."""
+    """Return cells as an Arrow stream of one batch."""
     return b"".join([_SCHEMA, cells.serialize(), _END])
 
 
 def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
-    """Rows with times as ISO 8601 text; single-precision numbers without the digits they do not have."""
+    """Return rows with times as ISO 8601 text and single-precision numbers without surplus digits."""
     columns: dict[str, list[Any]] = {}
     for f in table.schema:
         if pa.types.is_timestamp(f.type):

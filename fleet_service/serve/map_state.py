@@ -1,4 +1,4 @@
-"""The map: the cells of each tile, and which tiles changed. Pure."""
+"""The map: the cells of each tile, and the tiles that changed. Pure."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ PARTS: Final = 32  # of a tile's index before they are joined: each costs as muc
 
 
 class MapState:
-    """The tiles of a fusion.
+    """Tiles of a fusion.
 
     Args:
-        fusion: whose cells they are.
+        fusion: owner of the cells.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -32,8 +32,8 @@ class MapState:
         self._changed: dict[int, int] = {}
         self.change = 0  # how often anything changed
 
-    def changed(self, slots: IntArray) -> None:
-        """Note cells that were updated."""
+    def mark_changed(self, slots: IntArray) -> None:
+        """Record cells that were updated."""
         self._index()
         self.change += 1
         tiles = distinct(tile_of(self.fusion, slots)).tolist()
@@ -41,21 +41,21 @@ class MapState:
         self._changed.update(dict.fromkeys(tiles, self.change))
 
     def changed_at(self, tile: int) -> int:
-        """Value of `change` when the tile changed the last time; 0 if it did not."""
+        """Return the value of `change` when the tile last changed; 0 if it never did."""
         return self._changed.get(tile, 0)
 
     def take_dirty(self) -> list[int]:
-        """Tiles that changed since the last call."""
+        """Return the tiles that changed since the last call."""
         dirty, self._dirty = sorted(self._dirty), set()
         return dirty
 
     def tiles(self) -> list[int]:
-        """All tiles with a cell."""
+        """Return all tiles that have a cell."""
         self._index()
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Slots of a tile, in the order in which they were first visited."""
+        """Return the slots of a tile, in the order of their first visit."""
         self._index()
         if tile not in self._slots:
             return np.zeros(0, np.int64)
@@ -64,11 +64,11 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """How many slots a tile has."""
+        """Return the number of slots of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
-    def renumbered(self) -> None:
-        """Slots of the fusion have other numbers now."""
+    def rebuild(self) -> None:
+        """Rebuild the tiles after the fusion renumbered its slots."""
         self._slots.clear()
         self._indexed = 0
 
@@ -88,5 +88,5 @@ class MapState:
 
 
 def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Tile of each slot."""
+    """Return the tile of each slot."""
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)

@@ -1,10 +1,9 @@
-"""Imputation: beliefs of cells that nobody visited, from visited neighbours: wider, and marked as borrowed. Pure.
+"""Imputation of unvisited cells from visited neighbours: wider, and marked as borrowed. Pure.
 
-A neighbour's road may be another road (the other side of a shadow, a bridge): half of the imputed belief is the prior.
-Along a route, where it is known what lies behind what, a cell borrows from the nearest visited ones before and behind,
-up to REACH cells away, with a share of the prior that grows with the distance: three visits in a street say something
-about all of it. Where both sides are visited each counts by its share, so that what was seen on both sides of a border
-makes a wide belief between them, and not a mean surface.
+A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the imputed belief is the
+prior. Along a route the order of cells is known. There a cell borrows from the nearest visited cells before and behind
+it, up to REACH cells away, and the share of the prior grows with the distance. If both sides are visited, each counts
+by its share. Different surfaces on the two sides therefore give a wide belief and not a mean surface.
 """
 
 from __future__ import annotations
@@ -25,11 +24,12 @@ KEPT: Final = 0.8
 
 
 def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int) -> CellView:
-    """Unvisited cells of a tile that adjoin its visited `slots`, same sector; along a route's keys those it passes.
+    """Return the unvisited cells of a tile next to its visited `slots`, same sector; along a route, the cells of its
+    keys.
 
-    Belief: half the prior, half the mean of the visited neighbours; less of them, the further they are. `vehicles` is
-    the least of theirs, so that an imputed value is never more public than what it was made from; times are the newest
-    and oldest of theirs.
+    The belief is half the prior and half the mean of the visited neighbours, less of them at greater distance.
+    `vehicles` is the minimum of theirs, so that an imputed value is never more public than its sources. Times are the
+    newest and oldest of theirs.
     """
     live = fusion.live
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
@@ -63,9 +63,10 @@ def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, n
 
 
 def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Unvisited keys of a route in a tile, the slots of the nearest visited ones on it, before and behind, and shares.
+    """Return unvisited keys of a route in a tile, the slots of the nearest visited ones before and behind, and their
+    shares.
 
-    A key stands once for each side that lies within REACH; those that adjoin are the neighbours' own.
+    A key appears once for each side within REACH; adjacent keys are handled as neighbours.
     """
     slots = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
     place = np.arange(len(route))

@@ -1,4 +1,4 @@
-"""Answers to queries, a tile at a time: select → view → impute → encode. Pure."""
+"""Answers to queries, one tile at a time: select → view → impute → encode. Pure."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from schemas.regions import keys_along
 def answer(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
 ) -> Iterator[tuple[int, bytes]]:
-    """Tile and payload of every reply, each made when it is taken.
+    """Yield tile and payload of every reply, computed on demand.
 
     Args:
         cache: the tiles of the map.
-        query: what is asked.
-        wanted: whether a tile's key matches the query's.
+        query: its parameters.
+        wanted: returns True if a tile's key matches the query's.
         now: for ages and forgetting [ns].
-        only: the one tile that can be wanted, where the query's key names it.
+        only: the only matching tile, if the query's key names it.
 
     Raises:
         InputError: the route is too long.
@@ -39,21 +39,21 @@ def answer(
             if route is None and query.basis is None:
                 shown = cache.shown(tile, now)
             else:
-                shown = _viewed(cache, tile, query, route, now)
-            payload = _encoded(shown, _rows(shown, query), query.format, tile)
+                shown = _view_tile(cache, tile, query, route, now)
+            payload = _encode_tile(shown, _rows(shown, query), query.format, tile)
             if payload is not None:
                 yield tile, payload
 
 
 class AnswerSize(NamedTuple):
-    """What an answer has at the most."""
+    """Upper bound of an answer's size."""
 
     cells: int
     tiles: int
 
 
 def size_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
-    """Size of all tiles that an answer looks at; arguments and errors as of `answer`."""
+    """Return the size of all tiles that an answer reads; arguments and errors as for `answer`."""
     route = keys_along(query.route) if query.route else None
     tiles = [tile for tile in _tiles(cache, query, route, only) if only is not None or wanted(tile)]
     with cache.guard:
@@ -61,7 +61,7 @@ def size_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool],
 
 
 def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None) -> list[int]:
-    """Select: the tiles that may have something."""
+    """Select the tiles that may contain something."""
     if route is not None:
         tiles = np.unique(grid.tile_of(route // grid.SECTORS))
     elif only is not None:
@@ -74,8 +74,8 @@ def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int 
     return [int(tile) for tile in tiles]
 
 
-def _viewed(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int) -> ShownTile:
-    """View and impute: the cells of one tile that may be asked for; along a route in its order."""
+def _view_tile(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int) -> ShownTile:
+    """View and impute the cells of one tile that may match; along a route in its order."""
     with cache.guard:
         fusion, slots = cache.state.fusion, cache.state.slots(tile)
         passed = slots
@@ -90,11 +90,10 @@ def _viewed(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None
 
 
 def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
-    """Select: the cells with enough vehicles that touch the box.
+    """Select the cells with enough vehicles that touch the box.
 
-    Most often that is all of a tile that is shown, or a run of its lines. Every step that lets go of the interpreter
-    may wait for it again behind whoever is busy, ten times as long as it takes; so cells are compared one by one only
-    where it must be.
+    Usually that is a complete tile, or a contiguous part of it. Every step that releases the interpreter lock may wait
+    for it ten times as long as the step takes, so cells are compared one by one only if necessary.
     """
     columns, run = shown.columns, slice(0, len(shown.cells))
     if query.bbox is not None and shown.payload:
@@ -110,8 +109,8 @@ def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     return np.asarray(keep)
 
 
-def _encoded(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int) -> bytes | None:
-    """Encode: what is left of a tile; None where nothing is."""
+def _encode_tile(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int) -> bytes | None:
+    """Encode the selected cells of a tile; None if there are none."""
     if isinstance(rows, slice):
         count = max(rows.stop - rows.start, 0)
         if form is Format.ARROW and shown.payload and count == len(shown.cells):

@@ -1,12 +1,13 @@
-"""Answering queries: what is light at once in Zenoh's thread, what is heavy in a thread of its own, a tile at a time.
+"""Scheduling of queries: cheap ones are answered in Zenoh's thread, expensive ones in a thread of their own, tile by
+tile.
 
-Zenoh does not tell a queryable who asks, and what an asker says of itself anybody can say. So nobody has a budget of
-his own: all share by what a question costs. The next tile is always of the question that would have ended first, had
-each come to an idle service (`_Heavy.rank`); so a small one goes before a large one that came earlier, and no stream of
-small ones keeps a large one waiting for ever. Where too many wait, the most costly is told to come again. Light answers
-take no more than LIGHT_PER_S together, beyond which they are treated as heavy ones, the smallest first. After each tile
-of a heavy answer the thread rests as long as it took. What is more than an answer may hold is an error that says how to
-ask. One past is rebuilt at a time, in a process of its own; who asks meanwhile is told to ask again.
+Zenoh queries are anonymous, so per-client limits are impossible. Queries are scheduled by estimated cost instead. The
+next tile always belongs to the query that would have ended first on an idle service (`_Heavy.rank`). A small query
+therefore overtakes a large earlier one, and a stream of small ones cannot starve a large one. If too many wait, the
+most expensive one is told to come again. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated
+as expensive ones, smallest first. After each tile of an expensive answer the thread rests as long as the tile took. A
+query beyond the size limit is an error with a hint. One past map is rebuilt at a time, in a separate process; other
+such queries are told to come again.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ LONGEST_REST_S: Final = 0.05
 
 
 class Answering(NamedTuple):
-    """What answers.
+    """Functions that answer queries.
 
     Attributes:
-        size: how many cells and tiles an answer may have at the most.
-        answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants, and the only
-            one, where the query's key is a tile's.
+        size: returns the upper bound of an answer's cells and tiles.
+        answer: yields tile and payload of every reply to a query, for the tiles that a predicate accepts, and the only
+            one if the query's key names a tile.
     """
 
     size: Callable[[MapQuery, Callable[[int], bool], int | None], AnswerSize]
@@ -57,12 +58,12 @@ class Answering(NamedTuple):
 
 
 @dataclass(order=True)
-class _Heavy:
-    """A question that waits, or is half answered.
+class _QueuedQuery:
+    """Expensive query that waits or is partly answered.
 
     Attributes:
-        rank: when it would be answered, had it come to a service that has nothing else to do [s].
-        number: of the questions before it.
+        rank: time at which it would be answered on an idle service [s].
+        number: of earlier queries.
     """
 
     rank: float
@@ -74,19 +75,19 @@ class _Heavy:
 
 @dataclass
 class _Answered:
-    """Whether nothing of an answer is still to come."""
+    """Marker: True if an answer is complete."""
 
     whole: bool = True
 
 
-class _Light:
-    """How much light answering there may be."""
+class _TokenBucket:
+    """Token bucket for cheap answers."""
 
     def __init__(self) -> None:
         self._left, self._since, self._guard = LIGHT_PER_S, time.monotonic(), threading.Lock()
 
     def take(self, cost: float) -> bool:
-        """Whether there may be so much now; it is taken."""
+        """Take `cost` from the bucket; return False if it is too empty."""
         with self._guard:
             now = time.monotonic()
             self._left = min(LIGHT_PER_S, self._left + (now - self._since) * LIGHT_PER_S)
@@ -98,7 +99,7 @@ class _Light:
 
 
 class MapQueryable:
-    """The callback of the queryables.
+    """Callback of the queryables.
 
     Args:
         answering: counts and makes answers.
@@ -108,20 +109,20 @@ class MapQueryable:
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
         self._answering, self._counts = answering, counts
         self._past = threading.Lock()
-        self._heavy: list[_Heavy] = []  # a heap
-        self._light = _Light()
+        self._heavy: list[_QueuedQuery] = []  # a heap
+        self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
         self._busy_since: float | None = None  # with one tile of a heavy answer
         self._some = threading.Condition()
 
     @property
     def hangs_s(self) -> float:
-        """For how long one tile of a heavy answer is being made [s]."""
+        """Return how long the current tile of an expensive answer has taken so far [s]."""
         since = self._busy_since
         return 0.0 if since is None else time.monotonic() - since
 
     def __call__(self, request: zenoh.Query) -> None:
-        """Answer one query, now or a little later."""
+        """Answer one query, now or later."""
         self._counts["queries"] += 1
         try:
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
@@ -153,7 +154,7 @@ class MapQueryable:
         self._counts["heavy_queries"] += 1
         with self._some:
             rank = time.monotonic() + cost / PER_S
-            heapq.heappush(self._heavy, _Heavy(rank, self._counts["heavy_queries"], request, wanted))
+            heapq.heappush(self._heavy, _QueuedQuery(rank, self._counts["heavy_queries"], request, wanted))
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
                 self._heavy.remove(dropped)
@@ -181,8 +182,8 @@ class MapQueryable:
                     heapq.heappush(self._heavy, first)
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
-    def _goes_on(self, heavy: _Heavy) -> bool:
-        """Answer with one tile more; whether there may be others."""
+    def _goes_on(self, heavy: _QueuedQuery) -> bool:
+        """Answer with one more tile; return True if there may be others."""
         request = heavy.request
         with self._answered(request) as answered:
             if heavy.tiles is None:
@@ -206,7 +207,7 @@ class MapQueryable:
 
     @contextmanager
     def _answered(self, request: zenoh.Query) -> Iterator[_Answered]:
-        """Reply to a request, and let it go unless there is more to come; what fails is an error reply."""
+        """Reply to a request and close it unless more follows; a failure becomes an error reply."""
         answered = _Answered()
         try:
             yield answered
@@ -234,7 +235,8 @@ class MapQueryable:
 
 
 def _wanted(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
-    """Whether a tile's key matches the query's; and the only tile that can, where the query's key names it."""
+    """Return a predicate for tiles whose key matches the query's, and the only such tile if the query's key names
+    it."""
     expression = request.key_expr
     only = _tile(str(expression))
     return (lambda tile: tile == only or expression.intersects(zenoh.KeyExpr(keys.map_key(tile)))), only
@@ -242,7 +244,7 @@ def _wanted(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
 
 @lru_cache(1 << 12)
 def _tile(expression: str) -> int | None:
-    """The tile that a key names; None where it is none's, or many."""
+    """Return the tile that a key names; None if it names none or several."""
     try:
         return keys.parse(expression).quadint
     except InputError:

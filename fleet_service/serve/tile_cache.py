@@ -1,7 +1,7 @@
-"""Tiles as they are shown: made when they are asked for or put, and shown again while they are good.
+"""Cache of tiles for readers: made on request or for publication, and reused while they are fresh.
 
-A tile that is shown is at most SHOWN_NS old and holds everything that was acknowledged, or alerted, before it was asked
-for: what an answer can be no fresher than by more than a put can. Most questions under load then cost a look.
+A tile is at most SHOWN_NS old and holds everything that was acknowledged or alerted before the query. Most queries
+under load then cost a look-up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.view import CellView, coarse, view
+from fleet_service.serve.view import CellView, coarsen, view
 from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.numeric import IntArray
@@ -31,17 +31,17 @@ NOTHING: Final = (math.inf, math.inf, -math.inf, -math.inf)  # an area that no b
 
 
 class ShownTile(NamedTuple):
-    """Cells of a tile.
+    """Cells of a tile as readers see them.
 
     Attributes:
         cells: in the schema of the map.
         columns: SELECTED_BY as arrays (k,).
-        payload: all cells as an Arrow stream, of which `cells` shares the memory, from south to north; empty where
-            the cells have another order and are used once.
-        least: vehicles that every cell has.
-        common: west, south, east and north that all cells touch, where they lie from south to north.
-        made: when [ns].
-        change: the last change of the map that is in it.
+        payload: all cells as an Arrow stream that shares memory with `cells`, from south to north; empty if the cells
+            have another order and are used once.
+        least: minimum number of vehicles of its cells.
+        common: west, south, east and north that all cells touch, if they are ordered from south to north.
+        made: time of creation [ns].
+        change: last change of the map that it contains.
     """
 
     cells: pa.RecordBatch
@@ -54,13 +54,13 @@ class ShownTile(NamedTuple):
 
 
 class TileCache:
-    """The tiles of a map.
+    """Cached tiles of a map.
 
     Args:
         state: the map.
-        guard: held while the map is read; not while Arrow is written.
-        least: vehicles of a cell that is public.
-        visitors: who must have been that many lately; None: whenever it was.
+        guard: lock held while the map is read, but not while Arrow is written.
+        least: minimum number of vehicles of a public cell.
+        visitors: counts the vehicles of the recent window; None counts all vehicles.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class TileCache:
         self._acknowledged = 0  # change up to which all must be seen
 
     def acknowledge(self) -> None:
-        """Note that all the map holds now was acknowledged or alerted: no tile without it is shown from here on."""
+        """Record that everything in the map was acknowledged or alerted: no older tile is shown from now on."""
         self._acknowledged = self.state.change
 
     def shown(self, tile: int, now: int) -> ShownTile:
-        """A tile that is good enough for a query at `now` [ns]."""
+        """Return a tile that is fresh enough for a query at `now` [ns]."""
         kept = self._kept.get(tile)
         if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
             return self.make(tile, now)
@@ -84,7 +84,7 @@ class TileCache:
         return kept if whole else self.make(tile, now)
 
     def make(self, tile: int, now: int) -> ShownTile:
-        """A tile as it is believed at `now` [ns]."""
+        """Make a tile as believed at `now` [ns]."""
         with self.guard:
             change = self.state.change
             cells = self.seen(self._from_south(self.public(self.state.slots(tile), now)), now)
@@ -96,12 +96,12 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """The cells of slots as readers see them: coarse where more than one vehicle makes a cell public."""
+        """Return the cells of slots as readers see them: coarse if more than one vehicle makes a cell public."""
         cells = view(self.state.fusion, slots, now)
-        return coarse(cells) if self._least > 1 else cells
+        return coarsen(cells) if self._least > 1 else cells
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """The public ones at `now` [ns]."""
+        """Return the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._visitors is None else slots[self._visitors.count(slots, now) >= self._least]
 
@@ -123,7 +123,7 @@ class TileCache:
 
 
 def used_once(cells: CellView, now: int) -> ShownTile:
-    """Cells in an order of their own, which are shown to one asker."""
+    """Return cells in an order of their own, for a single query."""
     batch = batch_of(cells, now)
     return ShownTile(batch, selected_by(batch))
 
@@ -136,5 +136,5 @@ def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, tuple[float, floa
 
 
 def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """The columns by which a query selects cells."""
+    """Return the columns by which a query selects cells."""
     return {name: cells[name].to_numpy() for name in SELECTED_BY}

@@ -1,10 +1,9 @@
-"""When changed tiles are put: in rounds on a grid of time, a few tiles a turn of the worker, so that acknowledgements
-never wait for them.
+"""Publication of changed tiles in rounds, a few tiles per turn of the worker, so that acknowledgements never wait.
 
-A round takes up all tiles that changed since the last one. A moment of the grid at which the last round is not done is
-skipped and counted; what changed meanwhile is in the next. So a tile is put once a second as long as there is time for
-it, and each in turn when there is not. The grid is the service's own: when within a second a tile is put says nothing
-about when somebody passed there.
+A round takes all tiles that changed since the last one. It begins at the moments of a time grid. A moment at which the
+last round is not complete is skipped and counted, and its changes go to the next round. A tile is therefore published
+once a second if there is time, and in turn otherwise. The grid's offset is private: the instant of a publication does
+not reveal when a vehicle passed.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ SHARE_S: Final = 0.02  # of a turn of the worker; with what comes in meanwhile, 
 
 
 class TileRounds:
-    """The rounds of one service; for one thread.
+    """Rounds of one service; for one thread.
 
     Args:
-        every_s: between two moments of the grid.
-        changed: takes the tiles that changed since its last call.
-        put: makes one and puts it.
+        every_s: distance of the moments of the grid.
+        changed: returns the tiles that changed since its last call.
+        put: makes a tile and publishes it.
         counts: takes `tile_rounds_skipped`.
         clock: monotonic seconds.
     """
@@ -40,11 +39,11 @@ class TileRounds:
 
     @property
     def waiting(self) -> int:
-        """Tiles of the round that are still to be put."""
+        """Return the number of tiles of the round that are not published yet."""
         return len(self._left)
 
     def begin(self) -> bool:
-        """Begin a round, if its moment has come; whether one has, although the round before may go on instead."""
+        """Begin a round if its moment has come; return True if it has, even if the previous round continues instead."""
         passed = int((self._clock() - self._due) // self._every_s) + 1
         if passed <= 0:
             return False
@@ -57,7 +56,7 @@ class TileRounds:
         return True
 
     def go_on(self, share_s: float = SHARE_S) -> None:
-        """Put tiles of the round for so long: one at least, if there is one."""
+        """Publish tiles of the round for `share_s`; at least one if there is one."""
         end = self._clock() + share_s
         while self._left:
             self._put(self._left.popleft())
@@ -65,7 +64,7 @@ class TileRounds:
                 break
 
     def finish(self, most_s: float) -> None:
-        """Put what is left and what changed since, as far as the time allows: the service leaves."""
+        """Publish the rest and later changes within `most_s`, because the service stops."""
         known = set(self._left)
         self._left.extend(tile for tile in self._changed() if tile not in known)
         self.go_on(most_s)

@@ -1,4 +1,4 @@
-"""A view of cells: what a fusion knows of them at one moment, as columns that no longer change. Pure."""
+"""View of cells: their state at one moment, as columns that do not change any more. Pure."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) f
 
 
 class CellView(NamedTuple):
-    """Cells as they are believed at one moment: columns (k,) and beliefs (k, 32).
+    """Cells as believed at one moment: columns (k,) and beliefs (k, 32).
 
     Attributes:
-        cell, sector: where.
+        cell, sector: place.
         belief: about the road.
         values: votes with a value.
-        vehicles, observations: how many.
+        vehicles, observations: numbers of them.
         first, last: times of the first and the last observation [ns].
-        imputed: whether the belief was made from neighbours'.
+        imputed: True if the belief was made from neighbours.
     """
 
     cell: IntArray
@@ -48,7 +48,7 @@ class CellView(NamedTuple):
 
 
 def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
-    """The cells of `slots` as they are believed at `now` [ns]; copies, so that the fusion may go on."""
+    """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may continue."""
     live = fusion.live
     key = live.key[slots]
     return CellView(
@@ -58,8 +58,8 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     )  # fmt: skip
 
 
-def coarse(cells: CellView) -> CellView:
-    """The cells as readers see them where persons are kept private: no single passage shows in a time or a count."""
+def coarsen(cells: CellView) -> CellView:
+    """Return the cells as readers see them with privacy on: no single passage shows in a time or a count."""
     steps = COUNT_STEPS
     counts = [
         steps[np.maximum(np.searchsorted(steps, column, "right") - 1, 0)]
@@ -70,12 +70,16 @@ def coarse(cells: CellView) -> CellView:
 
 
 def joined(*views: CellView) -> CellView:
-    """Views one after the other."""
+    """Return views joined into one."""
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 
-def measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
-    """Whether a value, and not only bounds, made beliefs what they are: (k,), of the interval's ends and how many votes
-    with a value there were (k,)."""
+def is_measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
+    """Return True for beliefs that rest on a value and not only on bounds, (k,).
+
+    Args:
+        lower, upper: ends of the interval, (k,).
+        values: number of votes with a value, (k,).
+    """
     narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH
     return np.asarray((values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow))

@@ -1,7 +1,7 @@
-"""How many distinct vehicles were in a cell lately: rather too few than too many, in sixteen bytes a cell. Pure.
+"""Number of distinct vehicles in a cell recently: a lower bound, in sixteen bytes per cell. Pure.
 
-What k vehicles learned hides each of them only while they are k. Once a cell is public for ever, the one car that
-passes at night shows in it.
+The data of k vehicles hides each of them only while there are k. If a cell stayed public for ever, a single car at
+night would be visible in it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """The vehicles of each slot of a fusion, each as one bit of 64 in each part of the window.
+    """Vehicles of each slot of a fusion, each as one bit of 64 in each part of the window.
 
     Args:
-        fusion: whose slots they are; it takes observations before they are `heard`.
+        fusion: owner of the slots; it must receive observations before they are passed to `add`.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -33,8 +33,8 @@ class Visitors:
         self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
         self._part = 0  # the newest that was heard of
 
-    def heard(self, o: Observations) -> None:
-        """Note who was where."""
+    def add(self, o: Observations) -> None:
+        """Record which vehicles were in which cells."""
         self._grow()
         part = o.time // PART_NS
         self._move_on(int(part.max(initial=self._part)))
@@ -46,27 +46,27 @@ class Visitors:
                 np.bitwise_or.at(self._bits[:, back], slot[mine], bit[mine])
 
     def count(self, slots: IntArray, now: int) -> IntArray:
-        """Distinct vehicles (k,) of slots within the window that ends at `now` [ns]."""
+        """Return the distinct vehicles (k,) of slots within the window that ends at `now` [ns]."""
         self._grow()
         ago = max(now // PART_NS - self._part, 0)
         within = self._bits[slots, : max(PARTS - ago, 0)]
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
-    def renumbered(self, place: IntArray) -> None:
-        """Slots of the fusion have other numbers now: `place` of each, -1 for those that are gone."""
+    def renumber(self, place: IntArray) -> None:
+        """Update slots after the fusion renumbered them; `place` is the new number, -1 for removed ones."""
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
         longer[: min(len(place), len(self._bits))] = self._bits[: len(place)]
         self._bits = longer[stay]
 
     def columns(self) -> dict[str, IntArray]:
-        """What `of` makes the same of."""
+        """Return the columns from which `of` restores this object."""
         self._grow()
         return {"bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64), "part": np.array([self._part])}
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
-        """The visitors that `columns` told; nobody, where they do not fit."""
+        """Restore the visitors from `columns`; empty if the columns do not match the fusion."""
         made, bits = Visitors(fusion), columns["bits"]
         if len(bits) == PARTS * fusion.size:
             made._bits = bits.view(np.uint64).reshape(-1, PARTS).copy()
@@ -74,14 +74,14 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Room for the slots that there are; twice as much, so that it is seldom done."""
+        """Make room for new slots; the size doubles, so this is rare."""
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)
             longer[: len(self._bits)] = self._bits
             self._bits = longer
 
     def _move_on(self, part: int) -> None:
-        """Begin a part of the window; what is older than it goes."""
+        """Begin a part of the window and drop older parts."""
         ago = part - self._part
         if ago > 0:
             self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]

@@ -1,1 +1,1 @@
-"""Who serves which region."""
+"""Assignment of regions to services: tokens, lease, ownership, hand-over."""

@@ -1,4 +1,4 @@
-"""What a service has for itself while it runs: the folder by a lock, and where it has a copy, the bucket by a lease."""
+"""Exclusive ownership of a running service: the folder by a lock, and the bucket copy, if any, by a lease."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import BinaryIO, Final
 
 from fleet_service.archive import compaction, terms
 from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copies import FOLDERS, Copy, copy_for
-from fleet_service.archive.files import lock
+from fleet_service.archive.copies import FOLDERS, BucketReplica, open_replica
+from fleet_service.archive.files import lock_archive
 from fleet_service.shards.lease import Lease, Standby, forget_holder, holder_of
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -22,104 +22,106 @@ AGAIN_S: Final = 1.0  # between two tries to reach the bucket
 REQUESTS: Final = 4  # of a lease that fit into its time
 
 
-class Holding:
-    """A locked archive, filled from its copy; `close` it.
+class Ownership:
+    """Exclusive ownership of an archive folder and its bucket copy; call `close`.
 
     Attributes:
-        copy: of the archive; None: it has none.
-        lease: of the copy; None: nobody else is to be told.
-        to: the standby that it is to be handed over to; "": none.
-        leaves: all is ready for that.
+        copy: bucket copy of the archive; None without one.
+        lease: of the copy; None if no other service must be excluded.
+        to: standby to hand over to; "" for none.
+        leaves: True once everything is ready for the hand-over.
     """
 
-    def __init__(self, lock_file: BinaryIO, copy: Copy | None, lease: Lease | None = None) -> None:
+    def __init__(self, lock_file: BinaryIO, copy: BucketReplica | None, lease: Lease | None = None) -> None:
         self._lock_file, self.copy, self.lease = lock_file, copy, lease
         self.to, self.leaves = "", False
 
     @property
     def epoch(self) -> int:
-        """Of segments' names, at the least."""
+        """Return the smallest epoch that new segment names may use."""
         return 0 if self.lease is None else self.lease.term.epoch
 
     @property
     def may_acknowledge(self) -> bool:
-        """Whether what is durable now will be known to whoever comes after this service."""
+        """Return True if the next service will know everything that is durable now."""
         return self.lease is None or self.lease.fresh
 
     @property
     def left_s(self) -> float:
-        """For which it may acknowledge without a renewal of the lease [s]; infinite without one."""
+        """Return how long it may acknowledge without renewing the lease [s]; infinite without a lease."""
         return math.inf if self.lease is None else self.lease.left_s
 
     @property
     def lost(self) -> bool:
-        """Whether another has taken over."""
+        """Return True if another service has taken over."""
         return self.lease is not None and self.lease.lost
 
     @property
     def former(self) -> tuple[str, ...]:
-        """Names of the services that had it earlier, and of this one; none without a lease."""
+        """Return the names of this and earlier holders; empty without a lease."""
         return () if self.lease is None else (*self.lease.former, self.lease.service)
 
-    def give_up(self) -> None:
-        """Another has taken over, as its tokens tell."""
+    def mark_lost(self) -> None:
+        """Record that another service has taken over, as its tokens show."""
         if self.lease is not None:
             self.lease.lost = True
 
-    def give_free(self) -> None:
-        """Nothing is acknowledged after this, and the next may have the copy."""
+    def release(self) -> None:
+        """Release the lease; nothing is acknowledged afterwards."""
         if self.lease is not None:
-            self.lease.end(self.to if self.leaves else "")
+            self.lease.release(self.to if self.leaves else "")
 
     def close(self) -> None:
-        """Let the next have it."""
-        self.give_free()
+        """Release lease and lock."""
+        self.release()
         if self.copy is not None:
             self.copy.close()
         self._lock_file.close()
 
 
-def alone(config: ServiceConfig, root: Path) -> Holding:
-    """An archive without a lease.
+def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
+    """Open an archive without a lease.
 
     Raises:
         InputError: another service holds it, or its copy cannot be used.
-        OSError: it cannot be read or written.
+        OSError: the folder cannot be read or written.
     """
-    lock_file = lock(root)
+    lock_file = lock_archive(root)
     try:
         forget_holder(root)
-        return Holding(lock_file, copy_for(config, root))
+        return Ownership(lock_file, open_replica(config, root))
     except BaseException:
         lock_file.close()
         raise
 
 
-Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standing_by`
+Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standby_signs`
 
 
-def hold(
+def acquire(
     config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None = None
-) -> Holding | None:
-    """An archive with the lease of its copy, where it has one; None if stopped.
+) -> Ownership | None:
+    """Open an archive with the lease of its copy, if it has one; None if stopped.
 
     Args:
         config: settings.
         root: of the archive.
         stop: ends the wait.
-        say: takes a line whenever there is something new to wait for.
-        signs: of a standby: whether it would be heard, whether a service's token stands, and what it does at each look.
+        say: called with a line whenever the reason for waiting changes.
+        signs: of a standby: whether it would be reachable, whether a service's token is active, and a function called
+            at
+            each check.
 
     Raises:
-        InputError: another service holds folder or copy, or the copy is not usable as it is set.
+        InputError: another service holds folder or copy, or the copy cannot be used with these settings.
         OSError: the folder cannot be read or written.
     """
     url = config.archive.second
     if url is None:
         if signs is not None:
             raise InputError("standby", "needs archive.copy", "name the bucket of the service that it is to follow")
-        return alone(config, root)
-    lock_file = lock(root)
+        return open_exclusive(config, root)
+    lock_file = lock_archive(root)
     try:
         holding = _leased(config, root, stop, say, signs, lock_file)
     except BaseException:
@@ -133,27 +135,27 @@ def hold(
 def _leased(
     config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None,
     lock_file: BinaryIO,
-) -> Holding | None:  # fmt: skip
+) -> Ownership | None:  # fmt: skip
     url, options = str(config.archive.second), config.archive.options
     empty = not any((root / folder).exists() for folder in FOLDERS)
     holder, known = holder_of(root, url)
     lease = Lease(holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s)
-    copy = Copy(root, url, options)
+    copy = BucketReplica(root, url, options)
     mirrors = empty or known
-    standby = None if signs is None else Standby(*signs, copy.get_ahead if mirrors else lambda: None)
+    standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
     try:
         while lease.wait(stop, say, copy.epoch, standby):
             lease.keep()
             if lease.succeeds and not mirrors:
                 raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
-            copy.under(partial(_fresh, lease), lease.alone)
-            if _joined(config, root, copy, lease, stop, say):
-                terms.note(root, lease.term.epoch)
-                return Holding(lock_file, copy, lease)
-            lease.end()
+            copy.attach_lease(partial(_fresh, lease), lease.assert_not_superseded)
+            if _sync_folder(config, root, copy, lease, stop, say):
+                terms.write_epoch(root, lease.term.epoch)
+                return Ownership(lock_file, copy, lease)
+            lease.release()
             if not lease.lost:
                 break
-            lease = lease.again()
+            lease = lease.retry()
     except CopyError as error:
         _leave(lease, copy)
         fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
@@ -169,20 +171,25 @@ def _fresh(lease: Lease) -> bool:
     return lease.fresh
 
 
-def _leave(lease: Lease, copy: Copy) -> None:
-    lease.end()
+def _leave(lease: Lease, copy: BucketReplica) -> None:
+    lease.release()
     copy.close()
 
 
-def _joined(
-    config: ServiceConfig, root: Path, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None]
-) -> bool:  # fmt: skip
-    """Let the folder become what the copy is; False if stopped, or another has the lease. A standby tries again while
-    the bucket is away."""
+def _sync_folder(
+    config: ServiceConfig,
+    root: Path,
+    copy: BucketReplica,
+    lease: Lease,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> bool:
+    """Synchronise the folder with the copy; False if stopped, or if another service has the lease. A standby retries
+    while the bucket is away."""
     logged = ""
     while not stop.is_set():
         try:
-            with _still(root) if lease.succeeds else nullcontext():
+            with _wait_for_compaction(root) if lease.succeeds else nullcontext():
                 copy.join(None if config.standby else config.name, lease.term, succeeds=lease.succeeds)
         except (CopyError, _BusyError) as error:
             if lease.lost:
@@ -199,13 +206,13 @@ def _joined(
 
 
 class _BusyError(Exception):
-    """Somebody is at work in the folder."""
+    """Another process works in the folder."""
 
 
-def _still(root: Path) -> BinaryIO:
-    """See that no compaction goes on which the service began that had the folder before, and which outlived it: what it
-    has read may be rows that do not count any more."""
+def _wait_for_compaction(root: Path) -> BinaryIO:
+    """Wait until no compaction of the folder's former service is running: it may have read rows that do not count any
+    more."""
     try:
-        return compaction.alone(root)
+        return compaction.lock_compacted(root)
     except InputError as error:
         raise _BusyError(str(error)) from error

@@ -1,28 +1,29 @@
-"""Who serves an archive's copy: a lease in its bucket, for which a bucket that makes an object only once is enough.
+"""Lease of an archive's bucket copy. It needs only a bucket with conditional create.
 
     lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the highest number holds
-    ARCHIVE/holder.json     who this folder is to the others, over restarts
+    ARCHIVE/holder.json     identity of this folder, kept over restarts
 
-Taking over is making the next number, which one alone can; renewing is putting one's own number again, with the next
-turn, and then seeing that there is no next number. Clocks are not compared.
+A service takes over by creating the next number, which only one can do. It renews by writing its own number again with
+the next turn, and then checking that no higher number exists. Clocks are not compared.
 
-Why nothing acknowledged is lost. Let A hold, and B make the next number at T. A acknowledges only what is in the bucket
-already, and only within `lease_s / 2` after it *began* a renewal that counts; one that counts saw no next number, so it
-began before T. B takes over when it has seen the same turn for `lease_s` (or for HINT of it, when A's token fell): then
-A's last renewal began before B saw it first, and A's time was over before T. If the turn is another one after T, a
-renewal landed in between, and B waits for `lease_s / 2` more. Only then B lists the bucket: all that A acknowledged is
-there. An acknowledgement that A's network delivers years later is still true. What A, frozen meanwhile, puts after the
-list has an older epoch and is not in B's fence (`archive.terms`): it counts for nothing, and A acknowledged none of it.
-Deletes: A deletes only after it put what stands for it and saw no next number since, so B finds what stands for it.
+Why nothing acknowledged is lost. Let A hold, and let B create the next number at T. A acknowledges only what is in the
+bucket already, and only within `lease_s / 2` after it *began* a valid renewal. A valid renewal saw no higher number, so
+it began before T. B takes over when it has seen the same turn for `lease_s` (or for HINT of it, when A's token fell):
+then A's last renewal began before B saw it first, and A's time was over before T. If the turn has changed after T, a
+renewal landed in between, and B waits for `lease_s / 2` more. Only then B lists the bucket: everything that A
+acknowledged is there. An acknowledgement that A's network delivers later is still true. If A was frozen and uploads
+after the listing, its files have an older epoch and are not in B's fence (`archive.terms`): they do not count, and A
+acknowledged none of them. A deletes only after it uploaded the replacement and saw no higher number, so B finds the
+replacement.
 
-Why nothing is doubled. What counts is one set of files, which B read whole before it admits anything: a batch that A
-archived and did not acknowledge is known to B, and acknowledged again. What of A's is not in the set its senders send
-again, and it is admitted once. A's folder becomes what the bucket is before A serves again.
+Why nothing is doubled. The files that count are one set, which B reads completely before it admits anything. A batch
+that A archived and did not acknowledge is known to B and acknowledged again. Rows of A outside this set are sent again
+and admitted once. A's folder is synchronised with the bucket before A serves again.
 
-A machine that was suspended finds its lease old (`elapsed`).
+A machine that was suspended finds its lease expired (`elapsed_seconds`).
 
-Not covered: a machine whose clock of elapsed time runs at less than half the speed of another's, or stands still while
-it is copied from host to host, and a bucket that does not show at once what it has taken.
+Not covered: a machine whose elapsed-time clock runs at less than half the speed of another's, or stops while it is
+migrated between hosts, and a bucket without read-after-write consistency.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from fleet_service.archive import terms
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.terms import Term
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
@@ -54,16 +55,16 @@ _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 LOOK_S: Final = 0.25  # between two looks of who waits
 
 
-class Held(NamedTuple):
-    """A lease as the bucket has it.
+class LeaseRecord(NamedTuple):
+    """Lease as stored in the bucket.
 
     Attributes:
         number, epoch: of the term.
         holder, service: the folder, and the name of the service on it.
         turn: grows with each renewal.
-        released: it was given free.
+        released: True if the holder released it.
         before: names of the services that held it earlier.
-        to: the service that it was given free for; for a lease's time others leave it alone.
+        to: the service for which it was released; others leave it alone for one lease time.
     """
 
     number: int
@@ -77,17 +78,17 @@ class Held(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of the object."""
+        """Return the object's name."""
         return f"{FOLDER}/{self.number:010d}.json"
 
     @property
     def content(self) -> bytes:
-        """Of the object."""
+        """Return the object's content."""
         return json.dumps({name: value for name, value in self._asdict().items() if name != "number"}).encode()
 
 
 class Standby(NamedTuple):
-    """What a service that waits asks while it waits."""
+    """Questions of a waiting service: whether it is reachable, and whether the holder's token is active."""
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
     stands: Callable[[str], bool]  # whether a service's token stands
@@ -96,24 +97,24 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """The lease of one archive's copy; `wait` for it, `keep` it, `end` it.
+    """Lease of one archive's copy; `wait` for it, `keep` it, `release` it.
 
     Args:
-        holder: who this folder is, see `holder_of`; it is locked by this process: another start of it has ended.
+        holder: identity of this folder, see `holder_of`; this process has it locked, so no other start of it runs.
         bucket: of the copy.
         service: its name.
-        lease_s: after which a lease that is not renewed may be taken.
+        lease_s: time after which a lease that is not renewed may be taken.
 
     Attributes:
-        lost: another has it.
+        lost: True if another service has it.
         service: its name.
-        serves: whether the service does its work: one that reaches no router is to be followed.
-        succeeds: whether somebody else had it before: the folder may hold what counts for nothing.
+        serves: returns True if the service works; one that reaches no router must be replaced.
+        succeeds: True if another folder had it before: this folder may hold files that do not count.
     """
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
         self._holder, self._bucket, self.service, self._lease_s = holder, bucket, service, lease_s
-        self._mine: Held | None = None
+        self._mine: LeaseRecord | None = None
         self._renewed, self._stop = 0.0, threading.Event()
         self._thread: threading.Thread | None = None
         self.lost, self.succeeds = False, False
@@ -121,29 +122,29 @@ class Lease:
 
     @property
     def term(self) -> Term:
-        """How many had it with this one, and the epoch of the names that it gives."""
+        """Return the lease number (1 for the first holder) and the epoch used in this holder's file names."""
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 
     @property
     def former(self) -> tuple[str, ...]:
-        """Names of the services that held it earlier."""
+        """Return the names of the services that held it earlier."""
         return () if self._mine is None else self._mine.before
 
     @property
     def left_s(self) -> float:
-        """For which what is in the bucket may be acknowledged, without a renewal [s]; 0 or less: not now."""
-        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed() - self._renewed)
+        """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0 or less: not now."""
+        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed_seconds() - self._renewed)
 
     @property
     def fresh(self) -> bool:
-        """Whether what is in the bucket now may be acknowledged."""
+        """Return True if the content of the bucket may be acknowledged now."""
         return self.left_s > 0.0
 
-    def alone(self) -> None:
-        """See that nobody has taken over: then who does later finds all that was put until now.
+    def assert_not_superseded(self) -> None:
+        """Check that no other service has taken over. A later successor then finds everything uploaded until now.
 
         Raises:
-            CopyError: somebody has, or the bucket does not say.
+            CopyError: another service has taken over, or the bucket does not answer.
         """
         mine = self._mine
         if mine is None or self._bucket.get(mine._replace(number=mine.number + 1).name) is not None:
@@ -153,19 +154,19 @@ class Lease:
     def wait(
         self, stop: threading.Event, say: Callable[[str], None], epoch: Callable[[], int], standby: Standby | None
     ) -> bool:
-        """Wait until the lease is this one's; False if stopped.
+        """Wait until this service has the lease; False if stopped.
 
         Args:
             stop: ends the wait.
-            say: takes a line when there is something new to say.
-            epoch: the largest that is known.
-            standby: None: it is none, and does not wait for a service that lives.
+            say: called with a line when the reason for waiting changes.
+            epoch: the largest known epoch.
+            standby: None for a service that is no standby and does not wait for a live holder.
 
         Raises:
-            InputError: a service that lives has it, and this one is no standby.
+            InputError: a live service has it, and this one is no standby.
             CopyError: the bucket cannot be reached, and this one is no standby.
         """
-        seen: Held | None = None
+        seen: LeaseRecord | None = None
         since, ahead, logged, stood = time.monotonic(), 0.0, "", False
         while not stop.is_set():
             line = ""
@@ -182,7 +183,9 @@ class Lease:
                 stands = standby is not None and found is not None and standby.stands(found.service)
                 stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
                 stood = stood or stands
-                free = found is None or (found.to in ("", self.service) and (found.released or self._had(found)))
+                free = found is None or (
+                    found.to in ("", self.service) and (found.released or self._was_held_here(found))
+                )
                 if free or time.monotonic() - since >= stale_s:
                     if (standby is None or standby.may()) and self._take(found, epoch, stop):
                         return True
@@ -202,12 +205,13 @@ class Lease:
         return False
 
     def keep(self) -> None:
-        """Renew it from now on, in a thread, while it `serves`: else it runs out, and another takes it."""
+        """Renew it from now on in a thread while `serves` is true; otherwise it expires, and another service takes
+        it."""
         self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
         self._thread.start()
 
-    def end(self, to: str = "") -> None:
-        """Give it free, if it is still held, for a service or for any: nothing is acknowledged after this."""
+    def release(self, to: str = "") -> None:
+        """Release it if it is still held, for a named service or for any; nothing is acknowledged afterwards."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(self._lease_s)
@@ -218,23 +222,23 @@ class Lease:
             except CopyError as error:
                 log.warning("the lease runs out by itself: %s", error)
 
-    def again(self) -> Lease:
-        """One to wait for, after this one was lost."""
+    def retry(self) -> Lease:
+        """Return a new lease to wait for, after this one was lost."""
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
-        """Put the next turn; it counts if nobody has a higher number after it.
+        """Write the next turn; the renewal is valid if no higher number exists afterwards.
 
         Raises:
-            CopyError: it is not known whether it counts.
+            CopyError: it is unknown whether the renewal is valid.
         """
         if self._mine is None or self.lost:
             return
-        began = elapsed()
+        began = elapsed_seconds()
         turn = self._mine._replace(turn=self._mine.turn + 1)
         self._bucket.put(turn.name, turn.content)
         self._mine = turn
-        self.alone()
+        self.assert_not_superseded()
         self._renewed = began
 
     def _keep(self) -> None:
@@ -247,22 +251,22 @@ class Lease:
             if self.lost:
                 return
 
-    def _had(self, found: Held) -> bool:
-        """Whether it was this folder's in a former start."""
+    def _was_held_here(self, found: LeaseRecord) -> bool:
+        """Return True if an earlier start of this folder held the lease."""
         return found.holder == self._holder
 
-    def _newest(self) -> Held | None:
+    def _newest(self) -> LeaseRecord | None:
         names = [name for name in self._bucket.names(FOLDER) if name.endswith(".json")]
         content = self._bucket.get(max(names)) if names else None
         return None if content is None else _read(max(names), content)
 
-    def _take(self, found: Held | None, known: Callable[[], int], stop: threading.Event) -> bool:
-        """Make the next number; False if another was faster."""
+    def _take(self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event) -> bool:
+        """Create the next number; False if another service was faster."""
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
-        mine = Held(number, self._holder, self.service, epoch, 0, released=False, before=before)
-        began = elapsed()
+        mine = LeaseRecord(number, self._holder, self.service, epoch, 0, released=False, before=before)
+        began = elapsed_seconds()
         if not self._bucket.make(mine.name, mine.content):
             return False
         self._mine, self._renewed = mine, began
@@ -272,13 +276,13 @@ class Lease:
         return True
 
 
-def elapsed() -> float:
-    """Seconds that have passed; those in which the machine was suspended too, where the system counts them (Linux)."""
+def elapsed_seconds() -> float:
+    """Return elapsed seconds, including suspended time where the system counts it (Linux)."""
     return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
 
 
 def holder_of(root: Path, url: str) -> tuple[str, bool]:
-    """Who a folder is to others, and whether it was somebody before; a copy of it, or one moved, is another.
+    """Return the identity of a folder, and True if it existed before; a copied or moved folder gets a new one.
 
     Raises:
         OSError: the folder cannot be read or written.
@@ -290,22 +294,23 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
             identity = json.loads(path.read_bytes())
     if not place.items() <= identity.items() or "holder" not in identity:
         known, identity = identity.get("copy") == url, {**place, "holder": secrets.token_hex(8)}
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(json.dumps(identity).encode())
         return str(identity["holder"]), known
     return str(identity["holder"]), True
 
 
 def forget_holder(root: Path) -> None:
-    """A folder that is written without a lease holds what no bucket has: it may not become what a bucket is.
+    """Remove the identity of a folder that is written without a lease: it holds data that no bucket has, so it must not
+    be synchronised with a bucket.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the identity cannot be removed.
     """
     (root / HOLDER).unlink(missing_ok=True)
     (root / terms.NAME).unlink(missing_ok=True)
 
 
-def _read(name: str, content: bytes) -> Held:
+def _read(name: str, content: bytes) -> LeaseRecord:
     record: dict[str, Any] = json.loads(content)
-    return Held(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})
+    return LeaseRecord(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})

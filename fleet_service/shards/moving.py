@@ -1,4 +1,4 @@
-"""Handing a region over, live: who serves it leaves in good order, and its lease goes to the standby that is named.
+"""Live hand-over of a region: the active service stops in good order, and its lease goes to a named standby.
 
 ask                                      the service
 get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
@@ -26,24 +26,24 @@ LOOK_S: Final = 0.05
 FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 
-class Moved(NamedTuple):
-    """From which service, and for how long nobody served the region [s]."""
+class HandoverResult(NamedTuple):
+    """Result: the service that left, and how long the region had no service [s]."""
 
     service: str
     pause_s: float
 
 
-def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
-    """Answer who asks a service to hand over; returns to whom, None where it cannot be done.
+def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
+    """Answer a hand-over request; return the target, or None if it is impossible.
 
     Args:
-        query: as `hand_over` puts it.
+        query: as `hand_over` sends it.
         session: of the service.
         served: its region expressions.
     """
     with query:
         to = str(query.parameters).removeprefix("to=")
-        waiting = {token.region for token in tokens.standing(session, keys.WAITS) if token.service == to}
+        waiting = {token.region for token in tokens.active_tokens(session, keys.WAITS) if token.service == to}
         if re.fullmatch(NAME_PATTERN, to) is None or waiting != set(served):
             other = f"stands by for {', '.join(sorted(waiting))}" if waiting else f"no {to[:63]!r} stands by"
             query.reply_err(f"to: {other}, not for {', '.join(served)}; {FIX}".encode())
@@ -52,40 +52,40 @@ def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> 
         return to
 
 
-def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> Moved | None:
-    """Have a region's service hand over; None if it is served by that one already.
+def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> HandoverResult | None:
+    """Make a region's service hand over; None if the target serves the region already.
 
     Args:
-        session: of whoever may ask a service.
+        session: of a client with a service certificate.
         region: key expression.
         to: name of the standby.
-        say: takes a line when there is something new.
+        say: called with a line of progress.
 
     Raises:
-        InputError: nobody serves it, or no such standby waits, or it did not come to it.
+        InputError: the region has no service, the standby does not wait, or it did not take over.
     """
-    with tokens.watched(session) as there:
+    with tokens.track_tokens(session) as there:
         service = _server(there, region)
         if service is None:
             raise InputError("region", f"nobody serves {region}", "see `fleet-service watch`")
         if service == to:
             return None
-        say(f"{service} hands over {_ask(session, service, to)}")
+        say(f"{service} hands over {_request_handover(session, service, to)}")
         end, absent_since = time.monotonic() + MOVED_S, 0.0
         while (now := _server(there, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
                 raise InputError("to", f"{to} does not serve {region}, but {now or 'nobody'} does", "see their logs")
             time.sleep(LOOK_S)
-        return Moved(service, time.monotonic() - (absent_since or time.monotonic()))
+        return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
-def _server(there: tokens.Watched, region: str) -> str | None:
-    return next((token.service for token in there.here if regions.covers(token.region, region)), None)
+def _server(there: tokens.PresenceTracker, region: str) -> str | None:
+    return next((token.service for token in there.active if regions.covers(token.region, region)), None)
 
 
-def _ask(session: zenoh.Session, service: str, to: str) -> str:
-    """The regions that go."""
+def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
+    """Request the hand-over; return the regions that move."""
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_string().replace(",", ", ")

@@ -1,4 +1,4 @@
-"""Telling which regions a service serves, and that nobody else does: of two for one region only one would be asked."""
+"""Announcement of served regions, and exclusion of a second service: queries would reach only one of two."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import zenoh
 
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.keys import CLAIMS, SERVES, WAITS, Served
+from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import tokens, zenoh_session
 
@@ -22,30 +22,30 @@ _TRIES: Final = 5  # of services that start at the same moment
 
 
 @contextmanager
-def claimed(
+def claim_regions(
     session: zenoh.Session, name: str, regions: Sequence[str], stop: threading.Event, former: Collection[str] = ()
-) -> Iterator[frozenset[Served]]:
-    """Have regions for oneself, until the block ends.
+) -> Iterator[frozenset[ServiceToken]]:
+    """Claim regions exclusively until the block ends.
 
     Args:
         session: of the service.
         name: of the service.
         regions: key expressions.
-        stop: ends the wait for another's token to fall.
-        former: names of services that had the lease which this one has: one that says so still is to leave.
+        stop: ends the wait for another service's token.
+        former: names of earlier holders of this service's lease; their remaining tokens are about to go.
 
     Raises:
-        InputError: another service has one of them.
+        InputError: another service has one of the regions.
     """
-    mine = frozenset(Served(region, name, secrets.token_hex(4)) for region in regions)
+    mine = frozenset(ServiceToken(region, name, secrets.token_hex(4)) for region in regions)
     with _standing(_claimed(session, mine, stop, former)):
         yield mine
 
 
 @contextmanager
-def serving(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[None]:
-    """Say that regions are served, while the block runs. All that may be asked is to be answered before and after it:
-    an empty answer of a region that is served says that nobody was there."""
+def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
+    """Announce that regions are served while the block runs. The queryables must answer before and after the block: an
+    empty answer of a served region means that nothing is known there."""
     with _standing(_declared(session, mine, SERVES)):
         yield
 
@@ -60,25 +60,27 @@ def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 
 
 @contextmanager
-def successors(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[Callable[[], bool]]:
-    """Whether a service has come for these regions since the block began: so does one hear that it was followed that is
-    cut off from its bucket, and would else go on telling what it knew then."""
-    with tokens.watched(session) as there:
-        before = there.here
-        yield lambda: bool(rivals(mine, there.here - before))
+def watch_successors(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns True if another service took these regions since the block began. A service that is
+    cut off from its bucket learns so that it was replaced, and stops serving outdated data."""
+    with tokens.track_tokens(session) as there:
+        before = there.active
+        yield lambda: bool(rival_tokens(mine, there.active - before))
 
 
-def rivals(mine: frozenset[Served], there: set[Served], former: Collection[str] = ()) -> list[Served]:
-    """Tokens of others for the same regions, but for those of `former` services."""
+def rival_tokens(
+    mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
+) -> list[ServiceToken]:
+    """Return the tokens of other services for the same regions, except those of `former` services."""
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
 
 def _claimed(
-    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event, former: Collection[str]
+    session: zenoh.Session, mine: frozenset[ServiceToken], stop: threading.Event, former: Collection[str]
 ) -> list[zenoh.LivelinessToken]:  # fmt: skip
-    def others_there() -> list[Served]:
-        return rivals(mine, tokens.standing(session) | tokens.standing(session, CLAIMS), former)
+    def others_there() -> list[ServiceToken]:
+        return rival_tokens(mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former)
 
     for _ in range(_TRIES):
         waited = 0.0
@@ -98,24 +100,24 @@ def _claimed(
     raise InputError("regions", "others start for them at the same time", "start one service for each region")
 
 
-def _declared(session: zenoh.Session, mine: frozenset[Served], root: str) -> list[zenoh.LivelinessToken]:
-    return [session.liveliness().declare_token(token.below(root)) for token in sorted(mine)]
+def _declared(session: zenoh.Session, mine: frozenset[ServiceToken], root: str) -> list[zenoh.LivelinessToken]:
+    return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(mine)]
 
 
 @contextmanager
-def standing_by(
+def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Of a standby: whether it would be heard if it took over now, as it reaches a router, whether the token of a
-    service stands, and `alive`. None: it is none, or was stopped before it reached a router."""
+    """Yield the signs of a standby: whether it reaches a router, whether a service's token is active, and `alive`. None
+    if it is no standby or was stopped before it reached a router."""
     session = zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
     if session is None:
         yield None
         return
-    waits = frozenset(Served(region, config.name, secrets.token_hex(4)) for region in config.regions)
-    with session, tokens.watched(session) as there, _standing(_declared(session, waits, WAITS)):
+    waits = frozenset(ServiceToken(region, config.name, secrets.token_hex(4)) for region in config.regions)
+    with session, tokens.track_tokens(session) as there, _standing(_declared(session, waits, WAITS)):
         yield (
             lambda: bool(list(session.info.routers_zid())),
-            lambda name: any(one.service == name for one in there.here),
+            lambda name: any(one.service == name for one in there.active),
             alive,
         )

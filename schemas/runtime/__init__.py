@@ -1,1 +1,2 @@
-"""Machinery that both halves start with: compiling, records, batches at speed, sessions, metrics, process, figures."""
+"""Machinery that both packages use: compiler, records, fast batch decoding, sessions, metrics, process set-up,
+figures."""

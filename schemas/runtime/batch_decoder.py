@@ -1,9 +1,9 @@
-"""Many payloads → one set of columns. Python is touched per message and per column, never per record.
+"""Decode many payloads into one set of columns. Python code runs per message and per column, never per record.
 
-A compiled walk (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages; then column by column
-the values of all are taken together. What the walk does not understand, JSON among it, the protobuf library reads and
-writes anew in the plain form, so that there is one way from bytes to columns. What is wrong with a message is an error
-beside the others and never their loss.
+A compiled scanner (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages. Then the values of
+all messages are read column by column. A message that the scanner does not understand, for example JSON, is decoded by
+the protobuf library and encoded again in the plain form. So there is one path from bytes to columns. An error in one
+message is reported for that message and does not affect the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from schemas import mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, Walked, gather, walk
+from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, ScannedFields, gather, walk
 from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
 from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, PresentColumns, complete, message_of
 
@@ -32,7 +32,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     if not walked.understood.all():
         for index in np.flatnonzero(~walked.understood).tolist():
             try:
-                plain[index] = _plainly(kind, *payloads[index])
+                plain[index] = _reencode(kind, *payloads[index])
             except WireError as error:
                 errors.append((index, error))
         wrong = {index for index, _ in errors}
@@ -43,16 +43,16 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     return complete(Decoded(indices, fields.heads(), *fields.columns(), errors), fields.sent())
 
 
-def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], Walked]:
+def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
     return data, walk(kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict)
 
 
-def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
-    """A message as our own encoder writes it.
+def _reencode(kind: Kind, payload: bytes, encoding: str) -> bytes:
+    """Return a message as our own encoder writes it.
 
     Raises:
-        WireError: it is none.
+        WireError: the payload is not a message of this kind.
     """
     message = message_of(kind, payload, encoding)
     message.DiscardUnknownFields()
@@ -61,26 +61,26 @@ def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
 
 
 class _Fields(NamedTuple):
-    """The fields of k messages, where they lie."""
+    """Positions of the fields of k messages."""
 
     kind: Kind
     data: NDArray[np.uint8]
-    walked: Walked
+    walked: ScannedFields
 
     @property
     def sizes(self) -> IntArray:
-        """Records of each message."""
+        """Return the number of records of each message, (k,)."""
         return self.walked.sizes
 
     def sent(self) -> PresentColumns:
-        """Which messages come with which column."""
+        """Return which messages contain which column."""
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))}
         )
 
     def heads(self) -> Heads:
-        """Heads, with the first of all sequence numbers held where the sender does not say which."""
+        """Return the heads; a missing `first_held` is the lowest sequence number."""
         data = self.data.tobytes()
         texts = {
             name: [
@@ -93,7 +93,7 @@ class _Fields(NamedTuple):
         return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 
     def columns(self) -> tuple[IntArray, Columns, BoolArray]:
-        """Sizes, columns as they were sent (integers wide) or filled, and which records have a likelihood."""
+        """Return sizes, columns (missing values filled, integers widened), and which records have a likelihood."""
         out: Columns = {}
         n = int(self.sizes.sum())
         likelihood = np.zeros(n, bool)

@@ -1,4 +1,4 @@
-"""What both command lines share: the frame around a command, negative numbers, versions, completion, who may be told.
+"""Frame of both command lines: error handling, negative numbers, version, completion, quiet mode.
 
 Exit codes: 0 done, 1 done and something failed or was left, 2 misuse or bad input, 3 not plausible (edge-agent), 130
 ended by Ctrl-C.
@@ -25,7 +25,7 @@ _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
 class Command(NamedTuple):
-    """A subcommand: its module has `add_arguments(parser)` and `run(arguments) -> int`."""
+    """Subcommand; its module has `add_arguments(parser)` and `run(arguments) -> int`."""
 
     name: str
     module: str
@@ -34,7 +34,7 @@ class Command(NamedTuple):
 
 
 def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen: str | None) -> argparse.ArgumentParser:
-    """All commands by name, and the options of those chosen; the modules of the others are not imported."""
+    """Return a parser with all commands by name and the options of the chosen ones; other modules are not imported."""
     parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument("--version", action=VersionAction)
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -47,8 +47,8 @@ def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen:
     return parser
 
 
-def joined(argv: Sequence[str]) -> list[str]:
-    """The words of a command line, `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`: argparse takes a minus for an option."""
+def join_negative_numbers(argv: Sequence[str]) -> list[str]:
+    """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`, because argparse takes a leading minus for an option."""
     out: list[str] = []
     for word in argv:
         if _NEGATIVE.match(word) and out and re.fullmatch(r"--[a-z-]+", out[-1]):
@@ -59,7 +59,7 @@ def joined(argv: Sequence[str]) -> list[str]:
 
 
 def add_command(commands: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:  # noqa: ANN401 argparse's own
-    """A subcommand with its example, and with the options that all have."""
+    """Add a subcommand with its example and the common options."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=about, epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -71,24 +71,24 @@ def add_command(commands: Any, name: str, about: str, example: str) -> argparse.
 
 
 def wants_quiet(arguments: Sequence[str]) -> bool:
-    """Whether a command line asks for errors only, before it is parsed."""
+    """Return True if a command line, not yet parsed, asks for errors only."""
     return not {"-q", "--quiet"}.isdisjoint(arguments)
 
 
 class VersionAction(argparse.Action):
-    """`--version`: that of the distribution that is installed."""
+    """`--version`: print the version of the installed distribution."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: object) -> None:
         super().__init__(option_strings, dest, nargs=0, help="show the version and leave", default=argparse.SUPPRESS)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        """Print it and leave."""
+        """Print the version and exit."""
         print(f"{parser.prog} {version()}")
         parser.exit(0)
 
 
 def version() -> str:
-    """Version of the distribution, or of a source tree that was never installed."""
+    """Return the version of the distribution, or of a source tree that was never installed."""
     from importlib import metadata
 
     try:
@@ -97,11 +97,11 @@ def version() -> str:
         return "unknown (not installed)"
 
 
-def guarded(run: Callable[[], int]) -> int:
-    """Run a command; misuse, Ctrl-C and a reader that left end it with a line at most.
+def run_guarded(run: Callable[[], int]) -> int:
+    """Run a command; misuse, Ctrl-C and a closed output pipe end it with at most one line.
 
     Returns:
-        its exit code.
+        the exit code.
     """
     try:
         return int(run())
@@ -117,10 +117,10 @@ def guarded(run: Callable[[], int]) -> int:
 
 
 def out_folder(field: str, path: Path) -> Path:
-    """A path to write, before anything is computed for it.
+    """Return a path to write; check it before anything is computed.
 
     Raises:
-        InputError: it is a folder, or lies in none.
+        InputError: the path is a folder, or its parent folder does not exist.
     """
     if path.is_dir():
         raise InputError(field, f"{path} is a folder", "name a file")
@@ -132,11 +132,11 @@ def out_folder(field: str, path: Path) -> Path:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Write the file that `--out` names in this block.
+def report_write_errors(path: Path) -> Iterator[None]:
+    """Turn errors of writing the `--out` file inside this block into input errors.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         yield
@@ -144,11 +144,11 @@ def writing(path: Path) -> Iterator[None]:
         raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
-def ending(field: str, path: Path, known: Sequence[str]) -> str:
-    """The ending of a path, which decides the format; the longest that fits.
+def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
+    """Return the ending of a path, which selects the format; the longest match wins.
 
     Raises:
-        InputError: it is none of those known.
+        InputError: the ending is unknown.
     """
     fits = [one for one in known if path.name.endswith(one)]
     if not fits:
@@ -156,8 +156,8 @@ def ending(field: str, path: Path, known: Sequence[str]) -> str:
     return max(fits, key=len)
 
 
-def not_an_input(field: str, out: Path, inputs: Sequence[Path]) -> None:
-    """Refuse to write over what is read.
+def refuse_input_path(field: str, out: Path, inputs: Sequence[Path]) -> None:
+    """Refuse to overwrite an input file.
 
     Raises:
         InputError: the file to write is one of the inputs.
@@ -168,10 +168,10 @@ def not_an_input(field: str, out: Path, inputs: Sequence[Path]) -> None:
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """The script that completes a command line in a shell.
+    """Return the completion script for a shell.
 
     Raises:
-        InputError: no such shell.
+        InputError: the shell is not supported.
     """
     if shell not in SHELLS:
         raise InputError("shell", f"{shell!r} is none", f"use one of {', '.join(SHELLS)}")

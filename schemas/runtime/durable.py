@@ -1,4 +1,4 @@
-"""Files and folders that power loss does not forget, and files that are there whole or not at all."""
+"""Durable files: they survive power loss, and they are either complete or absent."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ _OWN: Final = ".drafts-"
 
 
 def draft_of(path: Path) -> Path:
-    """Where a file is written before it has its name; the dot hides it from Spark and pyarrow."""
+    """Return the path of a file's draft; the leading dot hides it from Spark and pyarrow."""
     return path.with_name(f".{path.name}{ENDING}")
 
 
 @contextmanager
-def written(path: Path, mode: int | None = None, *, named: bool = True) -> Iterator[BufferedWriter]:
-    """A file to write, that appears under its name whole and durable when the block ends; as it was before if it fails.
+def open_durably(path: Path, mode: int | None = None, *, named: bool = True) -> Iterator[BufferedWriter]:
+    """Open a file that appears under its name, complete and durable, when the block ends. If the block fails, nothing
+    changes.
 
     Args:
-        path: of the file; one that is there is replaced.
-        mode: permissions, which the draft has from its first byte on; those of every new file if None.
-        named: whether its name is durable too at the end; else the caller syncs the folder.
+        path: of the file; an existing one is replaced.
+        mode: permissions, which the draft has from its first byte on; the default permissions if None.
+        named: True to make the name durable too; otherwise the caller syncs the folder.
 
     Raises:
-        OSError: the disk is full or read-only; nothing is left of it.
+        OSError: the disk is full or read-only; no draft is left.
     """
     draft = draft_of(path)
     try:
@@ -52,14 +53,17 @@ def written(path: Path, mode: int | None = None, *, named: bool = True) -> Itera
 
 @contextmanager
 def own_drafts(folder: Path) -> Iterator[Path]:
-    """A folder within `folder` for drafts that are renamed when they are whole: two tries at one file, on one machine
-    or on two, write different drafts. What a try leaves that is killed goes by `sweep_drafts`."""
+    """Create a folder within `folder` for drafts that are renamed when they are complete.
+
+    Two attempts at one file, on one or two machines, write different drafts. `sweep_drafts` removes what a killed
+    attempt leaves.
+    """
     with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
         yield Path(drafts)
 
 
 def sweep_drafts(folder: Path) -> None:
-    """Remove the drafts of tries that died, when none is under way."""
+    """Remove the drafts of attempts that died; call it only when no attempt is running."""
     for drafts in folder.glob(f"{_OWN}*"):
         shutil.rmtree(drafts, ignore_errors=True)
 
@@ -74,7 +78,7 @@ def sync_directory(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and the ones above it, such that power loss does not forget them."""
+    """Create a folder and its parents so that power loss does not lose them."""
     if not folder.exists():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Figures that a campaign measured, each with its bar: one `figures.json`, and the table made from it."""
+"""Figures measured by a campaign, each with its bar: the file `figures.json` and a table."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Figure:
     """One measured value.
 
     Attributes:
-        bar: what it is held against; a pair for "within"; None where it is only shown.
-        better: on which side of the bar it must lie.
+        bar: limit of the value; a pair for "within"; None if the value is only shown.
+        better: the side of the bar on which the value must lie.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """Whether the bar holds; NaN (not measured) never does."""
+        """True if the bar holds; NaN (not measured) never does."""
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
@@ -42,7 +42,7 @@ class Figure:
 
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
-    """What a figure depends on besides the code: commit, machine, versions, seeds, date."""
+    """Return the conditions of a measurement: commit, machine, versions, seeds, date."""
     return {
         "campaign": campaign,
         "commit": commit(Path(__file__)),
@@ -54,10 +54,11 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
 
 
 def commit(source: Path) -> str:
-    """Commit of the repository that a source file belongs to; with `-dirty` where a file that it knows was changed.
+    """Return the commit of the repository that a source file belongs to; `-dirty` is appended if a tracked file was
+    changed.
 
-    The repository of the working directory may be another, and an installed copy may lie inside one that does not know
-    it: "unknown" then.
+    The repository of the working directory may be a different one. An installed copy may lie inside a repository that
+    does not track it; the result is then "unknown".
     """
     git = ["git", "-C", str(source.parent)]
     describe = [*git, "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty"]
@@ -78,7 +79,7 @@ def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Fig
 
 
 def markdown(figures: Sequence[Figure]) -> str:
-    """The figures as a Markdown table; a bar that does not hold says so."""
+    """Return the figures as a Markdown table; a missed bar is marked."""
     lines = ["| figure | value | bar | |", "|---|---|---|---|"]
     for name, *rest in map(row, figures):
         lines.append(f"| `{name}` | {' | '.join(rest)} |")
@@ -86,7 +87,7 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 
 def row(figure: Figure) -> list[str]:
-    """Name, value with unit, bar and verdict of a figure; a bar that does not hold says so."""
+    """Return name, value with unit, bar and verdict of a figure."""
     signs, bar = {"less": "≤ ", "more": "≥ "}, figure.bar
     value = f"{figure.value:.4g} {figure.unit}"
     if bar is None:

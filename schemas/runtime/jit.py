@@ -1,4 +1,4 @@
-"""The one way of compiling a kernel, shared by the packages."""
+"""Compilation of kernels; the only way to compile one in all packages."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 
 class _Told(event.Listener):
-    """A compilation takes its time: whoever waits is told."""
+    """Listener that reports compilations, because they take time."""
 
     def on_start(self, event: event.Event) -> None:
-        """Say it, once a process."""
-        talk.say_once(talk.COMPILING)
-        talk.doing(f"compiling {event.data['dispatcher'].__name__}")
+        """Report the first compilation of the process."""
+        progress_messages.report_once(progress_messages.COMPILING)
+        progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
 
     def on_end(self, event: event.Event) -> None:
-        """It took as long as it took."""
+        """Do nothing."""
 
 
 event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
@@ -43,38 +43,38 @@ R = TypeVar("R")
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not an exception).
 
-    Without fast-math and threads the result of a row does not depend on how many rows there are,
-    which is what makes a bank of N = 1 and of N = thousands bit-equal. Where the cache's disk is full, a kernel is
-    compiled at each start.
+    Without fast-math and threads the result of a row does not depend on the number of rows. Banks of N = 1 and of N =
+    thousands are therefore bit-equal. If the cache's disk is full, a kernel is compiled at each start.
     """
     return _compile(function)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """`compiled` into each of its callers: for a few lines of arithmetic in a loop, where a call costs more than they.
+    """Compile `function` into each of its callers; for a few lines of arithmetic in a loop, where a call costs more.
 
-    The optimiser then works on the four wheels side by side. Callers hand such functions numbers and tuples: what is
-    read from an array has to be read again after every write to another.
+    The optimiser can then vectorise over the four wheels. Pass numbers and tuples to such functions: values of an array
+    must be read again after every write to another array.
     """
     return _compile(function, forceinline=True)
 
 
 def nogil(function: Callable[P, R]) -> Callable[P, R]:
-    """`compiled`, and other Python threads run meanwhile: for long kernels that touch only what they are handed."""
+    """Compile `function` and release the interpreter lock while it runs; for long kernels that touch only their
+    arguments."""
     return _compile(function, nogil=True)
 
 
 def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
-    """`nogil`, without counting references to arrays: two locked additions for each array at each call.
+    """Compile like `nogil`, without counting references to arrays, which costs two locked additions per array and call.
 
-    For functions that make no array and return none, so that all they touch belongs to the caller; what they call must
-    be `refcount_free` too.
+    Only for functions that neither create nor return arrays, so that the caller owns everything they touch. Functions
+    that they call must be `refcount_free` too.
     """
     return _compile(function, nogil=True, references=False)
 
 
 def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """`refcount_free` into each of its callers: an array handed over costs seven words."""
+    """Compile like `refcount_free` into each caller; an array argument costs seven words."""
     return _compile(function, nogil=True, forceinline=True, references=False)
 
 
@@ -99,9 +99,9 @@ prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
-    """The machine code of a compiled function that has been called, without numba's look at the arguments (.3 us).
+    """Return the machine code of a compiled function that was called before, without numba's argument check (0.3 us).
 
-    Every argument must be of the kind that it had in that call: nobody checks it again.
+    Every argument must have the same type as in that call. Types are not checked again.
     """
     made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
     return cast(Callable[P, R], made.entry_point)
@@ -121,10 +121,10 @@ def _compile(
 
 
 class _Cache(FunctionCache):
-    """Numba's own, but for a full disk, where it raises and would take the process with it, and for closures."""
+    """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
 
     def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
-        """A closure is known by the names of what it closes over: numba pickles it, differently in each process."""
+        """Identify a closure by the names that it closes over, because numba's pickle of it differs per process."""
         cells = self._py_func.__closure__
         if cells is None:
             return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
@@ -133,17 +133,17 @@ class _Cache(FunctionCache):
         return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
     def save_overload(self, sig: object, data: object) -> None:
-        """Save, if the disk lets us."""
+        """Save the compiled code if the disk allows it."""
         with suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 @functools.cache
 def kernel_cache(package: str) -> str:
-    """Folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
+    """Return the folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
 
-    Numba's own cache looks only at the file of a kernel and not at those that it calls or takes constants from, and
-    would go on with what was compiled before a change. Old folders may be deleted at any time.
+    Numba's own cache checks only the file of a kernel, not the files of its callees and constants. It would continue
+    with outdated code after a change there. Old folders may be deleted at any time.
     """
     root, digest = Path(__file__).parents[2], hashlib.blake2b(digest_size=8)
     for folder in (root / "schemas", root / package):
@@ -154,10 +154,10 @@ def kernel_cache(package: str) -> str:
 
 @functools.cache
 def cache_root() -> Path | None:
-    """Where compiled kernels may lie: the user's cache, else a folder of the user's own among the temporary files.
+    """Return the folder for compiled kernels: the user's cache, or else a folder of the user among the temporary files.
 
-    None where neither can be written (a service account without a home, a read-only container): kernels are then
-    compiled at each start.
+    None if neither can be written (a service account without a home, a read-only container). Kernels are then compiled
+    at each start.
     """
     for folder in _roots():
         with suppress(OSError):

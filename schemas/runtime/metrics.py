@@ -1,6 +1,6 @@
-"""How a running part is seen: OpenMetrics at `/metrics`, its health at `/healthz`, on loopback unless set otherwise.
+"""Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on loopback by default.
 
-Values are read when they are asked for; nothing is counted twice for the sake of being shown.
+Values are read when they are requested; nothing is counted only for display.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ READ_S: Final = 5.0  # a silent client is cut off
 
 
 class Metric(NamedTuple):
-    """One family of values: a counter only grows. `label` names what tells the values apart; "" for a single one."""
+    """Family of values; a counter only grows. `label` names the dimension; "" for a single value."""
 
     name: str
     kind: Literal["counter", "gauge"]
@@ -32,7 +32,7 @@ class Metric(NamedTuple):
 
 
 def gauge(name: str, text: str, value: float) -> Metric:
-    """A single value that goes up and down."""
+    """Return a single value that can rise and fall."""
     return Metric(name, "gauge", text, {"": value})
 
 
@@ -41,16 +41,16 @@ Troubles = Callable[[], Sequence[str]]
 
 
 @contextmanager
-def serving(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
-    """Serve while the block runs; gives the address, or None where `port` is None. Port 0 is a free one.
+def serve_metrics(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
+    """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a free port.
 
     Args:
         host, port: where to listen.
-        read: all values, now.
-        troubles: what is not as it should be, a sentence each; none is healthy.
+        read: returns all current values.
+        troubles: returns one message per problem; an empty list means healthy.
 
     Raises:
-        InputError: the port is taken, or the package for the format is missing.
+        InputError: the port is in use, or the package for the format is missing.
     """
     if port is None:
         yield None
@@ -124,4 +124,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """A scrape is no event."""
+        """Do not log requests."""

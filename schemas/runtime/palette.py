@@ -1,8 +1,7 @@
-"""Colours of everything that is drawn: they survive three kinds of colour blindness and a grey printer.
+"""Colours of all plots and pages, distinguishable with three kinds of colour blindness and in greyscale.
 
-`GRIP` is viridis (van der Walt and Smith 2015): its lightness rises all the way, so that darker is more slippery on any
-paper. What was not measured has no colour: it is white and hatched, and never a shade of the scale.
-`tests/test_palette.py` computes the distances.
+`GRIP` is viridis (van der Walt and Smith 2015). Its lightness increases monotonically, so darker is more slippery in
+print too. Unmeasured areas have no colour: they are white and hatched. `tests/test_palette.py` computes the distances.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ UNKNOWN: Final = "not measured: only lower bounds"
 
 
 class LineStyle(NamedTuple):
-    """How a line is drawn, everywhere; `dash` as matplotlib writes it."""
+    """Style of a line in all plots; `dash` in matplotlib's notation."""
 
     colour: str
     dash: str = "-"
@@ -42,12 +41,12 @@ OTHER: Final = LineStyle("#777777", ":")  # an estimator from outside
 
 
 def line_of(estimator: str) -> LineStyle:
-    """The line of an estimator by name."""
+    """Return the line style of an estimator by name."""
     return ESTIMATORS.get(estimator, OTHER)
 
 
 def shade(value: float, low: float, high: float) -> str:
-    """Colour of a value on GRIP between `low` and `high`, as the pages compute it too."""
+    """Return the colour of a value on GRIP between `low` and `high`; the pages compute the same."""
     at = min(max((value - low) / (high - low), 0.0), 1.0) * (len(GRIP) - 1)
     k = min(int(at), len(GRIP) - 2)
     first, second = (_rgb(GRIP[j]) for j in (k, k + 1))

@@ -1,12 +1,12 @@
-"""What other distributions bring: entry points, by group and name. A name of our own is never replaced.
+"""Plug-ins of other distributions: entry points by group and name. They never replace a built-in name.
 
     [project.entry-points."gripmap.estimators"]
     mine = "my_package.estimators:bank"
 
-group                   what stands behind a name
-gripmap.estimators      bank(vehicles) with `advance` as EstimatorBank has it
-gripmap.tyre_curves     curve(theta): force over its peak of normalised slips, an array; `--estimator aco-fckf@name`
-gripmap.sources         blocks(address), an iterator of edge_agent.Block; asked for as `--source name:address`
+group                   object behind a name
+gripmap.estimators      bank(vehicles) with `advance` as in EstimatorBank
+gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array; `--estimator aco-fckf@name`
+gripmap.sources         blocks(address), an iterator of edge_agent.Block; used by `--source name:address`
 gripmap.questions       a fleet_service.analytics.questions.Question
 """
 
@@ -25,20 +25,20 @@ QUESTIONS: Final = "gripmap.questions"
 
 
 @cache
-def found(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group, by name."""
+def entry_points_of(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by name."""
     return {point.name: point for point in entry_points(group=group)}
 
 
-def loaded(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
-    """What stands behind a name.
+def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
+    """Import the object behind a name.
 
     Raises:
         InputError: it cannot be imported.
     """
     try:
-        return found(group)[name].load()
+        return entry_points_of(group)[name].load()
     except (ImportError, AttributeError) as error:
         field = group.rpartition(".")[2].removesuffix("s")
-        where = found(group)[name].value
+        where = entry_points_of(group)[name].value
         raise InputError(field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it") from error

@@ -1,4 +1,4 @@
-"""Set-up of a long-lived process: memory, and its log lines, text for people or JSON lines for programs."""
+"""Set-up of a long-lived process: memory limits, and log lines as text or as JSON."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
 _LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
 
 
-class Line(str):
-    """A line with its numbers by name, for those who read JSON."""
+class LogLine(str):
+    """Log line with its values by name, for the JSON form."""
 
     __slots__ = ("values",)
 
-    def __new__(cls, text: str, **values: object) -> Line:
-        """Text for people, values for programs."""
+    def __new__(cls, text: str, **values: object) -> LogLine:
+        """Create a line from text for people and values for programs."""
         line = super().__new__(cls, text)
         line.values = values
         return line
@@ -35,16 +35,15 @@ class Line(str):
 
 
 def limit_memory(*without: str) -> None:
-    """Keep from a process that lives long what its libraries would do for others; call it at its very start.
+    """Prevent libraries from using memory and threads that a long-lived process does not need; call it first.
 
     Args:
-        without: modules that its libraries can do without, and it does.
+        without: modules that the libraries can do without; importing them is blocked.
 
-    Arrow loads pandas, where that is installed, to look whether what it is handed is a data frame: half a second, and
-    30 MB for good. The linear algebra behind numpy starts a thread a core, which wait for each other by turning: on
-    products as small as ours they double the processor time. And the allocator learns from the first large array that
-    is given back to keep the next ones, among which small things stay behind: a tenth of a gigabyte. Arrow's own
-    allocator keeps some for each thread that ever used it.
+    Arrow imports pandas, if installed, to recognise data frames: half a second and 30 MB. The linear algebra library of
+    numpy starts one thread per core, and these threads busy-wait; on our small products this doubles the processor
+    time. The allocator keeps large freed arrays, and small objects stay among them: about 0.1 GB. Arrow's own allocator
+    keeps memory for each thread that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
@@ -54,15 +53,15 @@ def limit_memory(*without: str) -> None:
 
 
 def trim_memory() -> None:
-    """Give the system what lies free between what is in use: after work that takes much memory for a short time."""
+    """Return free memory to the system, after work that needed much memory for a short time."""
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def end_now(code: int) -> NoReturn:
-    """End the process with an exit code, although one of its threads hangs; call it when its files are closed.
+def force_exit(code: int) -> NoReturn:
+    """End the process with an exit code although a thread hangs; call it after closing files.
 
-    What the threads are doing ends at this instant. What was printed is printed.
+    Threads stop at once. Printed text is flushed.
     """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # a full disk, a reader that left, a closed stream
@@ -70,17 +69,15 @@ def end_now(code: int) -> NoReturn:
     os._exit(code)
 
 
-def leave(code: int) -> NoReturn:
-    """End the process as a command does whose work is done, without taking the interpreter apart.
+def exit_fast(code: int) -> NoReturn:
+    """Exit without interpreter teardown.
 
-    Each compiled kernel is a module of LLVM: after a first use, taking some hundred of them apart was five seconds
-    without a word, beside other work; and a thread of a library that calls back meanwhile, a Zenoh session's, would
-    abort the process. As at Python's own end, threads that are no daemons are waited for, and what is registered for
-    the exit runs.
+    Unloading hundreds of LLVM modules takes about five seconds, and a Zenoh callback during teardown aborts the
+    process. As at a normal exit, non-daemon threads are joined and exit handlers run.
     """
     threading._shutdown()  # type: ignore[attr-defined] # no public way
     atexit._run_exitfuncs()
-    end_now(code)
+    force_exit(code)
 
 
 class _Without(MetaPathFinder):
@@ -93,29 +90,30 @@ class _Without(MetaPathFinder):
 
 
 def print_line(line: str, stream: TextIO) -> None:
-    """Print a line at once, whole also where other threads print; what lies behind the stream (a full disk, a reader
-    that left) never ends the process."""
+    """Print a line at once and as a whole, also with several threads. Errors of the stream (full disk, closed pipe) are
+    ignored."""
     with suppress(OSError):
         stream.write(f"{line}\n")  # in one piece: `print` writes the end of a line by itself
         stream.flush()
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
-    """What takes the lines; as JSON each with time, process and `who`, the first word as its event."""
+    """Return a function that prints log lines; in JSON each has time, process and `who`, and the first word is the
+    event."""
 
     def text(line: str) -> None:
         print_line(line, stream)
 
     def as_json(line: str) -> None:
         event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
-        values = line.values if isinstance(line, Line) else {}
+        values = line.values if isinstance(line, LogLine) else {}
         print_line(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
 
     return text if form == "text" else as_json
 
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
-    """Let warnings of the program and its libraries go to `stream` in this form."""
+    """Send warnings of the program and its libraries to `stream` in this form."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(_Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)

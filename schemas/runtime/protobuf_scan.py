@@ -1,9 +1,9 @@
-"""Where everything lies in the bytes of many protobuf batches: one compiled walk, no object per message.
+"""Scanner that finds the fields in the bytes of many protobuf batches, compiled and without an object per message.
 
-The protobuf module stays the one authority. This reader knows only what our own encoder, and any other that
-follows the .proto plainly, writes: each field once, columns packed, numbers that fit, names of plain letters, columns
-of one length. All else it marks as not understood; then `batch_decoder` has the module read it and write it anew.
-Source: protobuf's encoding reference (tags, varints, packed fields).
+The protobuf library stays the authority. The scanner understands only messages as our own encoder, or any plain encoder
+of the .proto, writes them: each field once, columns packed, numbers in range, plain ASCII names, columns of equal
+length. It marks all others as not understood, and `batch_decoder` lets the library decode and encode them. Source:
+protobuf's encoding reference (tags, varints, packed fields).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _TEXT: Final = len(NUMBERS)  # roles: numbers, texts, columns
 _COLUMN: Final = _TEXT + len(TEXTS)
 
 
-class Walked(NamedTuple):
-    """Where the fields of k messages lie in their bytes.
+class ScannedFields(NamedTuple):
+    """Positions of the fields of k messages in their bytes.
 
     Attributes:
-        understood: whether the rest holds for a message, (k,).
-        numbers: NUMBERS of each, (k, 4).
+        understood: True if the other attributes are valid for a message, (k,).
+        numbers: NUMBERS of each message, (k, 4).
         texts: begin and end of TEXTS, (k, 2, 2).
-        begins: of each column, (k, columns).
-        counts: elements of each column, (k, columns); bytes of the likelihood.
-        sizes: records of each, (k,).
+        begins: begin of each column, (k, columns).
+        counts: elements of each column, (k, columns); bytes for the likelihood.
+        sizes: records of each message, (k,).
     """
 
     understood: BoolArray
@@ -54,7 +54,8 @@ class Walked(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """A kind of message as arrays: role of each field number; width, elements a record and need of each column."""
+    """Layout of a kind of message as arrays: role of each field number; width, elements per record and need of each
+    column."""
 
     roles: IntArray
     widths: IntArray
@@ -63,12 +64,12 @@ class _Layout(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """What a walk reads and fills: all bytes, the kind's layout, whether a name must be plain ASCII, the result."""
+    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, the result."""
 
     data: ByteArray
     layout: _Layout
     strict: bool
-    out: Walked
+    out: ScannedFields
 
 
 @cache
@@ -85,18 +86,18 @@ def _layout(kind: Kind) -> _Layout:
     )  # fmt: skip
 
 
-def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Walked:
-    """Look through messages that lie one after the other in `data`, each up to its end (k,).
+def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
+    """Scan messages that follow each other in `data`.
 
     Args:
         kind: of the messages.
         data: all bytes.
-        ends: of each message.
-        strict: whether a name that is not plain ASCII is left to the module; not when it wrote the bytes itself.
+        ends: end of each message, (k,).
+        strict: True to leave names that are not ASCII to the library; False if the library wrote the bytes.
     """
     layout, k = _layout(kind), len(ends)
     columns = len(layout.widths)
-    out = Walked(
+    out = ScannedFields(
         np.zeros(k, bool), np.zeros((k, len(NUMBERS)), np.int64), np.zeros((k, len(TEXTS), 2), np.int64),
         np.zeros((k, columns), np.int64), np.zeros((k, columns), np.int64), np.zeros(k, np.int64),
     )  # fmt: skip
@@ -105,8 +106,9 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Wa
     return out
 
 
-def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArray[Any]) -> None:
-    """Copy a column of all messages behind each other into an array (n, …) that holds what absent ones read as."""
+def gather(data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]) -> None:
+    """Copy a column of all messages, one after the other, into an array (n, …) that is filled with the default
+    value."""
     width, each = int(_layout(kind).widths[column]), int(_layout(kind).per_record[column])
     begins, counts = walked.begins[:, column], walked.counts[:, column]
     if width:
@@ -117,7 +119,7 @@ def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArr
 
 @refcount_free
 def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
-    """A number and where it ends; -1 where it is none of at most 64 bits."""
+    """Return a number and its end; the end is -1 if it is not a number of at most 64 bits."""
     value, shift = 0, 0
     while at < end and shift < 64:
         byte = int(data[at])
@@ -133,7 +135,7 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Fill the result for all messages; `first`: the column whose length is the number of records."""
+    """Fill the result for all messages; `first` is the column whose length is the number of records."""
     data, layout, out = scan.data, scan.layout, scan.out
     at = 0
     for k in range(len(ends)):
@@ -156,7 +158,7 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
 
 @refcount_free
 def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
-    """Note one field of message k; returns where it ends, or -1 where it is not as we write it."""
+    """Record one field of message k; return its end, or -1 if it is not as our encoder writes it."""
     data, out = scan.data, scan.out
     if role == 0:  # boot
         if wire != _FIXED64 or end - at < 8:

@@ -1,11 +1,11 @@
-"""Rows of named fields, as one NumPy array of a structured type: what a compiled kernel carries for each vehicle.
+"""Records of named fields as a NumPy structured array: the state that a compiled kernel carries per vehicle.
 
 The annotations of a class are the fields: float, int, bool, a NumPy number, another such class, or
-Annotated[FloatArray, size, ...] and likewise for arrays of the other numbers.
-`record_type` makes the type of it and `records` the array; a kernel sees a row as an object with these names.
+Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns the type and `records`
+the array. A kernel sees a row as an object with these names.
 
-Why not a tuple of arrays: handing one to a kernel costs .1 to .3 us for each array in it, a record array as much as one
-of them; what belongs to one vehicle lies together; and sizes are constants, so that short loops are unrolled.
+Why not a tuple of arrays: each array in it costs 0.1 to 0.3 us per call, and a record array costs as much as one of
+them. The data of one vehicle is contiguous, and sizes are constants, so short loops are unrolled.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ RecordArray: TypeAlias = NDArray[np.void]
 R_co = TypeVar("R_co", covariant=True)
 
 
-class Nothing:
-    """A record without anything to say."""
+class EmptyRecord:
+    """Record without fields."""
 
     unused: bool
 
@@ -41,20 +41,20 @@ KINDS: dict[Any, Any] = {
 
 
 class Records(Protocol[R_co]):
-    """A record array as a kernel sees it: rows with the fields of R."""
+    """Record array as a kernel sees it: rows with the fields of R."""
 
     def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
-        """The row, which is part of the array."""
+        """Return a row, which is a view into the array."""
         ...
 
     def __setitem__(self, index: int | tuple[int, int], row: object, /) -> None:
-        """Copy another row there."""
+        """Copy another row into this one."""
         ...
 
 
 @cache
 def record_type(kind: type) -> np.dtype[np.void]:
-    """The structured type whose fields are the annotations of `kind`, those of its bases first."""
+    """Return the structured type whose fields are the annotations of `kind`, those of its bases first."""
     fields = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         held, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
@@ -63,12 +63,12 @@ def record_type(kind: type) -> np.dtype[np.void]:
 
 
 def records(kind: type, *shape: int) -> RecordArray:
-    """Rows of `kind` in an array of this shape, all zero."""
+    """Return an array of rows of `kind`, all zero."""
     return np.zeros(shape, record_type(kind))
 
 
 def put_record(row: np.void, value: tuple[Any, ...]) -> None:
-    """A row becomes the value of a named tuple whose annotations say the fields."""
+    """Copy the values of a named tuple into a row; its annotations give the fields."""
     for name, part in zip(row.dtype.names or (), value, strict=True):
         if isinstance(part, tuple):
             put_record(row[name], part)

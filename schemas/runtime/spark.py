@@ -1,7 +1,7 @@
-"""Spark, where it is installed: a session, and tasks that it spreads over the machines of a cluster.
+"""Spark session and distribution of tasks over a cluster.
 
-A task is done on its own, whenever and wherever, and again where its machine failed; so it writes each file under a
-name that depends on the task alone, by a rename of a draft that no other try has.
+A task runs independently, and again if its machine fails. It therefore writes each file under a name that depends on
+the task alone, by renaming a draft that no other attempt uses.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ SETTINGS: Final = {
 
 
 def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without types
-    """The session of this process: of the cluster that spark-submit or Spark's own settings name, else of this machine.
+    """Return the Spark session of this process: of the cluster that spark-submit or Spark's settings name, or of this
+    machine.
 
     Raises:
-        InputError: Spark or a Java is missing.
+        InputError: Spark or Java is missing.
     """
     try:
         from pyspark.errors import PySparkRuntimeError
@@ -51,18 +52,18 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
 
 
 def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcome]) -> list[_Outcome]:  # noqa: ANN401
-    """Do all tasks, one of Spark's for each; outcomes in the order of the tasks.
+    """Run all tasks, each as one Spark task; return outcomes in the order of the tasks.
 
-    A task that fails, or whose machine does, is tried as often as `spark.task.maxFailures` says. What a try says that
-    failed is not heard: an outcome counts once.
+    A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt is ignored, so an
+    outcome counts once.
 
     Args:
         session: of Spark.
-        tasks: that pickle knows.
-        work: does one; a function of a module that is installed on all machines, or a partial of one.
+        tasks: picklable.
+        work: processes one task; a function of a module that is installed on all machines, or a partial of one.
 
     Raises:
-        InputError: of a task; such a one is not tried again.
+        InputError: raised by a task; such a task is not repeated.
     """
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
@@ -96,5 +97,5 @@ def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcom
 
 
 def _unpacked(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
-    """Numbers and tasks, or outcomes."""
+    """Yield numbers with their tasks or outcomes."""
     return (pickle.loads(one) for one in column.to_pylist())

@@ -1,4 +1,4 @@
-"""Who serves which region, as the services' liveliness tokens tell: now, or watched."""
+"""Liveliness tokens of services: which service serves which region, once or continuously."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Final
 import zenoh
 
 from schemas.errors import InputError
-from schemas.keys import SERVES, Served, parse_served
+from schemas.keys import SERVES, ServiceToken, parse_served
 
 ANSWER_S: Final = 2.0  # for a router to tell which tokens there are
 _ALL: Final = f"{SERVES}/**"
 
 
-def standing(session: zenoh.Session, root: str = SERVES) -> set[Served]:
-    """The tokens that stand now, as far as this session may see them; or those below another root."""
-    found = set[Served]()
+def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
+    """Return the tokens that are active now and visible to this session; or those below another root."""
+    found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
         if reply.ok is not None:
             with suppress(InputError):  # a stranger's
@@ -26,37 +26,42 @@ def standing(session: zenoh.Session, root: str = SERVES) -> set[Served]:
     return found
 
 
-class Watched:
-    """Tokens that stand, kept up."""
+class PresenceTracker:
+    """Tokens that are tracked continuously."""
 
     def __init__(self) -> None:
-        self._guard, self._here, self._withdrawn, self._fell = Lock(), set[Served](), set[Served](), set[Served]()
+        self._guard, self._here, self._withdrawn, self._fell = (
+            Lock(),
+            set[ServiceToken](),
+            set[ServiceToken](),
+            set[ServiceToken](),
+        )
 
     @property
-    def here(self) -> set[Served]:
-        """Those that stand."""
+    def active(self) -> set[ServiceToken]:
+        """Return the active tokens."""
         with self._guard:
             return set(self._here)
 
     @property
-    def withdrawn(self) -> set[Served]:
-        """Those that stood and fell."""
+    def lost(self) -> set[ServiceToken]:
+        """Return the tokens that were active and are not any more."""
         with self._guard:
             return set(self._withdrawn)
 
     @property
-    def fell(self) -> set[Served]:
-        """Those that fell at any time; they may be back."""
+    def ever_lost(self) -> set[ServiceToken]:
+        """Return the tokens that were lost at any time; they may be active again."""
         with self._guard:
             return set(self._fell)
 
-    def asked(self, session: zenoh.Session) -> set[Served]:
-        """Those that stand now. A router's answer may lack the token that it is just telling to the same session's
-        subscription (1 of 60 answers), which is then heard before the answer ends."""
-        return standing(session) | self.here
+    def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
+        """Query the active tokens. A router's answer may lack a token that it is just sending to the same session's
+        subscription (1 of 60 answers); the subscription then delivers it before the answer ends."""
+        return active_tokens(session) | self.active
 
-    def take(self, token: Served, *, stands: bool) -> None:
-        """A token stands, or fell."""
+    def record(self, token: ServiceToken, *, stands: bool) -> None:
+        """Record that a token became active or was lost."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)
@@ -65,19 +70,19 @@ class Watched:
 
 
 @contextmanager
-def watched(session: zenoh.Session) -> Iterator[Watched]:
-    """The tokens, from those that stand at the beginning of the block on."""
-    tokens = Watched()
+def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
+    """Yield a tracker of the tokens, from those active at the beginning of the block on."""
+    tokens = PresenceTracker()
 
     def hear(sample: zenoh.Sample) -> None:
         with suppress(InputError):
-            tokens.take(parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT)
+            tokens.record(parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT)
 
     # at once, on the thread that receives: what fell is known before the answer to any later question is
     subscriber = session.liveliness().declare_subscriber(_ALL, zenoh.handlers.Callback(hear, indirect=False))
-    for token in standing(session):  # a get ends when all were told, which a subscription's history does not
-        if token not in tokens.withdrawn:
-            tokens.take(token, stands=True)
+    for token in active_tokens(session):  # a get ends when all were told, which a subscription's history does not
+        if token not in tokens.lost:
+            tokens.record(token, stands=True)
     try:
         yield tokens
     finally:

@@ -1,4 +1,4 @@
-"""A sign of life for systemd (sd_notify): a process that hangs gives none, and is ended and started anew."""
+"""Watchdog signal for systemd (sd_notify): systemd restarts a process that stops sending it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ LONG_S: Final = 900.0  # a start may take as long, see TimeoutStartSec of the un
 _at_work = threading.Event()
 
 
-def alive() -> None:
-    """Tell the service manager that the process does its work, and so is ready; nothing where none asked for it."""
+def notify_alive() -> None:
+    """Notify the service manager that the process is ready and working; do nothing without a service manager."""
     _at_work.set()
     _tell()
 
 
-def patient(most_s: float = LONG_S) -> Callable[[], None]:
-    """Tell that a process is ready which waits for its work, as a standby does, and that it lives, until `alive`: from
-    a thread, since what it does meanwhile takes long in one piece.
+def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
+    """Notify the service manager that a process is ready and waiting, until `notify_alive` is called.
+
+    A thread sends the signals, because a waiting process may be busy for long.
 
     Returns:
-        to be called again and again; so long [s] after the last call there are no more signs.
+        a function to call repeatedly; `most_s` seconds after its last call the signals stop.
     """
     last = time.monotonic()
     every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4

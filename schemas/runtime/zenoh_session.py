@@ -1,7 +1,7 @@
-"""A Zenoh session as the contract wants it: a client of routers, no scouting, no gossip, no shared memory.
+"""Zenoh session of the contract: a client of routers, without scouting, gossip and shared memory.
 
-Why these settings: scouting finds strangers and costs half a second at start; shared memory drops samples silently when
-a receiver stalls; the lease says after how long a silent peer counts as gone.
+Reasons: scouting finds strangers and costs half a second at start; shared memory drops samples silently when a receiver
+stalls; the lease states how long a silent peer is kept.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Zenoh configuration: the defaults above, the endpoints, then the pass-through section.
+    """Return the Zenoh configuration: the defaults above, the endpoints, then the pass-through section.
 
     Args:
-        settings: of the configuration file; `{name}` in the section stands for
-        name: whose session it is, so that one file serves many vehicles with a certificate each.
+        settings: of the configuration file.
+        name: of the session; replaces `{name}` in the section, so that one file serves many vehicles with a certificate
+            each.
 
     Raises:
-        InputError: Zenoh refuses a setting, or a certificate that it names is not there.
+        InputError: Zenoh refuses a setting, or a certificate that it names does not exist.
     """
     config = zenoh.Config()
     chosen = {**CLIENT, "connect/endpoints": settings.connect, **settings.config}
@@ -61,9 +62,9 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
 
 
 def open_session(settings: ZenohSettings, stop: threading.Event | None = None, name: str = "") -> zenoh.Session | None:
-    """Open a session; wait for the router as long as it takes, until `stop` is set (then None).
+    """Open a session; wait for the router until one answers or `stop` is set (then return None).
 
-    A session that lost its router reconnects by itself. Why it waits is logged, once for each reason.
+    A session that lost its router reconnects by itself. The reason for waiting is logged once.
     """
     stop, logged = stop or threading.Event(), set[str]()
     while not stop.is_set():

@@ -116,7 +116,8 @@ def live(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def fleet(folder: Path, endpoint: str) -> list[Figure]:
-    """How many vehicles a core carries in real time: plant, estimator, publishing; the CPU of a whole fleet says it."""
+    """Measure how many vehicles a core carries in real time: plant, estimator, publishing; from the CPU of a whole
+    fleet."""
     words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
     used(folder, endpoint, *words, str(WARM_S))
     short, _ = used(folder, endpoint, *words, str(START_S))

@@ -1,4 +1,4 @@
-"""What a second place costs: acknowledgements of a service whose archive has a copy, and of one without, in turn.
+"""Cost of a second copy: acknowledgements of a service with a bucket copy and of one without, in turn.
 
 The copy is a real S3 server on this machine, a process of its own; a bucket over a network adds its way there.
 """
@@ -25,7 +25,7 @@ BAR = 2.0
 
 
 def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
-    """Of a new service with such an archive."""
+    """Measure a new service with such an archive."""
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)

@@ -1,4 +1,4 @@
-"""What an estimator costs per vehicle and sample."""
+"""Cost of an estimator per vehicle and sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the fusion costs per observation: updates, commits and reputation included. Processor time of one thread."""
+"""Cost of the fusion per observation: updates, commits and trust. Processor time of one thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the cost of a stream grows with its rate: the engine's processor time from 10³ to 10⁵ observations a second.
+"""Growth of a stream's cost with its rate: the engine's processor time from 10³ to 10⁵ observations a second.
 
 Ten observations to a message, one message a second of each vehicle: more rate is more vehicles, as in life. A second of
 the stream is taken in turns, then comes what a second brings: segment, acknowledgements, tiles. The stream's clock is

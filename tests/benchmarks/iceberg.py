@@ -30,7 +30,7 @@ def rows_different(root: Path, uri: str) -> int:
     """Rows, with all their columns, that are in the compacted files or in the tables and not in both as often."""
     different = 0
     for kind in Kind:
-        files = [pq.read_table(path, partitioning=None) for path in layout.compacted(root, kind)]
+        files = [pq.read_table(path, partitioning=None) for path in layout.compacted_files(root, kind)]
         there = pa.concat_tables(files)
         seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
         ours, theirs = _counted(there), _counted(seen)
@@ -55,6 +55,6 @@ def measured(folder: Path) -> float:
             raise RuntimeError(f"{rows} rows registered")
         different += rows_different(root, uri)
     today = layout.date_of(20_000) + timedelta(days=32)
-    if retention.retire(root, 31, today).files == 0:
+    if retention.retire_rows(root, 31, today).files == 0:
         raise RuntimeError("nothing was retired")
     return different + rows_different(root, uri)

@@ -126,7 +126,7 @@ def _take(sent: list[Message], records: int) -> tuple[float, float]:
         wall, cpu = time.perf_counter(), time.process_time()
         for at in range(0, len(sent), turn):
             engine.ingest(sent[at : at + turn], time.time_ns())
-            engine.written()
+            engine.end_flush()
             if at % FLUSH >= FLUSH - turn:
                 engine.begin_flush()
         engine.flush()

@@ -1,4 +1,4 @@
-"""How durations are taken: medians of rounds after a warm-up."""
+"""Measurement of durations: medians of rounds after a warm-up."""
 
 from __future__ import annotations
 

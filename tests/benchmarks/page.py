@@ -261,7 +261,8 @@ def _get(address: str) -> bytes:
 
 
 def watchers(on: Stage) -> float:
-    """How many watch with 95 % of the pushes within a second, the page on one core; 0: fewer than the least tried."""
+    """Return how many watchers get 95 % of the pushes within a second, the page on one core; 0 if fewer than the least
+    tried."""
     pinned(on.process, 0)
     for count in WATCHERS:
         late = asyncio.run(_watched(on, count))

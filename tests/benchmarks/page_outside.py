@@ -1,4 +1,4 @@
-"""What leaves the house for others' systems, measured: DATEX II, OGC API Features, links of a road network."""
+"""Interfaces of the page for other systems: DATEX II, OGC API Features, links of a road network."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ def records(document: bytes) -> list[ET.Element]:
 
 
 def is_over(record: ET.Element) -> bool:
-    """Whether a record has an end."""
+    """Return True if a record has an end."""
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
 def is_valid() -> Callable[[bytes], bool] | None:
-    """What tells whether a publication is valid; None where the schema is not there."""
+    """Return a validator of publications; None without the schema."""
     if not SCHEMA.exists():
         print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
         return None
@@ -187,7 +187,7 @@ def measured_cells(table: pa.Table) -> set[int]:
 
 
 def opens(reader: str, address: str) -> bool:
-    """Whether a reader has all features, the bounds among them without a value."""
+    """Return True if a reader has all features, the bounds among them without a value."""
     script = READERS[reader].format(address=address) + _COUNT
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
     whole, bounds = street.known("ice", "passed", "wet"), street.known("passed")
@@ -198,7 +198,7 @@ def opens(reader: str, address: str) -> bool:
 
 
 def ogrinfo_opens(address: str) -> bool:
-    """Whether GDAL's program lists all features."""
+    """Return True if GDAL's program lists all features."""
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     held = done.stdout.count("OGRFeature(grip)") == street.known("ice", "passed", "wet")

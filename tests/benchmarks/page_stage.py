@@ -123,7 +123,7 @@ def stage(seed: int) -> Iterator[Stage]:
 
 
 def tiles_of(address: str) -> int:
-    """How many tiles the page knows of."""
+    """Return the number of tiles that the page knows."""
     import json
     import urllib.request
 

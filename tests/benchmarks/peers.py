@@ -16,7 +16,7 @@ PYTHON_STEPS = 300  # enough for a median: these are slow
 
 
 class Problem(NamedTuple):
-    """What a peer is given."""
+    """Input of a peer."""
 
     row: FloatArray  # (12,) of the vehicle
     readings: FloatArray  # (T, 11)

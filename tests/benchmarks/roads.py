@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from fleet_service.analytics.roads.join import joined
+from fleet_service.analytics.roads.join import join_roads
 from fleet_service.analytics.roads.network import RoadNetwork, read_network
 from schemas import grid
 from schemas.numeric import FloatArray
@@ -53,7 +53,7 @@ def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float
     names = {link.id: link.name for link in network.links}
     fixes = pd.DataFrame({"place": place, "way": traffic.way, "fix": np.arange(len(place))})
     fixes = fixes[fixes.way.isin(set(names))]
-    links = joined(network).to_pandas()
+    links = join_roads(network).to_pandas()
     links["place"] = links.cell * grid.SECTORS + links.sector
     rows = fixes.merge(links[["place", "link"]], on="place", how="left")
     right = rows.link == rows.way

@@ -1,4 +1,4 @@
-"""What the running service answers under load: queries beside a bare queryable, and alerts from publish to subscriber.
+"""Running service under load: queries compared with a bare queryable, and alerts from publication to subscriber.
 
 Router, service, load, bare queryable and client are processes of their own, as in life.
 """
@@ -119,7 +119,7 @@ def until(something: Callable[[], object]) -> None:
 
 
 def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
-    """Of QUERIES rounds of all works in turn."""
+    """Return the times of QUERIES rounds of all works in turn."""
     out: list[list[float]] = [[] for _ in works]
     for _ in range(QUERIES):
         for work, times in zip(works, out, strict=True):

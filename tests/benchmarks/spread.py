@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from edge_agent.app.backfill import Task, backfill, backfill_on_spark, tasks_of, tried
+from edge_agent.app.backfill import Task, backfill, backfill_on_spark, estimate_atomically, tasks_of
 from edge_agent.cli import main as edge_agent
-from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuilt, zones_of
+from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuild_zone, zones_of
 from fleet_service.analytics.synthetic import SyntheticFleet
 from schemas.runtime import spark
 from tests import spark_sessions
@@ -39,7 +39,7 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     """Files of estimates that are not, byte for byte, those of this machine, though each task was killed once."""
     here, there, tries = folder / "here", folder / "there", folder / "tries"
     there.mkdir(parents=True)
-    work = partial(tried, estimator=ESTIMATOR, memberships=None)
+    work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     with spark_sessions.cores(2) as session:
         dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
         told = spark.spread(session, tasks_of(logs, None, there), dying)
@@ -59,7 +59,9 @@ def rebuild_difference(folder: Path) -> float:
     zones = zones_of(archive)
     with spark_sessions.cores(2) as session:
         spark.spread(
-            session, zones, spark_sessions.killed_at_first(partial(rebuilt, Rebuild(archive, there, UNTIL)), str, tries)
+            session,
+            zones,
+            spark_sessions.killed_at_first(partial(rebuild_zone, Rebuild(archive, there, UNTIL)), str, tries),
         )
     if sum(zone.cells for zone in rebuild(Rebuild(archive, here, UNTIL))) == 0 or len(list(tries.iterdir())) != len(
         zones

@@ -119,7 +119,7 @@ def read(endpoint: str) -> None:
 
 
 def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
-    """How long questions for one tile take [ms] while READERS ask for all, until each has an answer; tiles of these."""
+    """Return the times [ms] of queries for one tile while READERS query everything, until each has an answer."""
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
     got: list[list[int]] = [[] for _ in readers]

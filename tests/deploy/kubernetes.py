@@ -53,7 +53,7 @@ def built(overlay: str) -> list[Manifest]:
 
 
 def invalid(objects: list[Manifest]) -> list[str]:
-    """What Kubernetes' schemas find wrong, strictly: unknown fields too."""
+    """Return the errors by Kubernetes' schemas, strictly: unknown fields too."""
     import kubernetes_validate
 
     found = []
@@ -87,7 +87,7 @@ class Pod:
 
     @property
     def grace_s(self) -> float:
-        """How long it may take to leave [s]."""
+        """Return the termination grace period [s]."""
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
 
     def port(self, container: Manifest, named: str | int) -> int:
@@ -183,7 +183,7 @@ class Cluster:
                     self._unpack(pod, container, folder)
 
     def _unpack(self, pod: Pod, container: Manifest, folder: Path) -> None:
-        """What the documented command puts into a secret of certificates: those of its pods, and whom they trust."""
+        """Return the files that the documented command puts into a secret of certificates."""
         of = pod.name.rpartition("-")[0]
         for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:
             (folder / path.name).write_text(self._placed(pod, container, path.read_text()))
@@ -272,7 +272,7 @@ class Cluster:
 
 
 def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
-    """Whether a probe holds."""
+    """Return True if a probe succeeds."""
     if "tcpSocket" in probe:
         with socket.socket() as one:
             one.settimeout(1.0)

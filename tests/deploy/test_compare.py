@@ -61,7 +61,7 @@ def test_the_truth_is_the_friction_after_the_change_where_there_is_one() -> None
 def test_a_cell_without_a_truth_is_left_out() -> None:
     found = compare.compare(tile([7, 99], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1)), 10 * S)
     assert found.cells["cell"].to_pylist() == [7]
-    assert found.covered.tolist() == [True]
+    assert found.is_covered.tolist() == [True]
 
 
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
@@ -82,7 +82,7 @@ def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
 
 
-def test_old_snow_its_border_and_where_nobody_was_before_are_not_the_new_patch() -> None:
+def test_old_snow_and_unvisited_places_are_not_the_new_patch() -> None:
     before = (("a", 1, 7, 0.2, 0.9), ("a", 2, 8, 0.9, 0.9), ("a", 3, 9, 0.41, 0.9), ("b", 4, 9, 0.6, 0.9))
     after = (("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9), ("a", 13, 9, 0.39, 0.9), ("a", 14, 10, 0.2, 0.9))
     new = compare.newly_slippery(visits(*before, *after), 10 * S)
@@ -107,7 +107,7 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
     assert "http" not in text
 
 
-def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(tmp_path: Path) -> None:
+def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path) -> None:
     found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
     basis = found.cells.schema.get_field_index("basis")
     found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
@@ -121,10 +121,10 @@ def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(
         assert "demo.map.rmse" in shown.page.locator("#table").inner_text()
 
 
-def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes_told_and_drawn(
+def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of two warned and one unwarned pass since the first alert; what was before it counts for nobody."""
+    """Count two warned passes and one unwarned pass since the first alert; earlier ones do not count."""
     driven = visits(
         ("sim-001", 1.0, 7, 0.9, 0.5), ("sim-002", 11.0, 7, 0.2, 1.0), ("sim-001", 31.0, 7, 0.2, 0.6),
         ("sim-001", 32.0, 7, 0.2, 0.99), ("sim-002", 33.0, 7, 0.2, 1.0), ("sim-004", 40.0, 7, 0.2, 0.7),

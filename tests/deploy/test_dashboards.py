@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import yaml
 
+from tests import reference_pages
 from tests.house import ROOT
-from tests.usability import gauges
-from tests.usability.gauges import Shown
+from tests.reference_pages import Shown
 
 FOLDER = ROOT / "deploy" / "dashboards"
 RULES: list[dict[str, Any]] = [
@@ -29,28 +29,29 @@ EXPRESSIONS = [rule["expr"] for rule in RULES] + [
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     """All metrics of a service and of an agent."""
-    return gauges.shown(tmp_path_factory.mktemp("archive"))
+    return reference_pages.all_metrics(tmp_path_factory.mktemp("archive"))
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 def test_every_expression_asks_for_metrics_that_are_shown(expression: str, shown: Shown) -> None:
     asked, known = (
         set(re.findall(r"gripmap_\w+", expression)),
-        {gauges.stored(m) for found in shown.values() for m in found},
+        {reference_pages.stored_name(m) for found in shown.values() for m in found},
     )
     assert asked <= known, asked - known
     assert asked or expression.startswith("up{")
 
 
-def test_the_handbook_has_every_metric_with_its_meaning(shown: Shown) -> None:
-    """`python -m tests.usability.gauges` writes the table anew."""
-    rows = gauges.rows(gauges.PAGE.read_text(encoding="utf-8"))
-    assert rows == gauges.lines(shown)
-    assert len(rows) > 40
+def test_every_metric_has_a_meaning_and_a_row_in_the_reference(shown: Shown) -> None:
+    metrics = [metric for found in shown.values() for metric in found]
+    assert len(metrics) > 40
+    assert not [metric.name for metric in metrics if not metric.help]
+    page = reference_pages.metrics_page(shown)
+    assert not [metric.name for metric in metrics if f"| `{reference_pages.stored_name(metric)}` |" not in page]
 
 
 def test_the_handbook_says_what_to_do_about_every_rule() -> None:
-    handbook = (ROOT / "deploy" / "docs" / "operations.md").read_text()
+    handbook = (ROOT / "deploy" / "docs" / "how-to" / "operate.md").read_text()
     assert set(re.findall(r"`(GripMap\w+)`", handbook)) == {rule["alert"] for rule in RULES}
 
 

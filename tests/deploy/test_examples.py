@@ -103,7 +103,7 @@ def test_a_notebook_runs_from_its_first_cell_to_its_last(path: Path) -> None:
     assert not any(cell.get("outputs") for cell in notebook["cells"]), "kept without outputs"
 
 
-def test_the_style_has_the_colours_of_the_maps_and_none_for_what_is_unknown() -> None:
+def test_qgis_style_has_the_map_colours_and_none_for_unknown() -> None:
     text = (FOLDER / "gripmap.qml").read_text()
     root = ET.fromstring(text[text.index("<qgis") :])
     rules = {rule.get("label", ""): rule.get("filter", "") for rule in root.iter("rule")}

@@ -78,7 +78,7 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_policies_let_services_and_routers_reach_the_routers_and_nobody_the_services(overlay: str) -> None:
+def test_network_policies_reach_routers_but_never_services(overlay: str) -> None:
     """As a cluster applies them: what a pod may do is what any policy that selects it lets it do."""
     objects = built(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]
@@ -160,7 +160,7 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(overlay: str, tmp
         wanted = sorted({pod.name.rpartition("-")[0] for pod in services})
         until(lambda: sorted(serving()) == wanted, 120.0)
         with reader(running) as session:
-            until(lambda: len({token.region for token in tokens.standing(session)}) == sum(
+            until(lambda: len({token.region for token in tokens.active_tokens(session)}) == sum(
                 len(json.loads(settings(running, f"{name}-0"))["regions"]) if overlay == "three-regions" else 1
                 for name in wanted
             ))  # fmt: skip

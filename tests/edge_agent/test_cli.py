@@ -108,7 +108,7 @@ def test_publishing_changes_no_estimate(drive: Path, tmp_path: Path, router: Rou
     assert pq.read_table(tmp_path / "plain.parquet").equals(pq.read_table(tmp_path / "sent.parquet"))
 
 
-def test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_waits(
+def test_replay_publishes_at_the_time_of_the_drive_and_waits(
     drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
     more = ["--publish", "--trust", *config(tmp_path, router), "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]
@@ -127,9 +127,7 @@ IMPATIENT = "import sys; from edge_agent.cli import main, replay; replay.DRAIN_S
 
 
 @pytest.mark.parametrize("well", [True, False])
-def test_replay_with_a_session_that_hangs_keeps_its_estimates_and_says_that_nothing_was_acknowledged(
-    drive: Path, tmp_path: Path, well: bool
-) -> None:
+def test_replay_with_a_hanging_session_keeps_its_estimates(drive: Path, tmp_path: Path, well: bool) -> None:
     """A frozen router takes the connection and never answers."""
     router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path)
     router.start()
@@ -178,7 +176,7 @@ def test_run_drives_with_the_source_of_another_distribution(
         "blocks = lambda address: read_log(pathlib.Path(address)).blocks(time.time_ns(), 10)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(plugins, "found", plugins.found.__wrapped__)  # what is installed was looked up before
+    monkeypatch.setattr(plugins, "entry_points_of", plugins.entry_points_of.__wrapped__)  # the cache was filled before
     source = ["--source", f"theirs:{drive / 'log.parquet'}", "--vehicle", str(drive / "vehicle.json")]
     words = ["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]
     assert main([*words, "--name", "car-three"]) == 0

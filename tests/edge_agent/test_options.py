@@ -62,8 +62,8 @@ CHANGED: dict[tuple[str, str], list[str]] = {
         ("--repeats", "2"),
     )},
 }  # fmt: skip
-REPLAYED = "test_log_vehicle_estimator_and_configuration_of_a_replay_change_what_it_says"
-SENT_BY_REPLAY = "test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_waits"
+REPLAYED = "test_replay_depends_on_log_vehicle_estimator_and_configuration"
+SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
 # what the other options of the commands do is told by the tests named here, in whose modules they are given
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
@@ -151,7 +151,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """What a live command hands to the loop: vehicles, names, signals, settings, estimator, duration; and its files."""
+    """Record what a live command passes to the loop: vehicles, names, signals, settings, estimator, duration; and its
+    files."""
     seen: list[object] = []
 
     def note(
@@ -217,7 +218,7 @@ def test_every_option_of_simulate_changes_what_is_written(option: str, tmp_path:
     assert not logs[0].equals(logs[1])
 
 
-def test_log_vehicle_estimator_and_configuration_of_a_replay_change_what_it_says(tmp_path: Path) -> None:
+def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Path) -> None:
     for name, seed in (("one", "1"), ("other", "2")):
         files = ["--out", str(tmp_path / f"{name}.parquet"), "--vehicle-out", str(tmp_path / f"{name}.json")]
         assert main(["simulate", "slalom", "--duration", "3", "--seed", seed, *files]) == 0

@@ -22,7 +22,7 @@ import numpy as np
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
-from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, encoded
+from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, encode_question
 from fleet_service.archive import layout
 from fleet_service.archive.layout import CHECKPOINTS, DAY_NS, MAP_DAYS
 from fleet_service.archive.segments import SCHEMAS, Writer
@@ -86,7 +86,7 @@ def _smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, f
 
 
 def _asked_of(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """What a start from a checkpoint costs, and a question about the past."""
+    """Measure a start from a checkpoint, and a query about the past."""
     _measured("checkpoint", root)
     synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
     return _measured("ready", root), _measured("past", root, _asked(root))
@@ -146,11 +146,11 @@ def _asked(root: Path) -> bytes:
     """The question about the past, which the service would let through."""
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
-    return encoded(question)
+    return encode_question(question)
 
 
 def _measured(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """What a process says of itself; see `age_process`."""
+    """Return the output of a process; see `age_process`."""
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])

@@ -1,4 +1,4 @@
-"""Who watches behind a router that is restarted: every alert that stands is heard soon after the session is back.
+"""Watcher behind a router that is restarted: it receives every standing alert soon after the session is back.
 
 Two routers, the service behind the one, a watcher behind the other. That one is killed, alerts are raised, and it comes
 back; what was raised meanwhile the watcher must hear, and it hears nothing while it is away.
@@ -110,12 +110,12 @@ def _ice(turn: int, places: int) -> list[Batch]:
 
 
 def _stand(session: zenoh.Session, least: int) -> bool:
-    """Whether so many alerts stand."""
+    """Return True if so many alerts stand."""
     return len(_standing(session)) >= least
 
 
 def _standing(session: zenoh.Session) -> set[Place]:
-    """What the service says that stands."""
+    """Return the standing alerts of the service."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
     return {
         (alert.cell, alert.sector)

@@ -39,7 +39,7 @@ def attempt(function: Attempt) -> Attempt:
 
 
 def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
-    """Whether a session opens."""
+    """Return True if a session opens."""
     try:
         with ground.network.session(name, router, **changed):
             return True
@@ -101,7 +101,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def lures(ground: Ground, folder: Path, name: str) -> bool:
-    """Whether an honest vehicle opens a session at a router that shows this certificate."""
+    """Return True if an honest vehicle opens a session at a router with this certificate."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
@@ -130,7 +130,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Whether anybody hears what is put there."""
+    """Return True if anybody receives what is published there."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.passed(session)
@@ -229,7 +229,7 @@ def spoofed_reply(ground: Ground) -> bool:
 
 
 def overhears(ground: Ground, session: zenoh.Session) -> bool:
-    """Whether a session hears another vehicle's observations or acknowledgements."""
+    """Return True if a session receives another vehicle's observations or acknowledgements."""
     listener = Listener(session, (
         f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/state/**", keys.ack_key(HONEST), f"{keys.ROOT}/ack/*",
         key(HONEST), "**", "gripmap/**", f"{keys.ROOT}/*/**",
@@ -253,7 +253,7 @@ def reader_overhears(ground: Ground) -> bool:
 @attempt
 def foreign_liveliness_token(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
-    false = keys.Served("1202/310/*", ROGUE, "1f").key
+    false = keys.ServiceToken("1202/310/*", ROGUE, "1f").key
     foreign = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", false)
     places = (*foreign, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]

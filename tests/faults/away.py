@@ -67,7 +67,7 @@ def _message(one: StoredBatch) -> Message:
 
 
 def _draft(car: int, now: float) -> tuple[Draft, int]:
-    """What a car sends in half a second, and the cell that it tells of: each has a road of its own."""
+    """Return the reports of a car for half a second, and their cell; each car has a road of its own."""
     latitude, longitude = PLACE[0] + 2 * CELL_DEG * car, PLACE[1] + CELL_DEG * int(now)
     cell = int(grid.cell_of(latitude, longitude))
     region, time = int(grid.region_of(cell)), START + round(now * NS)

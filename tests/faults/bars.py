@@ -8,7 +8,7 @@ from schemas.runtime.figures import Figure
 
 
 class Bar(NamedTuple):
-    """What a figure is held against."""
+    """Bar of a figure."""
 
     unit: str
     bar: float

@@ -121,7 +121,7 @@ def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[s
         shutil.copyfile(path, copy)
         bit = _flip(copy, random_)
         outbox = Outbox(copy, boot=6)
-        held = {batch.seq: batch.payload for batch in outbox.held() if batch.stream.vehicle == "car-a"}
+        held = {batch.seq: batch.payload for batch in outbox.held_batches() if batch.stream.vehicle == "car-a"}
         lost = payloads.keys() - held.keys()
         counted = outbox.counts.damages + outbox.counts.damaged
         if any(payloads.get(seq) != payload for seq, payload in held.items()) or (lost and not counted):

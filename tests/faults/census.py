@@ -1,4 +1,4 @@
-"""What the generators know to be safe against what the archive holds."""
+"""Comparison of the generators' journals with the archive."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Census:
 
 
 class Told(NamedTuple):
-    """What the journals say: records and time [s] of every stored batch, time of every settled one."""
+    """Content of the journals: records and time [s] of every stored batch, time of every settled one."""
 
     stored: dict[Name, tuple[int, float]]
     settled: dict[Name, float]
@@ -89,7 +89,7 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
 
 def _doubled_outside(archive: Path) -> int:
     """Rows that are there again for who knows nothing of us, and reads the compacted files as they lie."""
-    paths = list(layout.compacted(archive, Kind.OBSERVATION))
+    paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]
     return sum(t.num_rows for t in whole) - (
         pa.concat_tables(whole).group_by(ROW).aggregate([]).num_rows if whole else 0

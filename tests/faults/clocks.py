@@ -20,7 +20,7 @@ import pyarrow as pa
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import archive_jobs
-from fleet_service.app.service import take
+from fleet_service.app.service import ingest_messages
 from fleet_service.archive import reading
 from fleet_service.archive.compaction import compact
 from fleet_service.ingest.inbox import Message
@@ -58,13 +58,13 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def jumped(self, clock: SteadyClock) -> bool:
-        """Whether a service's clock is far from the true time, or says that the system's is."""
+        """Return True if a service's clock is far from the true time, or reports that the system clock is."""
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
 
 @dataclass
 class Found:
-    """What went wrong, summed up over cases."""
+    """Failures, summed over cases."""
 
     sent: int = 0
     rejected: int = 0
@@ -103,7 +103,9 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             seq += 1
             found.sent += VEHICLES
             for again in (max(seq - 5, 1), seq):
-                take(engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)])
+                ingest_messages(
+                    engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)]
+                )
             engine.flush()
             if clock.moment().sure:
                 engine.fade_alerts(clock.now())
@@ -156,7 +158,7 @@ def _message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _rows(root: Path) -> Counter[tuple[int, int]]:
-    """How often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
+    """Return how often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
     tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)
     return Counter(zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True))

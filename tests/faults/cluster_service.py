@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from fleet_service.app import beside, jobs
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from fleet_service.cli import main
 
 COMPACTING, COPYING = "compacting", "copying"
 BEGINS, ENDS = "begins", "ends"
 FOLLOW_S: Final = 3.0
 
-_run, _follow, _put_there = beside.run, Copy.follow, Copy._put_there
+_run, _follow, _put_there = beside.run_module, BucketReplica.sync, BucketReplica._put_there
 _copying = threading.local()
 
 
@@ -34,8 +34,8 @@ def run(
     return output
 
 
-def follow(copy: Copy) -> int:
-    """As `Copy.follow`."""
+def follow(copy: BucketReplica) -> int:
+    """Sync like `BucketReplica.sync`."""
     _copying.at = False
     changed = _follow(copy)
     if _copying.at:
@@ -43,7 +43,7 @@ def follow(copy: Copy) -> int:
     return changed
 
 
-def put_there(copy: Copy, name: str) -> bool:
+def put_there(copy: BucketReplica, name: str) -> bool:
     """As `Copy._put_there`; the first one of a turn says that it begins."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
@@ -52,6 +52,6 @@ def put_there(copy: Copy, name: str) -> bool:
 
 
 if __name__ == "__main__":
-    beside.run, Copy.follow, Copy._put_there = run, follow, put_there  # type: ignore[method-assign,assignment]
+    beside.run_module, BucketReplica.sync, BucketReplica._put_there = run, follow, put_there  # type: ignore[method-assign,assignment]
     jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]
     sys.exit(main())

@@ -61,7 +61,7 @@ def populate(root: Path) -> str:
 
 
 class Journals:
-    """What the loads know to be acknowledged, as it comes."""
+    """Batches that the loads know to be acknowledged, updated as they arrive."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
         self._paths, self._read = list(paths), Counter[Path]()
@@ -163,7 +163,7 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """How a service goes, whose lease lasts so long [s], and how it ends: its process gone, the machine whole."""
+    """Way in which a service with this lease time [s] fails."""
 
     go: Go
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
@@ -207,7 +207,7 @@ def _mended(host: Host, random_: random.Random) -> None:
 
 def _followed(host: Host, _: random.Random) -> None:
     assert host.part.wait(PATIENCE_S) == 1
-    assert host.said("followed: ")
+    assert host.said("lease lost to another service")
 
 
 TWO: Final = "two standbys"
@@ -225,14 +225,14 @@ WAYS: Final = {
 
 
 class Failover(NamedTuple):
-    """What happened: the way, as it turned out, and how long [s] until a vehicle was acknowledged again."""
+    """Result: the failure as it happened, and the time [s] until a vehicle was acknowledged again."""
 
     way: str
     seconds: float
 
 
 class Machines:
-    """Of one region: one serves, one waits, others are spare."""
+    """Machines of one region: one serves, one waits, others are spare."""
 
     def __init__(
         self, hosts: list[Host], leases: Path, lease_s: float, journals: Journals, random_: random.Random
@@ -269,7 +269,7 @@ class Machines:
         return Failover(name if hit else "kill", seconds)
 
     def _terms(self) -> int:
-        """How many leases were taken so far."""
+        """Return the number of leases taken so far."""
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _taken(self) -> None:
@@ -286,7 +286,7 @@ class Machines:
     def hand_over(self, router: ZenohSettings) -> Host:
         """The service gives its region to the one that waits, and has left then; returns it."""
         former, to = self.serving, self.waiting[0].root.parent.name
-        with map_client.joined(router) as session:
+        with map_client.open_connected(router) as session:
             assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
         self._taken()
         assert former.part.wait(PATIENCE_S) == 0
@@ -294,15 +294,14 @@ class Machines:
         return former
 
     def pause_s(self, router: ZenohSettings) -> float:
-        """Of a hand-over under load: for how long no vehicle was acknowledged [s]."""
+        """Measure a hand-over under load: the time without any acknowledgement [s]."""
         began = self._journals.first_after(time.time())
         self.hand_over(router)
         self._journals.first_after(time.time())
         return self._journals.pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
-        """Of a hand-over while nothing is sent: the largest difference of what both know, as their checkpoints have it;
-        infinite where it is no number."""
+        """Measure a hand-over without load: the largest difference between both states, as in their checkpoints."""
         for part in parts:
             part.send(signal.SIGSTOP)
         time.sleep(SETTLED_S)
@@ -339,7 +338,7 @@ def _was_amid(host: Host, what: str) -> bool:
 
 
 def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
-    """Of numbers with a fraction the largest; infinite if anything else is not the same."""
+    """Return the largest difference of numbers with a fraction; infinite if anything else differs."""
     worst = 0.0
     if one.keys() != other.keys():
         return float("inf")

@@ -82,13 +82,13 @@ class Reading:
 
 
 def outside(root: Path) -> Iterable[pa.Table]:
-    """What a tool that knows nothing of us reads: the compacted files alone, as they are listed at one moment."""
-    for path in list(layout.compacted(root, Kind.OBSERVATION)):
+    """Return the rows that a foreign tool reads: the compacted files alone, as listed at one moment."""
+    for path in list(layout.compacted_files(root, Kind.OBSERVATION)):
         yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
 
 
 def complete(tables: Iterable[pa.Table], owed: int) -> bool:
-    """Whether the rows of batches 1 … `owed` are there, and none twice."""
+    """Return True if the rows of batches 1 … `owed` are there, and none twice."""
     rows = Counter(p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True))
     there = all((seq, row) in rows for seq in range(1, owed + 1) for row in range(ROWS))
     return there and (not rows or max(rows.values()) == 1)

@@ -29,7 +29,7 @@ class PowerLoss(BaseException):
 
 
 class CrashDisk:
-    """What is durable of a folder.
+    """Durable content of a folder.
 
     Args:
         live: the folder; empty, or an image that `image` made.
@@ -196,7 +196,7 @@ class CrashDisk:
         return open_
 
     def image(self, target: Path) -> None:
-        """What a machine finds after power loss at this moment, as a folder."""
+        """Create the folder that a machine finds after power loss at this moment."""
         there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
         numbered = {self._number.get(path.stat().st_ino): path for path in there}
         written = {number: path.read_bytes() for number, path in numbered.items() if number is not None}

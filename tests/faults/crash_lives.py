@@ -35,7 +35,7 @@ class Lives(ABC, Generic[BatchType]):
         self.at_stake = 0
 
     def violations(self) -> list[str]:
-        """What was wrong in it."""
+        """Return the errors found in it."""
         live = self.folder / "life-0"
         live.mkdir()
         found: list[str] = []
@@ -61,7 +61,7 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _problems(self, root: Path, last: bool) -> list[str]:
-        """Of the archive as the next life finds it."""
+        """Read the archive as the next life finds it."""
 
     def _pass_time(self) -> None:
         """Between two lives."""

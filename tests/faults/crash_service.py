@@ -22,12 +22,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.app.memory import Memory, remember
+from fleet_service.app.memory import ServiceState, load_state
 from fleet_service.archive import layout, reading, snapshots
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.load import load
 from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.retention import LEAST_DAYS, forget_period, forget_vehicle, retire
+from fleet_service.archive.retention import LEAST_DAYS, forget_period, forget_vehicle, retire_rows
 from fleet_service.archive.segments import nanoseconds
 from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
@@ -61,7 +61,7 @@ class Sent(NamedTuple):
 
     @property
     def rows(self) -> tuple[int, int]:
-        """What its rows are known by in the archive."""
+        """Return the identity of its rows in the archive."""
         return self.time - SECOND, self.time
 
     @property
@@ -136,7 +136,7 @@ class ServiceHistory(Lives[Sent]):
             elif job == "weather":
                 self._report(engine)
             elif job == "compaction":
-                weather.gather(root)
+                weather.join_daily_files(root)
                 compact(root, round_rows=self.random.choice((1, 5, 1000)))
             elif job == "retention":
                 self._retire(root)
@@ -197,7 +197,7 @@ class ServiceHistory(Lives[Sent]):
         today = datetime.fromtimestamp(self._now // SECOND, UTC).date()
         self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_DAYS - 1)
         with suppress(InputError):
-            retire(root, LEAST_DAYS, today)
+            retire_rows(root, LEAST_DAYS, today)
             weather.retire(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
 
     def _problems(self, root: Path, last: bool) -> list[str]:
@@ -228,7 +228,7 @@ class ServiceHistory(Lives[Sent]):
         return one.rows[0] // layout.DAY_NS <= self.retired or bool(marks & self.forgetting)
 
     def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
-        """What was forgotten, and is there nevertheless."""
+        """Return forgotten data that is there nevertheless."""
         found = [f"{one.vehicle} {one.seq} came back" for one in self.gone if any(rows[time] for time in one.rows)]
         keys = (path.read_bytes() for path in (root / "keys").glob("*.key"))
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
@@ -242,7 +242,7 @@ class ServiceHistory(Lives[Sent]):
             shutil.copytree(root, copy)
         shutil.rmtree(bare / layout.CHECKPOINTS, ignore_errors=True)
         damaged: list[Path] = []
-        begun, whole = (remember(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare))
+        begun, whole = (load_state(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare))
         found = _different(begun, whole, self._now)
         for copy in (same, bare):
             shutil.rmtree(copy)
@@ -269,8 +269,8 @@ def _boot(vehicle: str) -> int:
     return 1 + sum(vehicle.encode())
 
 
-def _different(begun: Memory, whole: Memory, now: int) -> list[str]:
-    """What two memories of one archive believe otherwise."""
+def _different(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
+    """Return the differences in belief of two states of one archive."""
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)

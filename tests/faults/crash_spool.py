@@ -66,7 +66,7 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
 
 
 def _torn(random_: random.Random, before: Files, after: Files) -> Files:
-    """What power loss during the commit may leave."""
+    """Return the files that power loss during the commit may leave."""
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
         chosen = (random_.choice((before, after)).database[at : at + PAGE].ljust(PAGE, b"\0") for at in pages)
@@ -83,7 +83,7 @@ def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes])
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)
     again = Outbox(path, boot=6, capacity_bytes=CAPACITY)
-    there = {batch.seq: batch.payload for batch in again.held()}
+    there = {batch.seq: batch.payload for batch in again.held_batches()}
     again.close()
     found = [f"batch {seq} is lost" for seq in owed - there.keys()]
     return found + [

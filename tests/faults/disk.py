@@ -24,7 +24,7 @@ from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox
 from fleet_service.app.clock import SteadyClock, TimeNow
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import Upkeep, archive_jobs
+from fleet_service.app.jobs import BackgroundJobs, archive_jobs
 from fleet_service.archive import reading, reserve
 from fleet_service.archive.retention import LEAST_DAYS
 from fleet_service.ingest.inbox import Message
@@ -104,7 +104,7 @@ def run(site: Site) -> list[Figure]:
         root = site.folder / "disk" / "archive"
         with closing(Engine(CONFIG, root)) as engine:
             jobs = archive_jobs(engine, CONFIG, root, SteadyClock().moment)
-            with Upkeep(jobs, engine.counts, lambda _: None):
+            with BackgroundJobs(jobs, engine.counts, lambda _: None):
                 acknowledged, seq = 0, 0
                 for _ in range(site.of(10, 3)):
                     acknowledged += _drive(engine, seq, 3)
@@ -183,7 +183,7 @@ def _room_made(engine: Engine, folder: Path) -> int:
     root = folder / "archive"
     begin_with_old_rows(root)
     with patch.multiple(reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):
-        reserve.keep(root)
+        reserve.allocate(root)
         assert (root / reserve.NAME).exists()
         jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
         retention, before = next(job for job in jobs if job.name == "retention"), len(old_days(root))
@@ -205,6 +205,6 @@ def _outbox_recovers(folder: Path, mounted: bool) -> bool:
             except Exception:  # noqa: BLE001 sqlite's own
                 refused = True
     took += len(outbox.store([draft], 0.0))
-    whole = len(outbox.held()) == took and (refused or not mounted)
+    whole = len(outbox.held_batches()) == took and (refused or not mounted)
     outbox.close()
     return whole

@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, NoReturn
 
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
-from schemas.runtime.process import end_now
+from schemas.runtime.process import force_exit
 from tests.faults.bars import figure
 
 RAISED: Final = 2  # exit code; 1: a bar does not hold
@@ -85,7 +85,7 @@ def leave(run: Callable[[], int]) -> NoReturn:
                 with suppress(ProcessLookupError):
                     os.kill(int(child), signal.SIGKILL)
         code = RAISED
-    end_now(code)
+    force_exit(code)
 
 
 def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:

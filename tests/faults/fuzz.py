@@ -109,7 +109,7 @@ def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
 
 
 def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool) -> tuple[int, int, int]:
-    """Whether a query crashed, was answered, and was of a past that was rebuilt; no past is without `past`."""
+    """Return whether a query crashed, was answered, and rebuilt a past map; none does without `past`."""
     rebuilt = 0
     try:
         wanted = query.parse(asked)

@@ -46,12 +46,12 @@ class Listener:
         self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
 
     def has(self, payload: bytes) -> bool:
-        """Whether it heard this payload."""
+        """Return True if it received this payload."""
         return any(payload in told for _, _, told in list(self.heard))
 
 
 class Ground:
-    """What an attack finds; the rogue is enrolled as a vehicle and sits at the second router."""
+    """Environment of an attack; the rogue is enrolled as a vehicle and connected to the second router."""
 
     def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
         self.network, self.service, self._stack = network, service, stack
@@ -86,7 +86,7 @@ class Ground:
         until(settled)
 
     def _durable(self, sent: wire.Batch) -> bool:
-        """Whether this very batch was acknowledged.
+        """Return True if this very batch was acknowledged.
 
         What else lies on the key counts for nothing: the acknowledgement of a batch before that was sent twice, or one
         that an attack forged.

@@ -74,7 +74,7 @@ def run(site: Site) -> list[Figure]:
             if second == WARM_S:
                 warm = _memory_mb()
         grown = _memory_mb() - warm
-        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.repeated(10**6))
+        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.alerts_to_repeat(10**6))
         settled = engine.counts[Kind.OBSERVATION]
         ours = {name: n for name, n in engine.counts.items() if n}
     site.say(f"{sent} messages of the insider, {settled} observations; {ours}")
@@ -154,7 +154,7 @@ def _text(one: Batch) -> Message:
 
 
 def _alone(latitude: float, longitude: float) -> bool:
-    """Whether an alert is where only the insider says to have been."""
+    """Return True if an alert is at a place that only the insider reports."""
     return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
 
 

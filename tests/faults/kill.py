@@ -22,7 +22,7 @@ from fleet_service.analytics import synthetic
 from fleet_service.app.engine import Engine
 from fleet_service.archive import layout
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due
+from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due_folders
 from fleet_service.serve.encode import cell_table
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
@@ -49,7 +49,7 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """What was offered amid the kills, for how long [s], and whether retention removed a day meanwhile."""
+    """Load during the kills: its amount, its duration [s], and whether retention removed a day meanwhile."""
 
     observations: int
     seconds: float
@@ -102,11 +102,11 @@ def begin_with_old_rows(archive: Path) -> None:
 
 def old_days(archive: Path) -> list[Path]:
     """Days that retention removes."""
-    return due(archive, LEAST_DAYS, datetime.now(UTC).date())
+    return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
 def _done(archive: Path) -> frozenset[str]:
-    """What upkeep left: the kills met it only if it was there."""
+    """Return the results of background jobs, which prove that the kills met them."""
     found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
     return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
 

@@ -36,7 +36,7 @@ PLACE = (57.70, 11.97)
 
 @dataclass(frozen=True)
 class Plan:
-    """What one generator does; `rate` is observations per second and vehicle."""
+    """Work of one generator; `rate` is observations per second and vehicle."""
 
     endpoint: str
     names: list[str]

@@ -129,7 +129,7 @@ def _agents(there: Stage, processes: int) -> None:
 
 
 def _settles(there: Stage) -> bool:
-    """Whether everything that is stored by now gets settled in time."""
+    """Return True if everything stored by now gets settled in time."""
     since, deadline = time.time(), time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:
         if told(there.journals).longest_wait(since) < float("inf"):

@@ -52,11 +52,11 @@ class Part:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Return True if it runs."""
         return self._process is not None and self._process.poll() is None
 
     def lines(self) -> list[str]:
-        """What it has printed since the present start."""
+        """Return the lines printed since the present start."""
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
@@ -139,7 +139,7 @@ class Stage:
 
     @property
     def journals(self) -> list[Path]:
-        """What the generators know to be on disk and settled."""
+        """Return the batches that the generators know to be on disk and settled."""
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:

@@ -106,7 +106,7 @@ def _wait(session: zenoh.Session) -> None:
 
 
 def _light(session: zenoh.Session, seconds: float) -> list[float]:
-    """How long each question about one tile took."""
+    """Return the time of each query for one tile."""
     waits, end, pause = [], time.monotonic() + seconds, threading.Event()
     while time.monotonic() < end:
         began = time.perf_counter()

@@ -42,7 +42,7 @@ class Running:
 
 @pytest.fixture(scope="session")
 def router() -> Iterator[ZenohSettings]:
-    """How to reach a router of this process."""
+    """Settings for a router of this process."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with session:
         yield ZenohSettings(connect=endpoints)

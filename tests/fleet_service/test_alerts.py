@@ -46,7 +46,7 @@ def told(stretches: Stretches, *alerts: Alert) -> list[Any]:
     return stretches.changes()
 
 
-def test_a_road_of_ice_in_both_directions_is_one_alert_with_its_length_and_direction() -> None:
+def test_an_icy_road_in_both_directions_is_one_alert() -> None:
     (found,) = told(Stretches(), *(alert(x, sector=s, at=x) for x in range(20) for s in (0, 2)))
     side = 360 / 2**21 * 111_195 * np.cos(np.radians(found.latitude))
     assert found.length_m == pytest.approx(20 * side, rel=0.01)
@@ -119,7 +119,7 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
         thread.join()
 
 
-def test_a_webhook_is_what_alertmanager_sends_and_comes_in_order_after_a_refusal() -> None:
+def test_webhook_has_alertmanagers_format_and_order_after_a_refusal() -> None:
     road, said = Stretches(), list[str]()
     with receiver(refuse=1) as (url, heard):
         hook = Webhook(url, said.append)

@@ -25,6 +25,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.commandline import Command
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
+from tests import reference_pages
 from tests.buckets import BucketServer
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
@@ -35,20 +36,17 @@ from tests.waiting import until
 COMMAND = [sys.executable, "-m", "fleet_service.cli"]
 
 
-README = Path(cli.__file__).parents[1] / "README.md"
-
-
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: str(command.name))
-def test_every_command_has_help_and_stands_in_the_readme_with_all_its_options(
+def test_every_command_has_help_and_every_option_is_in_the_reference(
     command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([command.name, "--help"])
     options = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE)
-    written = "".join(re.findall(rf"^fleet-service {command.name} .*(?:\n  .*)*", README.read_text(), re.MULTILINE))
-    assert written
+    page = reference_pages.command_page("fleet-service")
+    assert f"## `{command.name}`" in page
     assert options or command.name == "completion"
-    assert not [option for option in options if option not in written]
+    assert not [option for option in options if option not in page]
 
 
 def test_the_help_of_analyze_names_every_question() -> None:
@@ -185,7 +183,7 @@ BREAKS = "service.Service._shut_down = lambda self, *_: [][0]"
 
 
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])
-def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_well(
+def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
     tmp_path: Path, router: ZenohSettings, more: str, code: int
 ) -> None:
     config = tmp_path / "service.json"
@@ -196,7 +194,7 @@ def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_
     try:
         service.line_with("hangs")
         assert service.stop() == code
-        assert "left at last: a session or a job did not end in time" in service.lines()
+        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
         assert ("IndexError: list index out of range" in service.lines()) == bool(more)
     finally:
         service.kill()
@@ -215,7 +213,7 @@ def test_a_service_that_has_to_be_ended_gives_its_lease_free(
         service.line_with("hangs")
         service.line_with("ready: ")
         assert service.stop() == 0
-        assert "left at last: a session or a job did not end in time" in service.lines()
+        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
     finally:
         service.kill()
     (lease,) = bucket.place("lease").glob("*.json")

@@ -137,7 +137,7 @@ CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
 
 
 class Done(NamedTuple):
-    """What a command did: exit code, what it printed, and the files below its folder."""
+    """Result of a command: exit code, output, and the files below its folder."""
 
     code: int
     said: str
@@ -162,7 +162,7 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """What a file holds, as far as it is the same each time."""
+    """Return the reproducible content of a file."""
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
     if path.suffix == ".pem":
@@ -182,7 +182,7 @@ def done(words: list[str], folder: Path, capsys: Capture) -> Done:
 
 
 def options(command: Command) -> set[str]:
-    """What a command takes."""
+    """Return the options of a command."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)
     return {action.option_strings[0] if action.option_strings else action.dest for action in parser._actions}
@@ -267,9 +267,7 @@ def test_certificates_that_end_within_so_many_days_are_renewed(
     assert capsys.readouterr().out.startswith("issued 7: ") == renewed
 
 
-def test_weather_archive_and_configuration_of_a_service_are_those_that_run_is_given(
-    tmp_path: Path, router: ZenohSettings
-) -> None:
+def test_service_weather_archive_and_configuration_are_those_given(tmp_path: Path, router: ZenohSettings) -> None:
     rain = pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]})
     pq.write_table(rain, tmp_path / "rain.parquet")
     for name, more in (("shard-1", []), ("shard-2", ["--weather", str(tmp_path / "rain.parquet")])):
@@ -332,7 +330,7 @@ def test_every_option_of_a_query_changes_the_answer(router: ZenohSettings, tmp_p
     assert capsys.readouterr().out.splitlines()[-1] == "2 cells"
 
 
-def test_a_box_chooses_the_tiles_that_are_watched_and_either_way_names_the_router(
+def test_box_selects_watched_tiles_and_both_options_name_the_router(
     service: Running, session: zenoh.Session, router: ZenohSettings, tmp_path: Path
 ) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"zenoh": router.model_dump()}))

@@ -82,7 +82,7 @@ def queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """How often segments are written and rounds of tiles begin in ten turns of .3 s each."""
+    """Count segments and rounds of tiles in ten turns of .3 s each."""
     clock, calls = [time.monotonic()], {"begin_flush": 0, "take_dirty": 0}
 
     def counted(name: str) -> Callable[..., list[Any]]:

@@ -1,4 +1,4 @@
-"""What the .proto and the README tell other languages is what the code does."""
+"""Statements of the .proto and the README for other languages agree with the code."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.timeout(400)  # a service whose kernels are not compile
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """What a third party's process found, beside a router and a service in processes of their own."""
+    """Return the results of a third party's process, with a router and a service in processes of their own."""
     folder = tmp_path_factory.mktemp("third-party")
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"

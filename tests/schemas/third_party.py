@@ -81,7 +81,7 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 
 class Heard:
-    """What subscribers decoded, by topic; a message that cannot be read is kept as its error."""
+    """Messages decoded by subscribers, by topic; an unreadable message is stored as its error."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.acks: dict[str, list[wire.StreamAck]] = {}

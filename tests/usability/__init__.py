@@ -1,1 +1,1 @@
-"""How it is to use: what a person meets in the first hour, as figures. `make usability`."""
+"""Usability campaign: the first hour of a new user as figures. `make usability`."""

@@ -32,6 +32,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
+from tests import reference_pages, results
 from tests.browser import opened
 from tests.faults.processes import Part
 from tests.first_drive import commands, mapped
@@ -40,7 +41,7 @@ from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
 from tests.house import ROOT
 from tests.sight import SIGHTS, difference, lab
-from tests.usability import kept, mistakes, stale, waiting
+from tests.usability import mistakes, waiting
 from tests.usability.wrong_logs import WRONG, unnoticed
 from tests.waiting import until
 
@@ -66,7 +67,7 @@ class House:
 
 
 def readme_commands_failed(house: House) -> float:
-    """Commands of the root README that fail, in a network of their own."""
+    """Count commands of the tutorials that fail, in a network of their own."""
     folder = house.folder / "readme"
     folder.mkdir()
     line = f"ip link set lo up && exec {sys.executable} -m tests.usability.readme {folder}"
@@ -105,7 +106,7 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """What is wrong with the live page before a service with cars on ice; None where nothing is."""
+    """Return the faults of the live page with a service and cars on ice; None if there are none."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)
     with router, running(connection, house.folder / "live"), page_of(connection) as address:
@@ -196,21 +197,21 @@ def install_to_first_map_s(house: House) -> float:
 
 
 def options_undocumented(house: House) -> float:
-    """Options that no README mentions."""
-    found = stale.undocumented()
+    """Count options without a help text."""
+    found = reference_pages.undocumented_options()
     house.note("undocumented", found)
     return float(len(found))
 
 
 def figures_stale(house: House) -> float:
-    """Figures that pages quote and that are not those of the files in deploy/figures."""
-    found = kept.stale()
+    """Count pages of figures that are not those of the files in deploy/figures."""
+    found = results.stale()
     house.note("stale", found)
     return float(len(found))
 
 
 def alerts_per_stretch(house: House) -> float:
-    """Of the last demo."""
+    """Return the alerts per stretch of the last demo."""
     path = ROOT / ".demo" / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else []
     values = {row["name"]: row["value"] for row in rows if "name" in row}
@@ -220,7 +221,7 @@ def alerts_per_stretch(house: House) -> float:
 
 
 def first_drive_commands(_: House) -> float:
-    """That README's first drive takes, from the installation to the map."""
+    """Count the commands of the first drive, from the installation to the map."""
     return float(len(commands()))
 
 

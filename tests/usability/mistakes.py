@@ -76,7 +76,7 @@ def prepare(folder: Path) -> None:
 
 
 def tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """How many mistakes were made, and those that were answered with a traceback or with exit code 0."""
+    """Return how many mistakes were made, and those answered with a traceback or with exit code 0."""
     bad = []
     lines: list[tuple[Callable[[list[str]], int], str]] = [(edge_agent.cli.main, line) for line in EDGE]
     lines += [(fleet_service.cli.main, line) for line in FLEET]

@@ -1,6 +1,7 @@
-"""The commands of the root README, as written and in their order, in a network of their own and an empty folder.
+"""Run the commands of the tutorials, as written and in order, in a network of their own and an empty folder.
 
-Lines that stay (router, service, agent, watch) are started and must still run at the end; `pip install` is not run.
+Commands that stay (router, service, agent, watch, page) are started and must still run at the end. `pip install` is not
+run.
 """
 
 from __future__ import annotations
@@ -16,22 +17,41 @@ from typing import Final
 
 from tests.house import ROOT
 
-LASTING: Final = ("python -m deploy.router", "fleet-service run", "edge-agent run", "fleet-service watch")
+PAGES: Final = tuple(
+    ROOT / "deploy" / "docs" / name
+    for name in (
+        "tutorials/first-map.md",
+        "tutorials/first-drive.md",
+        "tutorials/first-analysis.md",
+        "tutorials/reproduce-a-paper.md",
+        "how-to/certificates.md",
+    )
+)
+LASTING: Final = (
+    "python -m deploy.router",
+    "fleet-service run",
+    "edge-agent run",
+    "fleet-service watch",
+    "fleet-service page",
+)
 LEFT_OUT: Final = ("pip install",)
-SECTION: Final = "## Using them"
 READY: Final = {"fleet-service run": "ready: "}  # what a person waits for before the next line
 SETTLE_S: Final = 2.0  # until what says nothing is up
 LONGEST_S: Final = 300.0
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
-    """Language and text of each fenced block of the section."""
-    section = text[text.index(SECTION) :].split("\n## ")[0]
-    return [(m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", section, re.DOTALL | re.MULTILINE)]
+    """Return language and text of each fenced block of a page."""
+    return [(m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)]
+
+
+def pages() -> str:
+    """Return the text of all pages whose commands are run."""
+    return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 
 def commands(text: str) -> list[str]:
-    """Lines that are typed, without their comments; a block of Python as one."""
+    """Return the commands of a page without their comments; a block of Python is one command."""
     found = []
     for language, block in blocks(text):
         if language == "python":
@@ -50,7 +70,7 @@ def run(folder: Path) -> list[str]:
     staying: list[tuple[str, subprocess.Popen[bytes]]] = []
     failed: list[str] = []
     try:
-        for number, command in enumerate(commands((ROOT / "README.md").read_text())):
+        for number, command in enumerate(commands(pages())):
             log = folder / f"{number}.log"
             if command.startswith(LASTING):
                 if "certs/" in command:  # the second router wants the port of the first

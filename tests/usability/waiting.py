@@ -1,4 +1,4 @@
-"""How long a person on a terminal waits without a sign of life."""
+"""Longest silence of a command on a terminal."""
 
 from __future__ import annotations
 

@@ -16,10 +16,10 @@ from typing import Final
 import numpy as np
 
 from edge_agent.ahead.horizon import COMFORT, horizon_length, look_ahead
-from edge_agent.ahead.known import HeardMap
-from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.roads import ways_on
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.lab.ahead.known_town import heard, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.observe.cell_tracker import locate, new_tracks
@@ -133,17 +133,19 @@ def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
     return np.asarray(np.min(found, axis=(0, 1)))
 
 
-def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: HeardMap, *, routed: bool) -> list[Path]:
+def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: LocalMap, *, routed: bool) -> list[Path]:
     length = horizon_length(pose.speed)
     if routed:
         given = GivenRoute(*fleet.route_ahead(k, length + 50.0)).ahead(pose, length)
         if given is not None:
             return [given]
-    return ways_on(pose, known.keys(), length) or [corridor(pose, length)]
+    return ways_on(pose, known.keys(), length) or [straight_path(pose, length)]
 
 
-def _look(track: _Track, pose: Pose, known: HeardMap, ways: list[Path]) -> None:
-    track.active, issued = warn(track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known)
+def _look(track: _Track, pose: Pose, known: LocalMap, ways: list[Path]) -> None:
+    track.active, issued = update_warnings(
+        track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known
+    )
     look = len(track.metre) - 1
     for one in issued:
         if one.state == "raised":

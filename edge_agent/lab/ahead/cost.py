@@ -13,13 +13,13 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.asking import FURTHER_M, Asked, Tiles, keys_of
-from edge_agent.ahead.hearing import heard_cells
+from edge_agent.ahead.asking import FURTHER_M, RequestLog, Tiles, keys_of
+from edge_agent.ahead.hearing import decode_cells
 from edge_agent.ahead.horizon import horizon_length, look_ahead
-from edge_agent.ahead.known import HeardMap
-from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor, degrees
+from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path, to_degrees
 from edge_agent.ahead.roads import ways_on
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.lab.ahead.made_up_service import tile_payload
 from schemas import grid, keys
 from schemas.numeric import FloatArray, IntArray
@@ -44,7 +44,7 @@ def streets() -> IntArray:
     for offset, sectors in ((2.0, (0, 1)), (-2.0, (2, 3))):
         for along_x, sector in zip((True, False), sectors, strict=True):
             a, b = (grid_.ravel() for grid_ in np.meshgrid(side, line + (-offset if along_x else offset)))
-            cell = grid.cell_of(*degrees(*((a, b) if along_x else (b, a)), CENTRE))
+            cell = grid.cell_of(*to_degrees(*((a, b) if along_x else (b, a)), CENTRE))
             found.append(np.unique(cell) * grid.SECTORS + sector)
     return np.unique(np.concatenate(found))
 
@@ -81,23 +81,23 @@ def drive(rng: np.random.Generator, known: IntArray, metres: float, *, routed: b
     """Megabytes heard, and processor time over time driven."""
     corners = way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
-    route = GivenRoute(*degrees(corners[:, 0], corners[:, 1], CENTRE))
-    heard, asked, tiles = HeardMap(), Asked(), Tiles()
+    route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))
+    heard, asked, tiles = LocalMap(), RequestLog(), Tiles()
     active: tuple[Active, ...] = ()
     total, spent = 0, 0.0
     for second in range(int(metres / SPEED)):
         s = second * SPEED
         x, y = np.interp(s, run, corners[:, 0]), np.interp(s, run, corners[:, 1])
         step = corners[min(int(s / BLOCK_M) + 1, len(corners) - 1)] - corners[int(s / BLOCK_M)]
-        latitude, longitude = degrees(np.asarray(x), np.asarray(y), CENTRE)
+        latitude, longitude = to_degrees(np.asarray(x), np.asarray(y), CENTRE)
         now = CENTRE.time + second * NS
         pose = Pose(float(latitude), float(longitude), math.atan2(step[1], step[0]), SPEED, now)
         began, length = time.process_time(), horizon_length(SPEED)
         paths: list[Path] = []
         if routed and (given := route.ahead(pose, length + FURTHER_M)) is not None:
             paths = [given]
-        paths = paths or ways_on(pose, heard.keys(), length + FURTHER_M) or [corridor(pose, length)]
-        active, _ = warn(active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard)
+        paths = paths or ways_on(pose, heard.keys(), length + FURTHER_M) or [straight_path(pose, length)]
+        active, _ = update_warnings(active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard)
         tiles.follow([path.near(length) for path in paths], pose)
         boxes = [box for path in paths for box in asked.wanting(path, pose, length)]
         spent += time.process_time() - began
@@ -108,7 +108,7 @@ def drive(rng: np.random.Generator, known: IntArray, metres: float, *, routed: b
                 payload, key = tile_payload(inside[tile == one], 0.7, now), keys.map_key(one)
                 total += len(payload) + len(key) + FRAME
                 began = time.process_time()
-                heard.take(*heard_cells(key, payload, now), now)
+                heard.take(*decode_cells(key, payload, now), now)
                 spent += time.process_time() - began
             total += FRAME * len(keys_of(box))
         if second % 2 == 0:

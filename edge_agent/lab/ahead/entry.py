@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.prior import NOWHERE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, absolute
@@ -82,7 +82,7 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     return [*out, Figure("prior.evidence_nats", nats, "nat", 0.5)]
 
 
-def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None) -> FilterTrace:
+def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None) -> FilterTrace:
     """Drive, and note what the filters say; with a `prior`, as a car does that hears that map."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -106,7 +106,7 @@ def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None)
     return FilterTrace(place, own, visit, truth, published)
 
 
-def entry_errors(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
+def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
     with_prior, alone = with_map(trace, known, now), _medians(np.exp(trace.own))
     since = _since_entry(trace.place)
@@ -115,7 +115,7 @@ def entry_errors(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 
-def arrivals(trace: FilterTrace, wrong: HeardMap, right: HeardMap, now: int) -> list[tuple[float, float]]:
+def arrivals(trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
     differ = _differ(trace.place, wrong, right, now)
     with_prior, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
@@ -149,7 +149,7 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
     return float(np.abs(a - b).max()) / mugrid.STEPS_PER_NAT
 
 
-def with_map(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
+def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """Median of what would be believed with a map, (T, N)."""
     prior, out = MapPrior(trace.place.shape[1]), np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
@@ -158,7 +158,7 @@ def with_map(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     return out
 
 
-def _belief(known: HeardMap, place: int, now: int) -> FloatArray | None:
+def _belief(known: LocalMap, place: int, now: int) -> FloatArray | None:
     return known.belief(place, now) if place != NOWHERE else None
 
 
@@ -173,7 +173,7 @@ def _since_entry(place: IntArray) -> IntArray:
     return out
 
 
-def _differ(place: IntArray, wrong: HeardMap, right: HeardMap, now: int) -> BoolArray:
+def _differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
     """Where one map says slippery and the other does not."""
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.known import MEASURED, HeardCells, HeardMap, belief_of
+from edge_agent.ahead.known import MEASURED, LocalMap, ReceivedCells, belief_of
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import Scenario
 from schemas import grid, mugrid
@@ -36,16 +36,16 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
     return KnownPlaces(key[order][first], mu[order][first])
 
 
-def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None) -> HeardMap:
+def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None) -> LocalMap:
     """What a car has heard that was told of all places, by the truth, or off it by chance."""
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)
     lower, upper = np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER), np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER)
     slippery = np.clip(0.5 + (SLIPPERY_MU - mu) / (3.0 * SPREAD), 0.0, 1.0)
-    belief, cache = belief_of(lower, mu, upper, slippery), HeardMap(most_cells=1 << 20)
+    belief, cache = belief_of(lower, mu, upper, slippery), LocalMap(most_cells=1 << 20)
     n = len(places.key)
-    cells = HeardCells(places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now)))
+    cells = ReceivedCells(places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now)))
     tiles = grid.tile_of(places.key // grid.SECTORS)
     for tile in np.unique(tiles).tolist():
-        cache.take(tile, HeardCells._make(column[tiles == tile] for column in cells), now)
+        cache.take(tile, ReceivedCells._make(column[tiles == tile] for column in cells), now)
     return cache

@@ -17,7 +17,7 @@ import numpy as np
 import zenoh
 
 from edge_agent.ahead.lookout import Lookout
-from edge_agent.ahead.path import Pose, degrees
+from edge_agent.ahead.path import Pose, to_degrees
 from edge_agent.lab.ahead.made_up_service import MadeUpService
 from schemas import grid
 from schemas.config import ZenohSettings
@@ -75,7 +75,7 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
     def hear(name: str, warning: GripWarning) -> None:
         warned[name].put((time.perf_counter(), warning))
 
-    places = [degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
+    places = [to_degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
 
     def poses() -> list[Pose]:
         now = time.time_ns()
@@ -121,7 +121,7 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
 
 def _ice(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:
     pose = ORIGIN._replace(latitude=float(place[0][0]), longitude=float(place[1][0]))
-    latitude, longitude = degrees(np.array([AHEAD_M]), np.zeros(1), pose)
+    latitude, longitude = to_degrees(np.array([AHEAD_M]), np.zeros(1), pose)
     cell = int(grid.cell_of(latitude, longitude)[0])
     middle = grid.centre(cell)
     return Alert(

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import candidates, shipped
+from edge_agent.app.tuned_memberships import search_results, shipped
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.design import design_of
@@ -59,7 +59,7 @@ def campaign(seeds: Sequence[int], *, quick: bool) -> Scores:
 
 def ways() -> dict[str, list[tuple[Memberships, bool]]]:
     """Memberships, and whether rules are applied, by way."""
-    searched = {way: [(one, True) for one in sets] for way, sets in candidates(ESTIMATOR).items()}
+    searched = {way: [(one, True) for one in sets] for way, sets in search_results(ESTIMATOR).items()}
     tuned, untuned = shipped(ESTIMATOR), Memberships()
     given = {
         "fuzzy": (tuned, True),

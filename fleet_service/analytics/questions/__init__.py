@@ -1,4 +1,4 @@
-"""The one table of questions: name, what it asks, and what its answer can be shown as."""
+"""Table of questions: name, description, and possible forms of the answer."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Question(NamedTuple):
 
     Attributes:
         about: one line for the help.
-        order: column by which the terminal shows rows, descending with a minus in front.
-        colour: column that a map colours cells by; None where the answer has no place.
-        answer: what answers it, of a question that another package brings; None: a module here.
+        order: column by which the terminal shows rows, descending with a leading minus.
+        colour: column that a map colours cells by; None if the answer has no place.
+        answer: function of a plug-in's question; None for a module here.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Question(NamedTuple):
 
     @property
     def ask(self) -> Callable[[QueryEngine, Options], pa.Table]:
-        """What answers it; imported when it is asked, for Ibis is heavy."""
+        """Return the function that answers it; imported on demand, because Ibis is heavy."""
         if self.answer is not None:
             return self.answer
         module = import_module(f"fleet_service.analytics.questions.{self.name.replace('-', '_')}")
@@ -59,19 +59,21 @@ QUESTIONS: Final = {
 }
 
 
-def known() -> dict[str, Question]:
-    """All questions by name, those of other packages too."""
-    others = {name: plugins.loaded(plugins.QUESTIONS, name) for name in plugins.found(plugins.QUESTIONS)}
+def known_questions() -> dict[str, Question]:
+    """Return all questions by name, those of plug-ins too."""
+    others = {
+        name: plugins.load_entry_point(plugins.QUESTIONS, name) for name in plugins.entry_points_of(plugins.QUESTIONS)
+    }
     return others | QUESTIONS
 
 
 def question_of(name: str) -> Question:
-    """A question by name.
+    """Return a question by name.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: there is no question of that name.
     """
-    found = known().get(name)
+    found = known_questions().get(name)
     if found is None:
-        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known())}")
+        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known_questions())}")
     return found

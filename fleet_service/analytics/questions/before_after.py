@@ -1,4 +1,4 @@
-"""`before-after`: what changed at a moment, in the same cells; with an interval that knows that vehicles are biased.
+"""`before-after`: change of grip at a moment, in the same cells, with an interval that accounts for biased vehicles.
 
 Legend
     y    a value of mu in cell c, period p (before, after), by vehicle v
@@ -21,7 +21,7 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """One row: cells, vehicles, values, means of both periods, difference and its standard deviation."""
+    """Return one row: cells, vehicles, values, means of both periods, difference and its standard deviation."""
     t = t.filter(value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
     place = ["cell", "sector"]
@@ -49,7 +49,7 @@ def expression(t: Table, at_s: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Two rows, before and after, with mu and its difference, interval, cells, vehicles and values behind it.
+    """Return two rows, before and after: mu, its difference with interval, and the cells, vehicles and values used.
 
     Raises:
         InputError: no moment is given, or no cell was measured in both periods.

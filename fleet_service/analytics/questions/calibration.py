@@ -1,7 +1,8 @@
-"""`calibration`: how often the interval that the map published held against what vehicles measured there afterwards.
+"""`calibration`: how often later values lay in the interval that the map had published.
 
-A value is held against the snapshots of the map in the HORIZON_S before it. `held`: the value itself lies inside. Its
-own error is in that figure, so that an honest 90 % map stays a little below .9; `compatible`: its interval touches.
+A value is compared with the snapshots of the map in the HORIZON_S before it. `held`: the value itself lies inside. Its
+own error is part of this figure, so a calibrated 90 % map stays slightly below 0.9. `compatible`: its interval
+overlaps.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _HOUR_S: Final = 3600
 
 
 def expression(t: Table, maps: Table) -> Table:
-    """One row per basis and hours between snapshot and value."""
+    """Return one row per basis and hours between snapshot and value."""
     t = t.filter(value(t)).select(
         "cell",
         "sector",
@@ -46,5 +47,5 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Rows of `expression`."""
+    """Return the rows of `expression`."""
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -1,16 +1,16 @@
-"""`change-rates`: how fast roads turn slippery or back, by temperature and by hour, from the archive's own values.
+"""`change-rates`: how fast roads become slippery or recover, by temperature and by hour, from the archive's values.
 
-Two values of a cell in a row, by different vehicles, say whether the road was slippery at both times. After a time Δ
+Two successive values of a cell, by different vehicles, show whether the road was slippery at both times. After a time Δ
 
     P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
 
-    λ   rate at which a road becomes another one, as in the fusion (CHANGE_S is 1/λ)        [1/s]
-    e   two readings of the same road that are unlike by their errors
-    m   two readings of two roads that are; π is the share of slippery ones in the class
+    λ   rate of change of the road, as in the fusion (CHANGE_S is 1/λ)                      [1/s]
+    e   probability that two readings of the same road differ because of errors
+    m   probability that readings of two roads differ; π is the share of slippery ones in the class
 
-which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are those of the largest
-likelihood over bins of Δ. Roads of a region change together, so pairs are no witnesses of their own: days are, and the
-90 % interval is that of days drawn with replacement. With fewer than LEAST_DAYS there is none.
+which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e maximise the likelihood over bins
+of Δ. Roads of a region change together, so pairs are not independent. Days are, and the 90 % interval is that of days
+drawn with replacement. With fewer than LEAST_DAYS there is none.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ BANDS: Final = (
 
 
 def expression(t: Table) -> Table:
-    """Pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values among both, `seconds`.
+    """Return pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values among both, `seconds`.
 
     Args:
-        t: observations with `temperature` of the air [°C], null where nobody knows it.
+        t: observations with `temperature` of the air [°C], null if unknown.
     """
     t = t.filter(value(t))
     w = ibis.window(group_by=["cell", "sector"], order_by=["time", "vehicle", "boot", "seq", "row"])
@@ -79,9 +79,9 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """A row per band of road temperature and per part of the day: rate per hour, its interval, what it rests on.
+    """Return one row per band of road temperature and per part of the day: rate per hour, its interval, and its basis.
 
-    Temperatures are those of the nearest station where `stations` is given, else those that vehicles reported.
+    Temperatures are those of the nearest station if `stations` is given, else those that vehicles reported.
 
     Raises:
         InputError: the table of stations cannot be used.
@@ -100,7 +100,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         for one in names:
             part = counted.filter(pc.equal(counted[column], pa.scalar(one)))
             if (pc.sum(part["pairs"]).as_py() or 0) >= LEAST_PAIRS:
-                rows.append({"by": by, "class": _named(one), **_fitted(part)})
+                rows.append({"by": by, "class": _named(one), **_fit_class(part)})
     return pa.Table.from_pylist(rows, schema=SCHEMA)
 
 
@@ -117,8 +117,8 @@ def _named(one: str | int) -> str:
     return one if isinstance(one, str) else f"{one * HOURS:02}-{(one + 1) * HOURS:02}"
 
 
-def _fitted(counted: pa.Table) -> dict[str, float | int | None]:
-    """Rate of a class, with the interval of days drawn with replacement."""
+def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
+    """Return the rate of a class, with the interval of days drawn with replacement."""
     columns = {name: counted[name].to_numpy().astype(float) for name in ("pairs", "unlike", "slippery", "seconds")}
     days, day = np.unique(counted["day"].to_numpy(zero_copy_only=False), return_inverse=True)
     octaves, octave = np.unique(counted["octave"].to_numpy(), return_inverse=True)
@@ -145,7 +145,7 @@ BEGINS: Final = tuple((1.0 / seconds, misread) for seconds in (600.0, 10_800.0, 
 
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
-    """λ [1/s] and e of the largest likelihood; NaN where no pair was unlike, or all roads are alike.
+    """Return λ [1/s] and e of the largest likelihood; NaN if no pair differs, or all roads are alike.
 
     Args:
         counts: (bins, 4) pairs, unlike ones, slippery values, seconds between.

@@ -1,10 +1,10 @@
-"""`contract`: per link of a road network, whether an agreed grip was kept, and how long it was not at the worst.
+"""`contract`: per link of a road network, whether the agreed grip was kept, and the longest breach.
 
-A link is looked at in pieces of PIECE_M, and is as good as the worst of them; ice on a tenth is not averaged away.
-Values are gathered in slots of SLOT_S, per vehicle first: a car that passes ten times is one witness. A slot is surely
-below the level when the 90 % interval of its mean lies below, surely kept when it lies above. A breach begins with a
-slot below and ends with the next one that is not. `least_s` is what was surely below; `most_s` runs from the last slot
-that was surely kept to the next one, between which nobody showed it. What was not measured is unknown, and never kept.
+A link is evaluated in pieces of PIECE_M, and is as good as its worst piece, so that ice on a tenth is not averaged
+away. Values are collected in slots of SLOT_S, per vehicle first: a car that passes ten times is one witness. A slot is
+certainly below the level if the 90 % interval of its mean lies below, and certainly kept if it lies above. A breach
+begins with a slot below and ends with the next one that is not. `least_s` is the time certainly below. `most_s` runs
+from the last slot that was certainly kept to the next one. Unmeasured time is unknown, and never counts as kept.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Mean of each vehicle's values per piece of a link and slot, with the mean of the variances that it reported.
+    """Return the mean of each vehicle's values per piece of a link and slot, with the mean of its reported variances.
 
     Args:
         t: observations.
@@ -56,10 +56,10 @@ def expression(t: Table, places: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """One row per link and direction on which anybody measured anything, the worst first.
+    """Return one row per measured link and direction, the worst first.
 
     Raises:
-        InputError: there is no table of roads, no level, or no time within which it is to be restored.
+        InputError: the table of roads, the level, or the time within which it must be restored is missing.
     """
     if options.roads is None:
         raise InputError("roads", "no table of roads", "make one: fleet-service roads EXTRACT --out roads.parquet")
@@ -78,9 +78,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slots(found: pa.Table) -> dict[str, FloatArray]:
-    """Mean and 90 % interval per slot from those of its vehicles, as columns with the slot's first row.
+    """Return mean and 90 % interval per slot from those of its vehicles, as columns with the slot's first row.
 
-    The error of a mean is the larger of what the vehicles' spread and what their own intervals say.
+    The error of a mean is the larger of the vehicles' spread and their own intervals.
     """
     y, variance, key = (found[name].to_numpy() for name in ("y", "variance", "key"))
     first, which, n = np.unique(key, return_index=True, return_inverse=True, return_counts=True)[1:]
@@ -96,13 +96,13 @@ def slots(found: pa.Table) -> dict[str, FloatArray]:
 def breach(
     slot: IntArray, lower: FloatArray, mu: FloatArray, upper: FloatArray, level: float, span: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """The longest breach of one link [s]: by the means, surely, at the most; and when it began (0: none).
+    """Return the longest breach of one link [s]: by the means, certain, and possible; and its begin (0 for none).
 
     Args:
         slot: (n,) numbers of slots, ascending.
         lower, mu, upper: (n,) interval and mean of each.
-        level: that was agreed.
-        span: begin and end [s] of all that was measured: before and after it nobody knows.
+        level: agreed grip.
+        span: begin and end [s] of all measurements; outside it nothing is known.
     """
     begins = slot * SLOT_S
     first, after = _runs(mu < level)
@@ -118,7 +118,8 @@ def breach(
 
 
 def _runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """First places of runs of true values, and the places after their last; a run ends where the next slot is far."""
+    """Return the first positions of runs of true values, and the positions after their last; a run ends where the next
+    slot is far."""
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)
     new = np.append(True, np.diff(number[at]) != 0)[: len(at)]
@@ -126,7 +127,7 @@ def _runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, 
 
 
 class _Measured(NamedTuple):
-    """Of one link: rows of each piece, and who told what."""
+    """Rows of each piece of one link, and their vehicles."""
 
     pieces: dict[int, list[int]]
     vehicles: set[str]
@@ -138,7 +139,7 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
     about = {(row["link"], row["direction"]): row
              for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
                  [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
-    share = _measured(roads, seen)
+    share = _measured_share(roads, seen)
     rows = found.to_pylist()
     names = [(str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in rows]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
@@ -173,8 +174,8 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
     return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
 
 
-def _measured(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
-    """Share of each link's length that lies in cells with a value."""
+def _measured_share(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
+    """Return the share of each link's length that lies in cells with a value."""
     rows = roads.join(seen, ["cell", "sector"], join_type="inner").sort_by("from_m")
     total: dict[tuple[str, str], float] = {}
     reached: dict[tuple[str, str], float] = {}

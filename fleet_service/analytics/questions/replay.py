@@ -1,4 +1,4 @@
-"""`replay`: the map as of any moment, replayed from the archive as the service fused it; or a day of it, in frames."""
+"""`replay`: the map as of any moment, replayed from the archive; or a day of it in frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import visited_cells
 from fleet_service.archive import layout
 from fleet_service.fusion import Fusion
-from fleet_service.replay.rebuild import Since, replay, weathered
+from fleet_service.replay.rebuild import Since, fusion_with_weather, replay
 from schemas import tables
 from schemas.errors import InputError
 from schemas.thresholds import NS
@@ -25,16 +25,16 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
+    """Return the cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
 
     Raises:
-        InputError: the step is none, or makes more frames than anybody looks at.
+        InputError: the step is not valid, or makes too many frames.
     """
     if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
         raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
     at = options.at if options.at is not None else engine.part.until
     last = at if options.step_s is None else max(at, engine.part.until)
-    fusion = weathered(engine.root, options.lateness_s, last)
+    fusion = fusion_with_weather(engine.root, options.lateness_s, last)
     if options.step_s is None:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
@@ -57,10 +57,10 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def _begin(engine: QueryEngine, first: int, step: int) -> int:
-    """When the frames begin [ns]: with the part, or just before the first row where the part begins earlier.
+    """Return the begin of the frames [ns]: that of the part, or just before the first row if the part begins earlier.
 
     Raises:
-        InputError: there would be more of them than anybody looks at.
+        InputError: there would be too many frames.
     """
     days = layout.days(engine.root, layout.TABLES[Kind.OBSERVATION])
     last = (max(map(layout.day_of, days), default=first // layout.DAY_NS) + 1) * layout.DAY_NS

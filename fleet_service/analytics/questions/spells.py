@@ -1,7 +1,7 @@
-"""`spells`: when cells became slippery, for how long, and how long an alert of two vehicles took.
+"""`spells`: begin and duration of slippery spells, and the time until an alert of two vehicles.
 
-A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time; it ends with the first value of
-grip. `least_vehicles` or more reported it. The alert is the first value of a second vehicle, as the service raises it.
+A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time. It ends with the first value of
+grip, and at least `least_vehicles` reported it. The alert is the first value of a second vehicle, as in the service.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """One row per spell; where it `lasts` at the end of the data, `end` is null and `duration_s` the least it took."""
+    """Return one row per spell; if it `lasts` at the end of the data, `end` is null and `duration_s` a minimum."""
     t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
     place = ["cell", "sector"]
     order = ["time", "vehicle", "boot", "seq", "row"]
@@ -47,5 +47,5 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Rows of `expression`."""
+    """Return the rows of `expression`."""
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -1,4 +1,4 @@
-"""`vehicles`: how far a vehicle's values lie from those of others in the same cell and hour; its sensors' health."""
+"""`vehicles`: deviation of a vehicle's values from those of others in the same cell and hour; its sensors' health."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ HOUR_S = 3600
 
 
 def expression(t: Table) -> Table:
-    """One row per vehicle; `bias` is null where it never met another one.
+    """Return one row per vehicle; `bias` is null if it never met another one.
 
-    `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its standard error, `z` their
-    ratio's size.
+    `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its standard error, `z` the
+    size of their ratio.
     """
     reported = value(t)
     mine = t.group_by("vehicle").aggregate(
@@ -44,5 +44,5 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Rows of `expression`."""
+    """Return the rows of `expression`."""
     return engine.answer(expression(engine.observations()))

@@ -1,4 +1,4 @@
-"""`weather`: values of mu by the temperature that the nearest station read in that hour; what grip does below 0 °C."""
+"""`weather`: values of mu by the temperature that the nearest station read in that hour."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BITS: Final = 22  # of a cell below its region: 2·(21 - 10)
 
 
 def nearest_readings(t: Table, path: Path) -> Table:
-    """Observations with the `temperature` [°C] that the station nearest to their region read in that hour.
+    """Return observations with the `temperature` [°C] of the nearest station in that hour.
 
     Raises:
         InputError: the table of stations cannot be used.
@@ -34,7 +34,8 @@ def nearest_readings(t: Table, path: Path) -> Table:
 
 
 def expression(t: Table, stations: Table, readings: Table) -> Table:
-    """One row per band of temperature [temperature, temperature + BAND): values, percentiles, share of slippery ones.
+    """Return one row per band of temperature [temperature, temperature + BAND): values, percentiles, share of slippery
+    ones.
 
     Args:
         t: observations.
@@ -68,7 +69,7 @@ def _joined(t: Table, stations: Table, readings: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Rows of `expression`.
+    """Return the rows of `expression`.
 
     Raises:
         InputError: there is no table of stations, or it lacks a column.
@@ -80,10 +81,10 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def read(path: Path) -> tuple[pa.Table, pa.Table]:
-    """Stations, and mean readings per station and hour.
+    """Return stations, and mean readings per station and hour.
 
     Raises:
-        InputError: it cannot be read, or lacks a column.
+        InputError: the file cannot be read, or lacks a column.
     """
     try:
         table = pq.read_table(path) if path.suffix == ".parquet" else pacsv.read_csv(path)

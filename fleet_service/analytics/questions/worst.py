@@ -20,7 +20,7 @@ SHARE: Final = 0.1  # of the values of a cell that were slippery: a stretch that
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Cells and sectors of which SHARE or more of the values were slippery, reported by enough vehicles."""
+    """Return cells and sectors with at least SHARE slippery values from enough vehicles."""
     reported = value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
         observations=t.count(),
@@ -35,13 +35,13 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Stretches, the worst first: score = length times the lower bound of the share of slippery values."""
+    """Return stretches, the worst first: score = length times the lower bound of the share of slippery values."""
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return stretches(cells)
 
 
 def stretches(cells: pa.Table) -> pa.Table:
-    """Cells of one sector that touch, as one row each; `members` are these, the box is around all of them."""
+    """Return cells of one sector that touch as one row each; `members` are the cells, the box surrounds them."""
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _touching(column["cell"], column["sector"].astype(np.int64))
     count = int(label.max(initial=-1)) + 1
@@ -70,7 +70,7 @@ def stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Lower 95 % bound of a share (Wilson 1927), (n,)."""
+    """Return the lower 95 % bound of a share (Wilson 1927), (n,)."""
     n = np.maximum(of, 1.0)
     p = hits / n
     spread = Z_95 * np.sqrt(p * (1 - p) / n + Z_95**2 / (4 * n * n))
@@ -78,7 +78,7 @@ def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
 
 
 def _touching(cell: IntArray, sector: IntArray) -> IntArray:
-    """Number of the component of each cell, among cells of its sector that touch, (n,)."""
+    """Return the component number of each cell, among cells of its sector that touch, (n,)."""
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)
     beside = grid.neighbours(cell) * grid.SECTORS + sector[:, None]
@@ -91,7 +91,7 @@ def _touching(cell: IntArray, sector: IntArray) -> IntArray:
 
 
 def _members(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
-    """The cells of each stretch: what is drawn of a bent road is the road, and not the box around it."""
+    """Return the cells of each stretch, so that a bent road is drawn as a road and not as a box."""
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
     return pa.LargeListArray.from_arrays(pa.array(ends, pa.int64()), pa.array(cell[order], pa.int64()))

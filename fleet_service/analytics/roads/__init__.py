@@ -1,1 +1,1 @@
-"""Links of a road network, and which of them each cell and sector of the map lies on."""
+"""Links of a road network, and the assignment of the map's cells and sectors to them."""

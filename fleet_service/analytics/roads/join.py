@@ -1,7 +1,7 @@
-"""Which link a cell and sector of the map lies on: no matching of trips, a join that is made once per network.
+"""Assignment of cells and sectors to links: no matching of trips, a join that is made once per network.
 
-A place is on the link that it is nearest to, in metres and in heading. A cell in which one link ends and the next
-begins is of both: no join could tell them apart. `make roads-bench` measures how often it is right.
+A place belongs to the link that is nearest in metres and in heading. A cell in which one link ends and the next begins
+belongs to both, because no join could separate them. `make roads-bench` measures how often it is right.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ class _Marks(NamedTuple):
     yaw: FloatArray
 
 
-def joined(network: RoadNetwork) -> pa.Table:
-    """One row per cell and sector that lies on a link; see README for the columns."""
+def join_roads(network: RoadNetwork) -> pa.Table:
+    """Return one row per cell and sector on a link; the reference "Columns of the ten questions" explains the
+    columns."""
     lengths, marks = _marks(network.links)
     tree, scale = cKDTree(_conformal(marks.latitude, marks.longitude)), np.cos(np.radians(marks.latitude))
     reach = REACH_M / scale.min()
@@ -94,10 +95,10 @@ def joined(network: RoadNetwork) -> pa.Table:
 
 
 def read_roads(path: Path) -> pa.Table:
-    """A file that `joined` made.
+    """Return a file made by `joined`.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not such a file.
     """
     try:
         table = pq.read_table(path)
@@ -108,7 +109,7 @@ def read_roads(path: Path) -> pa.Table:
 
 
 def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
-    """Lengths [m] of the links, and their marks."""
+    """Return the lengths [m] of the links, and their marks."""
     lengths, parts = np.empty(len(links)), []
     for k, link in enumerate(links):
         east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(link.latitude))))
@@ -125,7 +126,7 @@ def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 
 def _near(marks: _Marks, side: float) -> IntArray:
-    """Cells that may lie on a link: those within REACH_M of a mark, and some beyond."""
+    """Return cells that may lie on a link: those within REACH_M of a mark, and some beyond."""
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
     offsets = np.arange(-wide, wide + 1)
@@ -134,7 +135,7 @@ def _near(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """The first of each group in an order that sorts by the groups first."""
+    """Return the first element of each group in an order that sorts by the groups first."""
     new = np.zeros(len(order), np.bool_)
     new[:1] = True
     for group in groups:
@@ -143,13 +144,13 @@ def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
 
 
 def _ends(links: list[DirectedLink]) -> FloatArray:
-    """First and last points of the links in turn, (2 n, 2) [deg], to a tenth of a metre."""
+    """Return the first and last points of the links in turn, (2 n, 2) [deg], to a tenth of a metre."""
     ends = [(at.latitude[k], at.longitude[k]) for at in links for k in (0, -1)]
     return np.asarray(np.round(np.array(ends), 6), np.float64)
 
 
 def _conformal(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-    """Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it, the same in all directions."""
+    """Return points in Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it in all directions."""
     radius = np.degrees(METRES_PER_DEGREE)
     y = np.arcsinh(np.tan(np.radians(latitude)))
     return np.asarray(radius * np.column_stack([np.radians(longitude), y]))

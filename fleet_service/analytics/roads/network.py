@@ -41,19 +41,20 @@ class DirectedLink(NamedTuple):
 
 
 class RoadNetwork(NamedTuple):
-    """The links of a file, and what the file says of itself: name, digest, date, licence."""
+    """Links of a file, with its name, digest, date and licence."""
 
     links: list[DirectedLink]
     source: dict[str, str]
 
 
 def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNetwork:
-    """The links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file (GeoPackage, GeoJSON …).
+    """Return the links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file (GeoPackage, GeoJSON
+    …).
 
     Args:
         path: of the file.
-        identity: column of the id, of a file of lines.
-        name: column of the road's name there; may be missing, like `oneway` (forward, backward, yes, no) and `kind`.
+        identity: column of the id, for a file of lines.
+        name: column of the road's name there; optional, like `oneway` (forward, backward, yes, no) and `kind`.
 
     Raises:
         InputError: it cannot be read, has no such column, or holds no road; or a reader is not installed.
@@ -125,7 +126,7 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
 
 
 def _directions(identity: str, name: str, kind: str, oneway: str, points: FloatArray) -> list[DirectedLink]:
-    """The directions in which a line may be driven."""
+    """Return the directions in which a line may be driven."""
     apart = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
     points = points[apart[: len(points)]]
     if len(points) < 2:

@@ -1,4 +1,4 @@
-"""What one more vehicle, cell, and cell of a vehicle cost a service in memory: an engine in a process of its own.
+"""Memory cost per vehicle, per cell, and per cell of a vehicle, with an engine in a process of its own.
 
 The same number of observations goes through it each time, as do the same messages but for what is varied, so that the
 window of late observations is alike.

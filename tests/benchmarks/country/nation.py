@@ -167,7 +167,7 @@ def _least(before: list[float], parts: Sequence[Part]) -> list[float]:
 
 
 def _last_line(sender: Part) -> dict[str, float]:
-    """What it said last, of lines that are whole."""
+    """Return the last complete line of the output."""
     whole = [line for line in sender.lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said
@@ -179,7 +179,7 @@ def _kept(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Of the batches that were put in the ten minutes: how long they waited, and in which regions longest."""
+    """Return the waiting times of the batches of the ten minutes, and the slowest regions."""
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)
     halves, most = np.transpose([
@@ -197,7 +197,7 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
 
 
 def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
-    """Of the services' memory over the ten minutes, and what of it are new cells."""
+    """Return the growth of the services' memory over the ten minutes, and the part due to new cells."""
     time_s = np.array([look.time for look in looks])
     late = (time_s >= WARM_S) & (time_s < WARM_S + MEASURED_S)  # whole minutes: a line goes through the least of each
     memory, cells = (np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells"))
@@ -214,7 +214,7 @@ def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
 
 
 def _shares(looks: Sequence[Look], observations: int) -> list[Figure]:
-    """What each process did in the ten minutes."""
+    """Return the processor time of each process in the ten minutes."""
     late = [look for look in looks if look.time >= WARM_S]
     first, last = late[0], late[-1]
     apart = last.time - first.time

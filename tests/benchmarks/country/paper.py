@@ -1,4 +1,4 @@
-"""What ten times the vehicles would take, on paper: the country's measured costs, each times what there would be."""
+"""Estimate for ten times the vehicles: the country's measured costs times the expected numbers."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Chunk(NamedTuple):
 
 
 class Country:
-    """Who lives where and repeats which drive.
+    """Return the home region and the repeated drive of each vehicle.
 
     Args:
         folder: of the city's observations.

@@ -39,7 +39,7 @@ class Waits:
                 self.acked[first - 1 : last, vehicle] = now
 
     def line(self, since: float) -> dict[str, float]:
-        """What was put, and what waits; of what was put since then, the 99 % quantile of waits that have ended [s]."""
+        """Return the batches sent and waiting, and the 99 % quantile of finished waits since then [s]."""
         put, acked, now = self.put, self.acked.copy(), time.monotonic()  # a copy: it is written meanwhile
         waits = np.isfinite(put) & np.isnan(acked)
         ended = (acked - put)[(put >= since) & np.isfinite(acked)]

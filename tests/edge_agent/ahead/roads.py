@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from edge_agent.ahead import known, path
-from edge_agent.ahead.known import HeardCells, HeardMap
+from edge_agent.ahead.known import LocalMap, ReceivedCells
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
@@ -21,7 +21,7 @@ HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
 def line(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Latitude and longitude [deg] of a straight road from the car, a point a metre."""
     s = np.arange(start, length)
-    return path.degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
+    return path.to_degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
@@ -30,23 +30,23 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
     return key[np.sort(np.unique(key, return_index=True)[1])]
 
 
-def cells(key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW) -> HeardCells:
+def cells(key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW) -> ReceivedCells:
     """HeardCells of one friction."""
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
     belief = known.belief_of(said - width, said, said + width, slippery)
-    return HeardCells(
+    return ReceivedCells(
         key, belief, np.full(len(key), basis), np.full(len(key), 3), np.full(len(key), at), np.full(len(key), at)
     )
 
 
-def told(parts: list[HeardCells]) -> HeardMap:
+def told(parts: list[ReceivedCells]) -> LocalMap:
     """A cache that has heard of these cells."""
-    cache = HeardMap()
+    cache = LocalMap()
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():
             inside = grid.tile_of(part.key // grid.SECTORS) == tile
-            cache.take(tile, HeardCells._make(column[inside] for column in part), NOW)
+            cache.take(tile, ReceivedCells._make(column[inside] for column in part), NOW)
     return cache
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.ahead import known
-from edge_agent.ahead.asking import FURTHER_M, Asked
+from edge_agent.ahead.asking import FURTHER_M, RequestLog
 from edge_agent.ahead.horizon import (
     COMFORT,
     SIGHT_M,
@@ -18,8 +18,8 @@ from edge_agent.ahead.horizon import (
     look_ahead,
     safe_speed,
 )
-from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, HeardMap, belief_of
-from edge_agent.ahead.path import NONE, GivenRoute, Pose, corridor, degrees
+from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, LocalMap, belief_of
+from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degrees
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
@@ -57,8 +57,8 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     """A right angle to the left, 120 m on."""
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x, y = np.concatenate([way, np.full(len(way) - 1, 120.0)]), np.concatenate([np.zeros(len(way)), way[1:]])
-    route = GivenRoute(*degrees(x, y, HOME))
-    latitude, longitude = degrees(np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME)
+    route = GivenRoute(*to_degrees(x, y, HOME))
+    latitude, longitude = to_degrees(np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME)
     yaw = HOME.yaw + math.radians(turned)
     pose = HOME._replace(latitude=float(latitude[0]), longitude=float(longitude[0]), yaw=yaw)
     path = route.ahead(pose, 500.0)
@@ -91,7 +91,7 @@ def test_a_loop_that_is_driven_twice_is_not_jumped_ahead_in() -> None:
 
 
 def test_unknown_stays_unknown() -> None:
-    horizon = look_ahead(corridor(HOME, 300.0), HeardMap(), NOW)
+    horizon = look_ahead(straight_path(HOME, 300.0), LocalMap(), NOW)
     assert not horizon.basis.any()
     assert (horizon.key == NONE).all()
     assert np.isnan(horizon.mu_lower).all()
@@ -101,7 +101,7 @@ def test_unknown_stays_unknown() -> None:
 
 
 def test_a_bound_is_no_value_and_gives_no_advice() -> None:
-    horizon = look_ahead(corridor(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW)
+    horizon = look_ahead(straight_path(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW)
     assert (horizon.basis == known.BOUND).any()
     assert np.isnan(horizon.mu).all()
     assert not horizon.slippery.any()
@@ -119,7 +119,7 @@ def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
 
 def test_without_a_network_the_horizon_fades_to_unknown() -> None:
     cache = told([cells(keys_on(), 0.8, width=0.05)])
-    path = corridor(HOME, 60.0)
+    path = straight_path(HOME, 60.0)
     fresh, later, gone = (look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0))
     seen = fresh.basis == known.MEASURED
     assert seen.any()
@@ -128,22 +128,22 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
     assert not gone.basis.any()
 
 
-def test_a_warning_fades_in_half_an_hour_and_an_alert_that_is_not_repeated_in_ten_minutes() -> None:
+def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     said = cells(keys_on(), 0.15, width=0.05)
     said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
-    cache, path = told([said]), corridor(HOME, 60.0)
+    cache, path = told([said]), straight_path(HOME, 60.0)
     share = -math.expm1(-2400.0 / CHANGE_S)
     assert 0.9 * (1.0 - share) + 0.304 * share < WARN_ABOVE
     assert look_ahead(path, cache, NOW + 1500 * NS).slippery.any()
     assert not look_ahead(path, cache, NOW + 2400 * NS).slippery.any()
-    alone = HeardMap()
+    alone = LocalMap()
     alone.alert(alert(keys_on()[3]), NOW)
     assert look_ahead(path, alone, NOW + NS).alerted.any()
     assert not look_ahead(path, alone, NOW + round((ALERT_HELD_S + 1) * NS)).alerted.any()
 
 
 def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
-    cache = HeardMap(most_cells=50)
+    cache = LocalMap(most_cells=50)
     first = cells(keys_on(), 0.5)
     far = cells(keys_on(3000.0, start=2500.0), 0.5)
     cache.take(1, first, NOW)
@@ -154,7 +154,7 @@ def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
 
 def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
     keys = keys_on(100.0)
-    cache = HeardMap()
+    cache = LocalMap()
     cache.take(1, cells(keys, 0.8), NOW)
     cache.take(1, cells(keys[:3], 0.2), NOW + NS)
     found = cache.look_up(keys, NOW + NS)
@@ -163,7 +163,7 @@ def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
 
 
 def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
-    keys, cache = keys_on(100.0), HeardMap()
+    keys, cache = keys_on(100.0), LocalMap()
     cache.take(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
     cache.take(1, cells(keys, 0.8), NOW + NS)
     found = cache.look_up(keys, NOW + NS)
@@ -174,8 +174,8 @@ def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
     assert cache.cells == len(keys), "a tile without cells is none"
 
 
-def test_alerts_that_no_longer_stand_are_forgotten_with_the_tile_that_says_so() -> None:
-    cache, keys = HeardMap(), keys_on()
+def test_alerts_missing_from_a_tiles_standing_list_are_dropped() -> None:
+    cache, keys = LocalMap(), keys_on()
     tile = int(grid.tile_of(keys[3] // grid.SECTORS))
     assert cache.alert(alert(keys[3]), NOW)
     assert not cache.alert(alert(keys[3]), NOW + NS), "put again, it is no news"
@@ -202,13 +202,13 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
     """It has heard only of what it asked for, and what lies behind that it must ask for before it comes there."""
-    road, cache, asked, known_m = keys_on(1500.0), HeardMap(), Asked(), []
+    road, cache, asked, known_m = keys_on(1500.0), LocalMap(), RequestLog(), []
     latitude, longitude = line(1500.0)
     length = horizon_length(HOME.speed)
     for second in range(80):
         k = int(second * HOME.speed)
         pose = Pose(float(latitude[k]), float(longitude[k]), HOME.yaw, HOME.speed, NOW + second * NS)
-        ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [corridor(pose, length)]
+        ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [straight_path(pose, length)]
         horizon = look_ahead(ways[0].near(length), cache, pose.time)
         known_m.append(int((horizon.basis == known.MEASURED).sum()))
         for box in asked.wanting(ways[0], pose, length):
@@ -230,7 +230,7 @@ def test_the_other_carriageway_is_no_way_on() -> None:
     assert ways_on(HOME._replace(yaw=0.0), back, 200.0) == []
 
 
-def test_the_safe_speed_lets_one_stop_in_sight_and_falls_comfortably_before_a_slower_place() -> None:
+def test_safe_speed_allows_stopping_in_sight_and_falls_comfortably() -> None:
     lower = np.concatenate([np.full(100, 0.8), np.full(50, 0.12)])
     speed = safe_speed(np.zeros(150), lower)
     v, a = speed[120], 0.12 * GRAVITY
@@ -251,10 +251,10 @@ def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
     assert horizon_length(80.0) == 1000.0
 
 
-def test_an_alert_of_who_comes_the_other_way_warns_until_somebody_finds_grip_on_this_side() -> None:
-    road, path = keys_on(), corridor(HOME, 60.0)
+def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
+    road, path = keys_on(), straight_path(HOME, 60.0)
     other = [int(key) ^ OTHER_WAY for key in road[2:4]]
-    cache = HeardMap()
+    cache = LocalMap()
     for key in other:
         assert cache.alert(alert(key), NOW)
     seen = look_ahead(path, cache, NOW + NS)
@@ -271,5 +271,5 @@ def test_an_alert_of_who_comes_the_other_way_warns_until_somebody_finds_grip_on_
     assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), "who braked there found enough"
     cache.take(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
     assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {int(road[3])}
-    across = corridor(HOME._replace(yaw=HOME.yaw + np.pi / 2), 60.0)
+    across = straight_path(HOME._replace(yaw=HOME.yaw + np.pi / 2), 60.0)
     assert not look_ahead(across, cache, NOW + NS).alerted.any(), "another road"

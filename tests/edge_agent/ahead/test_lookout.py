@@ -12,10 +12,10 @@ import pytest
 import zenoh
 
 from edge_agent.ahead import known, lookout
-from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, Asked, Tiles
-from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
+from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, RequestLog, Tiles
+from edge_agent.ahead.hearing import decode_alert_message, decode_cells, decode_standing_alerts
 from edge_agent.ahead.lookout import Lookout
-from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.lab.ahead.made_up_service import MadeUpService, tile_payload
 from schemas import grid, keys, wire
 from schemas.errors import WireError
@@ -171,9 +171,7 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: Ma
     assert encode_ahead(told) == sample.payload.to_bytes()
 
 
-def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_back(
-    router: Router, town: MadeUpService
-) -> None:
+def test_ice_during_a_router_outage_is_received_after_reconnect(router: Router, town: MadeUpService) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         router.stop()
@@ -218,12 +216,12 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
-def test_a_map_of_yesterday_neither_warns_nor_advises_and_takes_nothing_from_that_of_today(router: Router) -> None:
-    """Of ice that lay there yesterday, and of the road before it that was dry; then of today the other way round."""
+def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Router) -> None:
+    """Report ice of yesterday after a dry road, and then of today the other way round."""
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         with MadeUpService(router.settings, time.time_ns() - DAY, yesterday, kept=True):
-            car.until(lambda _: car.lookout.counts.heard("cells") > 10)
+            car.until(lambda _: car.lookout.counts.total_of("cells") > 10)
             looks = car.lookout.counts.looks
             seen = car.until(lambda _: car.lookout.counts.looks > looks + 1)
             assert not seen.runs.basis.any(), "nobody knows what it is like today"
@@ -233,7 +231,7 @@ def test_a_map_of_yesterday_neither_warns_nor_advises_and_takes_nothing_from_tha
         now, key = time.time_ns(), keys.map_key(TILE)
         for when, mu in ((now, 0.15), (now - DAY, 0.85)):
             with subscriber.looking():
-                subscriber.known.take(*heard_cells(key, tile_payload(HERE, mu, when), now), now)
+                subscriber.known.take(*decode_cells(key, tile_payload(HERE, mu, when), now), now)
         assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
@@ -294,17 +292,17 @@ NOISE = (b"", b"\x00" * 100, b"\xff" * 10_000, tile_payload(HERE, 0.2, NOW)[:-40
 @pytest.mark.parametrize("lie", LIES)
 def test_a_tile_that_is_not_possible_is_not_believed(lie: str) -> None:
     key = keys.map_key(TILE)
-    assert heard_cells(key, tile_payload(HERE, 0.2, NOW), NOW)[0] == TILE
+    assert decode_cells(key, tile_payload(HERE, 0.2, NOW), NOW)[0] == TILE
     with pytest.raises(WireError):
-        heard_cells(key, tile_payload(HERE, 0.2, NOW, **LIES[lie]), NOW)
+        decode_cells(key, tile_payload(HERE, 0.2, NOW, **LIES[lie]), NOW)
 
 
 @pytest.mark.parametrize("payload", NOISE)
 def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
     with pytest.raises(WireError):
-        heard_cells(keys.map_key(TILE), payload, NOW)
+        decode_cells(keys.map_key(TILE), payload, NOW)
     with pytest.raises(WireError):
-        heard_cells(keys.alert_key(TILE), tile_payload(HERE, 0.2, NOW), NOW)
+        decode_cells(keys.alert_key(TILE), tile_payload(HERE, 0.2, NOW), NOW)
 
 
 class Liar(MadeUpService):
@@ -318,7 +316,7 @@ class Liar(MadeUpService):
         return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][self.said % (len(LIES) + len(NOISE) + 1)]
 
 
-def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_same(router: Router) -> None:
+def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> None:
     every = len(LIES) + len(NOISE) + 1
     with Liar(router.settings, time.time_ns(), {int(key): 0.85 for key in keys_on()}) as liar, driving(router) as car:
         later_s = 0.0
@@ -327,7 +325,7 @@ def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_
             car.be(later_s=later_s)
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
-        assert not car.lookout.counts.heard("cells")
+        assert not car.lookout.counts.total_of("cells")
         car.until(lambda seen: seen.time < time.time_ns() + NS)  # at an hour from now an alert of now is forgotten
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
         assert car.next().state == "raised"
@@ -337,7 +335,8 @@ def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_
 def test_alerts_that_are_not_possible_are_refused() -> None:
     good, key = alert(int(HERE[0]), time=NOW), keys.alert_key(TILE)
     assert (
-        heard_alert(key, wire.encode_alert(good), NOW) == heard_standing(key, wire.encode_standing([good]), NOW)[1][0]
+        decode_alert_message(key, wire.encode_alert(good), NOW)
+        == decode_standing_alerts(key, wire.encode_standing([good]), NOW)[1][0]
     )
     for name, value in (
         ("mu", float("nan")),
@@ -348,9 +347,9 @@ def test_alerts_that_are_not_possible_are_refused() -> None:
     ):
         lie = wire.Alert(**(vars(good) | {name: value}))
         with pytest.raises(WireError):
-            heard_alert(key, wire.encode_alert(lie), NOW)
+            decode_alert_message(key, wire.encode_alert(lie), NOW)
         with pytest.raises(WireError):
-            heard_standing(key, wire.encode_standing([good, lie]), NOW)
+            decode_standing_alerts(key, wire.encode_standing([good, lie]), NOW)
 
 
 def _at(metre: float, seconds: float) -> Pose:
@@ -361,8 +360,8 @@ def _at(metre: float, seconds: float) -> Pose:
 
 
 def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> None:
-    asked, pose = Asked(), _at(0, 0)
-    path = corridor(pose, 150.0)
+    asked, pose = RequestLog(), _at(0, 0)
+    path = straight_path(pose, 150.0)
     boxes = asked.wanting(path, pose, 100.0)
     assert 1 <= len(boxes) <= 6
     latitude, longitude = line(150.0)
@@ -376,12 +375,12 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
     assert asked.wanting(path, pose, 100.0), "the session has come back"
 
 
-def test_a_handful_of_tiles_is_heard_and_a_car_at_a_border_does_not_flicker() -> None:
+def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
     tiles, begun, ceased = Tiles(), 0, 0
     for second in range(600):
         metre = 40.0 * second
         pose = _at(metre, second)
-        here: list[Path] = [corridor(pose, 150.0)]
+        here: list[Path] = [straight_path(pose, 150.0)]
         fresh, gone = tiles.follow(here, pose)
         begun, ceased = begun + len(fresh), ceased + len(gone)
         assert len(tiles.heard) <= MOST_TILES
@@ -391,6 +390,6 @@ def test_a_handful_of_tiles_is_heard_and_a_car_at_a_border_does_not_flicker() ->
     west, _, _, _ = (float(side) for side in grid.bounds(TILE, grid.TILE_ZOOM))
     for second in range(100):
         pose = HOME._replace(longitude=west + 2e-6 * (-1) ** second, yaw=np.pi / 2, time=NOW + second * NS)
-        flickers += sum(map(len, border.follow([corridor(pose, 150.0)], pose)))
+        flickers += sum(map(len, border.follow([straight_path(pose, 150.0)], pose)))
     assert flickers <= 4
     assert LEAVE_S > 2.0

@@ -71,7 +71,7 @@ def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
     assert told([]).belief(place, NOW) is None
 
 
-def test_a_map_that_is_wrong_is_left_as_fast_as_measurements_come_and_the_next_cells_believe_it_less() -> None:
+def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> None:
     prior, says = MapPrior(1), []
     prior.step(key(4), saying(0.9), FLAT, {0: sharp(0.9)})
     for cell in range(5, 9):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from edge_agent.ahead.horizon import MARGIN_M, UNKNOWN_LOWER, look_ahead
-from edge_agent.ahead.known import BOUND, HeardMap
-from edge_agent.ahead.path import GivenRoute, Pose, corridor
-from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, warn
+from edge_agent.ahead.known import BOUND, LocalMap
+from edge_agent.ahead.path import GivenRoute, Pose, straight_path
+from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, update_warnings
 from schemas.numeric import IntArray
 from schemas.thresholds import GRAVITY, NS, REACTION_S
 from schemas.wire.ahead import GripWarning
@@ -22,7 +22,7 @@ ROAD = 600.0
 class Car:
     """A car that drives along the road and hears of warnings."""
 
-    def __init__(self, cache: HeardMap, speed: float = 14.0) -> None:
+    def __init__(self, cache: LocalMap, speed: float = 14.0) -> None:
         self.cache, self.speed = cache, speed
         self.route = GivenRoute(*line(ROAD))
         self.active: tuple[Active, ...] = ()
@@ -39,7 +39,7 @@ class Car:
         path = self.route.ahead(pose, 400.0)
         assert path is not None
         horizon = look_ahead(path, self.cache, pose.time)
-        self.active, found = warn(self.active, [horizon], pose, self.cache)
+        self.active, found = update_warnings(self.active, [horizon], pose, self.cache)
         return found
 
     def drive(self, metres: float) -> list[GripWarning]:
@@ -54,13 +54,13 @@ def icy(start: float = 300.0, length: float = 40.0) -> IntArray:
     return keys_on(start + length, start=start)
 
 
-def dry_but(*ice: IntArray) -> HeardMap:
+def dry_but(*ice: IntArray) -> LocalMap:
     slippery = np.concatenate(ice)
     rest = keys_on(ROAD)
     return told([cells(rest[~np.isin(rest, slippery)], 0.9), cells(slippery, 0.15, width=0.05)])
 
 
-def test_one_warning_comes_in_time_to_stop_and_ends_when_the_stretch_is_passed() -> None:
+def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
     car = Car(dry_but(icy()))
     told = car.drive(450.0)
     assert [one.state for one in told] == ["raised", "ended"]
@@ -77,7 +77,7 @@ def test_one_warning_comes_in_time_to_stop_and_ends_when_the_stretch_is_passed()
 
 
 def test_on_an_unknown_road_the_warning_comes_as_early_as_that_may_need() -> None:
-    cache = HeardMap()
+    cache = LocalMap()
     for key in icy():
         cache.alert(alert(key), NOW)
     car = Car(cache)
@@ -92,7 +92,7 @@ def test_who_is_slow_is_warned_later() -> None:
 
 def test_dry_and_unknown_roads_warn_of_nothing() -> None:
     assert Car(told([cells(keys_on(ROAD), 0.9)])).drive(450.0) == []
-    assert Car(HeardMap()).drive(450.0) == []
+    assert Car(LocalMap()).drive(450.0) == []
 
 
 def test_ice_on_the_other_carriageway_is_none_of_ours() -> None:
@@ -104,7 +104,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
     assert Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
 
 
-def test_an_alert_where_the_map_has_only_a_bound_by_now_is_told_with_its_own_grip() -> None:
+def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """Ice fades on the map, before its alert ends: what was a value is a bound then."""
     cache = told([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
@@ -115,7 +115,7 @@ def test_an_alert_where_the_map_has_only_a_bound_by_now_is_told_with_its_own_gri
 
 
 def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> None:
-    cache, keys = HeardMap(), icy(200.0, 80.0)
+    cache, keys = LocalMap(), icy(200.0, 80.0)
     for key in keys[:3]:
         cache.alert(alert(key), NOW)
     car = Car(cache)
@@ -141,13 +141,13 @@ def test_a_car_that_takes_another_way_is_told_that_the_warning_is_over() -> None
     raised = car.drive(224.0)
     assert raised[0].state == "raised"
     pose = car.pose()._replace(yaw=HOME.yaw + math.pi / 2, time=car.pose().time + round((ABSENT_S + UPDATE_S) * NS))
-    horizon = look_ahead(corridor(pose, 200.0), car.cache, pose.time)
-    _, told = warn(car.active, [horizon], pose, car.cache)
+    horizon = look_ahead(straight_path(pose, 200.0), car.cache, pose.time)
+    _, told = update_warnings(car.active, [horizon], pose, car.cache)
     assert [one.state for one in told] == ["ended"]
     assert told[0].reason == "the car took another way"
 
 
-def test_two_stretches_that_nearly_touch_are_one_warning_and_distant_ones_two() -> None:
+def test_nearly_touching_stretches_are_one_warning_distant_ones_two() -> None:
     near = Car(dry_but(icy(250.0, 20.0), icy(290.0, 20.0))).drive(300.0)
     assert [one.state for one in near] == ["raised"]
     apart = Car(dry_but(icy(200.0, 20.0), icy(320.0, 20.0))).drive(500.0)
@@ -159,10 +159,10 @@ def test_at_a_fork_a_stretch_on_one_way_is_told_as_possible() -> None:
     pose = HOME._replace(speed=20.0)
     route = GivenRoute(*line(ROAD)).ahead(pose, 300.0)
     assert route is not None
-    ways = [look_ahead(route, cache, NOW), look_ahead(corridor(pose._replace(yaw=1.6), 150.0), cache, NOW)]
-    _, told = warn((), ways, pose, cache)
+    ways = [look_ahead(route, cache, NOW), look_ahead(straight_path(pose._replace(yaw=1.6), 150.0), cache, NOW)]
+    _, told = update_warnings((), ways, pose, cache)
     assert [one.sure for one in told] == [False]
-    _, told = warn((), ways[:1], pose, cache)
+    _, told = update_warnings((), ways[:1], pose, cache)
     assert [one.sure for one in told] == [True]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.app.backfill import Outcome, Task, backfill, tasks_of, tried
+from edge_agent.app.backfill import Outcome, Task, backfill, estimate_atomically, tasks_of
 from edge_agent.cli import main
 from schemas.errors import InputError
 from tests.waiting import until
@@ -119,9 +119,9 @@ def test_an_engine_is_for_several_logs_and_wants_no_jobs(
 
 def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(drives: Path, tmp_path: Path) -> None:
     (task, *_) = tasks_of(logs(drives), None, tmp_path)
-    first = tried(task, "ckf", None)
+    first = estimate_atomically(task, "ckf", None)
     content = task.out.read_bytes()
-    assert tried(task, "ckf", None) == first == Outcome(task, 100, None)
+    assert estimate_atomically(task, "ckf", None) == first == Outcome(task, 100, None)
     assert [path.name for path in tmp_path.iterdir()] == [task.out.name]
     assert task.out.read_bytes() == content
-    assert tried(task._replace(vehicle=tmp_path / "none.json"), "ckf", None).error is not None
+    assert estimate_atomically(task._replace(vehicle=tmp_path / "none.json"), "ckf", None).error is not None

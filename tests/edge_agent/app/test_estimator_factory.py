@@ -14,7 +14,7 @@ from tests.edge_agent.estimators.drives import drive
 
 
 @pytest.mark.parametrize("name", TUNED)
-def test_a_tuned_estimator_runs_with_the_memberships_of_its_file_and_not_with_untuned_ones(name: str) -> None:
+def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     t, signals = t[:, None], signals[:, None]
     reported = bank_of(name, [vehicle]).advance(t, signals)

@@ -52,7 +52,7 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
     assert publisher.close(within_s=5.0)
 
 
-def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_path: Path, router: Router) -> None:
+def test_agent_without_answers_or_with_full_outbox_reports_problems(tmp_path: Path, router: Router) -> None:
     late: list[float] = []
     config = settings(router, tmp_path)
     publisher = Publisher(
@@ -65,19 +65,19 @@ def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_
     until(lambda: publisher.fill > metrics.FULL)
     until(lambda: publisher.unanswered_s > 0.0)
     late.append(metrics.UNANSWERED_S)
-    found = metrics.troubles(publisher, Progress())
+    found = metrics.health_problems(publisher, Progress())
     assert any(text.startswith("nothing was acknowledged for 6") for text in found)
-    assert "the outbox is full: the oldest states go first" in found
+    assert "the outbox is full: the oldest states are dropped first" in found
     publisher.close(within_s=0.0)
 
 
 def test_an_agent_without_a_router_or_behind_its_time_is_in_trouble(tmp_path: Path, router: Router) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     until(lambda: publisher.links == 3)
-    assert metrics.troubles(publisher, Progress()) == []
-    assert metrics.troubles(publisher, Progress(now_s=4.0)) == ["4.0 s behind real time"]
+    assert metrics.health_problems(publisher, Progress()) == []
+    assert metrics.health_problems(publisher, Progress(now_s=4.0)) == ["4.0 s behind real time"]
     publisher.close(within_s=0.0)
     router.stop()
     alone = publisher_of(settings(router, tmp_path))
-    assert metrics.troubles(alone, Progress()) == ["no session is open"]
+    assert metrics.health_problems(alone, Progress()) == ["no session is open"]
     alone.close(within_s=0.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from edge_agent.app.backfill import backfill, tasks_of, tried
+from edge_agent.app.backfill import backfill, estimate_atomically, tasks_of
 from edge_agent.cli import main
 from schemas.runtime import spark
 from tests import spark_sessions
@@ -65,7 +65,7 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "spark").mkdir()
-    work = partial(tried, estimator=ESTIMATOR, memberships=None)
+    work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tmp_path / "tries")
     told = spark.spread(session, tasks_of(drives, None, tmp_path / "spark"), dying)
     assert sorted(path.name for path in (tmp_path / "tries").iterdir()) == [path.name for path in drives], "all died"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app.trip import LEAST_S, LOOK_S, Trip, beside
+from edge_agent.app.trip import LEAST_S, LOOK_S, Trip, state_path_for
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.profile import Profile
 from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
@@ -34,7 +34,7 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Whether each block was admitted, and what the estimator would have got; the doctor is waited for."""
+    """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
     admitted, blocks = [], []
     for block in trip.blocks(source(drive), lambda: np.full(ROWS, np.nan)):
         if trip._looking is not None:
@@ -143,4 +143,6 @@ def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> N
 
 
 def test_what_is_known_lies_beside_the_outbox() -> None:
-    assert beside(Path("/var/lib/gripmap/spool.sqlite"), "car-one") == Path("/var/lib/gripmap/spool.car-one.json")
+    assert state_path_for(Path("/var/lib/gripmap/spool.sqlite"), "car-one") == Path(
+        "/var/lib/gripmap/spool.car-one.json"
+    )

@@ -101,7 +101,7 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
-def test_shipped_file_loads_covers_the_mismatch_range_and_says_how_it_was_made(path: Path) -> None:
+def test_shipped_memberships_load_cover_the_range_and_state_origin(path: Path) -> None:
     tuned = load(path)
     assert tuned.document.estimator == path.stem
     lower, upper = Memberships.bounds()
@@ -126,7 +126,7 @@ def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
     assert shipped("aco-fckf") in kept
 
 
-def test_the_memberships_of_the_papers_filter_gain_on_held_out_drives_and_are_scored_as_it_is() -> None:
+def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
     scores = load(FOLDER / "paper-aco-fckf.json").document.scores
     default, colony = scores["default"].held_out.log_likelihood, scores["colony"].held_out.log_likelihood
     assert colony > default + 1.0

@@ -60,7 +60,7 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
     assert felt(known) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
 
 
-def test_the_brush_curve_starts_with_slope_one_and_stays_at_one_from_three_on() -> None:
+def test_brush_curve_begins_with_slope_one_and_saturates_at_three() -> None:
     assert brush(1e-6) == pytest.approx(1e-6, rel=1e-5)
     assert brush(3.0) == pytest.approx(1.0)
     assert brush(30.0) == pytest.approx(1.0)
@@ -73,7 +73,7 @@ def test_in_balance_the_drive_wheel_rests() -> None:
     assert drive_wheel(rest, 300.0, 1.2, radius, 0.01) == pytest.approx(rest)
 
 
-def test_the_motor_settles_with_its_electric_time_and_the_force_stops_changing() -> None:
+def test_motor_settles_with_its_time_constant_and_force_is_constant() -> None:
     torque, slope = 0.0, 5000.0
     for _ in range(1000):
         state = WheelState(torque, 50.0, 0.0, slope)
@@ -82,7 +82,7 @@ def test_the_motor_settles_with_its_electric_time_and_the_force_stops_changing()
     assert abs(slope) < 1000.0
 
 
-def test_compensation_is_an_even_mixture_at_ordinary_slips_and_the_tyre_model_alone_when_sliding() -> None:
+def test_compensation_is_even_at_ordinary_slip_and_model_only_when_sliding() -> None:
     assert slip_share(0.3, 20.0 / 0.3, 20.0) == 0.5
     assert slip_share(0.3, 0.9 * 20.0 / 0.3, 20.0) == pytest.approx(0.5, abs=1e-2)
     assert slip_share(0.3, 0.0, 20.0) == 1.0

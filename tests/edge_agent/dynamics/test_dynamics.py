@@ -41,7 +41,7 @@ def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
     assert dugoff(3.0) == pytest.approx(1.0 - 1.0 / 12.0)
 
 
-def test_the_inverse_of_the_curve_undoes_it_and_knows_no_slip_beyond_the_peak() -> None:
+def test_inverse_curve_undoes_it_and_knows_no_slip_beyond_the_peak() -> None:
     for rho in (-0.95, -0.2, 0.0, 0.5, 0.99):
         assert tyres.magic_formula(tyres.magic_formula_inverse(rho, 1.4), 1.4, 0.0) == pytest.approx(rho, abs=1e-12)
     assert tyres.magic_formula_inverse(1.0, 1.4) == math.inf
@@ -69,7 +69,7 @@ def test_wheel_loads_carry_the_weight_and_a_left_turn_loads_the_right() -> None:
     assert rl + rr > CAR.mass * GRAVITY * CAR.cg_to_front_axle / 2.6
 
 
-def test_a_rolling_wheel_has_no_slip_and_a_left_turn_turns_the_outer_wheel_faster() -> None:
+def test_rolling_wheel_has_no_slip_and_a_left_turn_speeds_outer_wheel() -> None:
     along, across = slip.wheel_velocity(ROW, 3, 10.0, 0.0, 0.2, 0.0)
     assert along == pytest.approx(10.0 + 0.2 * 0.74)
     assert across == pytest.approx(-1.5 * 0.2)
@@ -78,7 +78,7 @@ def test_a_rolling_wheel_has_no_slip_and_a_left_turn_turns_the_outer_wheel_faste
     assert slip_y == pytest.approx(0.3 / along)
 
 
-def test_axle_forces_from_accelerations_undo_accelerations_from_wheel_forces() -> None:
+def test_axle_forces_and_accelerations_are_inverse() -> None:
     force_x, force_y = np.array([100.0, 300.0, -50.0, 80.0]), np.array([500.0, 700.0, 400.0, 450.0])
     _, ay, turn = body.accelerations(ROW, force_x, force_y, np.zeros(4))
     moment = 0.5 * CAR.track_front * (300.0 - 100.0) + 0.5 * CAR.track_rear * (80.0 + 50.0)

@@ -86,7 +86,7 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
     outbox.close()
 
 
-def test_what_was_stored_survives_a_kill_and_is_due_at_once_under_its_old_name(path: Path) -> None:
+def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) -> None:
     """A child process stores, says so, and is killed without closing anything."""
     script = f"""
 import os, pathlib, signal
@@ -111,7 +111,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     outbox.close()
 
 
-def test_unsettled_batches_are_offered_again_oldest_first_and_less_and_less_often(path: Path) -> None:
+def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, first_resend_s=1.0)
     outbox.store([draft() for _ in range(5)], now=0.0)
     assert outbox.due(now=1.0 - JITTER - 0.01, limit=9) == []
@@ -133,7 +133,7 @@ def silenced(outbox: Outbox, now: float = 0.0) -> float:
     return now
 
 
-def test_while_nobody_answers_fresh_batches_stay_on_disk_and_one_is_put_as_a_probe_every_two_minutes(
+def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
     path: Path,
 ) -> None:
     outbox = Outbox(path, boot=BOOT)
@@ -149,7 +149,7 @@ def test_while_nobody_answers_fresh_batches_stay_on_disk_and_one_is_put_as_a_pro
     outbox.close()
 
 
-def test_the_first_answer_lets_everything_go_oldest_first_and_faster_with_each_answer(path: Path) -> None:
+def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     now = silenced(outbox)
     for _ in range(300):
@@ -183,7 +183,7 @@ def test_a_region_that_nobody_serves_does_not_silence_the_others(path: Path) -> 
     outbox.close()
 
 
-def test_with_a_router_again_all_that_was_put_is_put_anew_oldest_first_and_nothing_twice(path: Path) -> None:
+def test_reconnect_sends_everything_again_oldest_first_and_once(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, first_resend_s=4.0)
     outbox.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
     outbox.reoffer("car-a", now=1.0)
@@ -195,7 +195,7 @@ def test_with_a_router_again_all_that_was_put_is_put_anew_oldest_first_and_nothi
     outbox.close()
 
 
-def test_with_a_router_again_a_silent_route_is_tried_at_once_with_one_batch(path: Path) -> None:
+def test_reconnect_probes_a_silent_route_at_once_with_one_batch(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     now = silenced(outbox)
     for _ in range(12):
@@ -231,7 +231,7 @@ def test_folders_made_for_an_outbox_are_synced_into_the_ones_above(
     assert synced == [tmp_path, tmp_path / "a"]
 
 
-def test_a_full_outbox_gives_up_the_oldest_states_then_the_oldest_observations_and_counts_them(path: Path) -> None:
+def test_full_outbox_drops_oldest_states_then_observations_and_counts(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, capacity_bytes=4_500)
     for _ in range(2):
         outbox.store([draft(size=1_000), draft(kind=Kind.STATE, size=1_000, records=7)], now=0.0)
@@ -305,7 +305,7 @@ def test_a_file_that_is_no_outbox_is_refused_and_left_alone(path: Path) -> None:
     assert path.read_bytes().startswith(b"my shopping list")
 
 
-def test_a_batch_that_nobody_answers_is_given_up_once_it_would_stop_its_stream(
+def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("edge_agent.publish.outbox.PASSED_OVER", 40)
@@ -325,7 +325,7 @@ def test_a_batch_that_nobody_answers_is_given_up_once_it_would_stop_its_stream(
 
 
 @pytest.mark.campaign
-def test_a_batch_that_waits_takes_little_memory_and_a_long_life_leaves_none_behind(path: Path) -> None:
+def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) -> None:
     """A day of a vehicle is 170 000 batches."""
     count = 20_000
     outbox = Outbox(path, boot=BOOT)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge_agent.app.live_loop import Progress
-from edge_agent.app.metrics import troubles
+from edge_agent.app.metrics import health_problems
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
 from edge_agent.publish.outbox import Outbox
@@ -131,7 +131,7 @@ def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
     router.stop()
 
 
-def test_without_a_router_it_leaves_in_time_and_keeps_everything_for_the_next_start(tmp_path: Path) -> None:
+def test_without_a_router_it_exits_in_time_and_keeps_everything(tmp_path: Path) -> None:
     nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
     config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
     publisher = publisher_of(config)
@@ -178,7 +178,7 @@ def test_a_rejected_batch_is_settled_counted_and_logged(
     assert "of car-b was rejected at row 0: speed" in caplog.text
 
 
-def test_acknowledgements_that_cannot_be_read_or_are_anothers_are_counted_and_settle_nothing(
+def test_unreadable_or_foreign_acknowledgements_settle_nothing(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False
@@ -205,18 +205,18 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
     mine = next(b for b in service.batches if b.vehicle == "car-a")
     settled = StreamAck(mine.boot, mine.kind, mine.region, ((mine.seq, mine.seq),), late=((mine.seq, mine.seq),))
-    assert troubles(publisher, Progress()) == []
+    assert health_problems(publisher, Progress()) == []
     with caplog.at_level(logging.WARNING):
         service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() + 130 * NS))
         until(lambda: publisher.counts.late[mine.kind] == 1)
     until(lambda: abs(publisher.clock_behind_s - 130.0) < 10.0)
-    assert any("clock" in trouble for trouble in troubles(publisher, Progress()))
+    assert any("clock" in trouble for trouble in health_problems(publisher, Progress()))
     assert "behind the service's" in caplog.text
     service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
     until(lambda: abs(publisher.clock_behind_s) < 10.0)
     service.put_ack("car-a", encode_ack("car-a", [settled]))  # of a version that does not tell
     until(lambda: publisher.counts.late[mine.kind] == 3)
-    assert troubles(publisher, Progress()) == []
+    assert health_problems(publisher, Progress()) == []
     publisher.close(within_s=0.1)
 
 

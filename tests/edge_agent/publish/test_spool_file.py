@@ -31,7 +31,7 @@ def found(batches: list[StoredBatch]) -> dict[int, bytes]:
     return {batch.seq: batch.payload for batch in batches}
 
 
-def test_with_any_page_gone_the_car_goes_on_and_most_of_its_batches_are_saved(tmp_path: Path) -> None:
+def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) -> None:
     whole = stored(tmp_path / "whole.sqlite")
     image = (tmp_path / "whole.sqlite").read_bytes()
     noticed, least = 0, BATCHES
@@ -43,7 +43,7 @@ def test_with_any_page_gone_the_car_goes_on_and_most_of_its_batches_are_saved(tm
         path.write_bytes(image[: page * PAGE] + bytes(PAGE) + image[(page + 1) * PAGE :])
         outbox = Outbox(path, boot=6)
         noticed += outbox.counts.damages
-        held = found(outbox.held())
+        held = found(outbox.held_batches())
         assert held.items() <= whole.items(), "a batch is not what was stored"
         least = min(least, len(held))
         assert outbox.store([Draft("car-a", Kind.STATE, 77, 1, lambda s, f: b"goes on")], 0.0)[0].seq == 1
@@ -62,7 +62,7 @@ def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
         image[place] ^= 1 << random_.randrange(8)
     path.write_bytes(image)
     outbox = Outbox(path, boot=6)
-    held = found(outbox.held())
+    held = found(outbox.held_batches())
     assert held == {seq: payload for seq, payload in whole.items() if seq not in (20, 70, 110)}
     assert outbox.counts.damaged == 6
     outbox.close()
@@ -75,7 +75,7 @@ def test_a_batch_whose_number_of_records_is_damaged_is_noticed(tmp_path: Path) -
         database.execute("UPDATE batch SET records = 0 WHERE seq = 20")
     database.close()
     outbox = Outbox(path, boot=6)
-    assert found(outbox.held()).keys() == whole.keys() - {20}
+    assert found(outbox.held_batches()).keys() == whole.keys() - {20}
     assert outbox.counts.damaged == 1
     outbox.close()
 
@@ -88,7 +88,7 @@ def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> 
     first = outbox.store([draft, draft], 0.0)
     outbox.settle(first[0].stream, [(1, 2)])
     outbox.delete_settled()
-    outbox.mend()
+    outbox.recover()
     assert outbox.counts.damages == 1
     assert outbox.store([draft], 1.0)[0].seq == 3
     assert outbox.batches == BATCHES + 1
@@ -102,7 +102,7 @@ def test_an_outbox_of_a_former_version_has_no_checksums_and_is_read(tmp_path: Pa
         database.execute("ALTER TABLE batch DROP COLUMN checksum")
     database.close()
     outbox = Outbox(path, boot=6)
-    assert found(outbox.held()) == whole
+    assert found(outbox.held_batches()) == whole
     assert outbox.counts.damages == 0
     outbox.close()
 

@@ -1,4 +1,4 @@
-"""Whether two engines answer alike: the same rows, floats within the stated error."""
+"""Comparison of two engines' answers: the same rows, floats within the stated error."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.output import ordered
+from fleet_service.analytics.output import order_rows
 from fleet_service.analytics.questions import Question
-from fleet_service.analytics.roads.join import joined
+from fleet_service.analytics.roads.join import join_roads
 from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from schemas import grid
 from schemas.numeric import IntArray
@@ -20,14 +20,14 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """What differs, or None."""
+    """Return the difference, or None."""
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
     keys = ["day", "cell", "sector", "onset", "vehicle", "period", "basis", "age_h", "temperature", "frame"]
     by: list[tuple[str, Literal["ascending", "descending"]]] = [
         (name, "ascending") for name in keys if name in one.schema.names
     ]
-    one, other = (ordered(table, question) for table in (one, other))
+    one, other = (order_rows(table, question) for table in (one, other))
     if by:
         one, other = one.sort_by(by), other.sort_by(by)
     for name in one.schema.names:
@@ -55,4 +55,4 @@ def roads_along(cells: IntArray) -> pa.Table:
                 DirectedLink(f"{line}-{k}", "backward", f"road {line}", "primary", latitude[::-1], longitude[::-1])
             )
     found.append(DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01])))
-    return joined(RoadNetwork(found, {}))
+    return join_roads(RoadNetwork(found, {}))

@@ -34,7 +34,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
         rows["longitude"] = rows["longitude"] + shift - far
         rows["cell"] = grid.cell_of(rows["latitude"], rows["longitude"])
         rows["region"] = grid.region_of(rows["cell"])
-        writer.write(Kind.OBSERVATION, segments.stepped(rows))
+        writer.write(Kind.OBSERVATION, segments.round_to_steps(rows))
         if number % 2:
             compact(root)
     rollup.complete(root)

@@ -43,12 +43,12 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else explained(name)
 
 
-MAP = {field.name for field in tables.MAP_CELL}  # that answers.md explains: tests/deploy/test_docs.py
+MAP = {field.name for field in tables.MAP_CELL}  # that map-columns.md explains: tests/deploy/test_docs.py
 
 
 def explained(question: str) -> set[str]:
     """Columns of an answer that the handbook's page has a meaning for."""
-    page = (ROOT / "deploy" / "docs" / "questions.md").read_text(encoding="utf-8")
+    page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
     assert all(row[4].strip() for row in rows)
     return {name for row in rows for name in re.findall(r"`(\w+)`", row[2])}

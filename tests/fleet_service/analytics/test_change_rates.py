@@ -10,7 +10,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from fleet_service.analytics.questions.change_rates import LEAST_DAYS, LONGEST_S, _fitted, fit
+from fleet_service.analytics.questions.change_rates import LEAST_DAYS, LONGEST_S, _fit_class, fit
 from schemas.numeric import FloatArray
 from schemas.thresholds import SLIPPERY_MU
 
@@ -57,7 +57,7 @@ def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
     for trial in range(trials):
         rng = np.random.default_rng([7, trial])
         days = [pairs_of_a_day(rng, RATE * rng.uniform(0.4, 1.6), 800) for _ in range(12)]
-        found = _fitted(counted(days))
+        found = _fit_class(counted(days))
         assert found["rate_lower"] is not None
         assert found["rate_upper"] is not None
         held += found["rate_lower"] <= 3600 * RATE <= found["rate_upper"]
@@ -66,7 +66,7 @@ def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
 
 def test_few_days_have_no_interval() -> None:
     rng = np.random.default_rng(2)
-    found = _fitted(counted([pairs_of_a_day(rng, RATE, 500) for _ in range(LEAST_DAYS - 1)]))
+    found = _fit_class(counted([pairs_of_a_day(rng, RATE, 500) for _ in range(LEAST_DAYS - 1)]))
     assert found["rate_per_hour"] is not None
     assert found["rate_lower"] is None
     assert found["rate_upper"] is None

@@ -32,7 +32,7 @@ def named(axes: Axes) -> list[str]:
     return [text.get_text() for text in legend.get_texts()] if legend else []
 
 
-def test_worst_draws_the_cells_of_each_stretch_and_no_line_through_unordered_points() -> None:
+def test_worst_draws_cells_of_each_stretch_without_connecting_lines() -> None:
     one = {"sector": 1, "mu": 0.2, "length_m": 50.0, "share_slippery": 0.9, "share_lower": 0.7, "values": 12}
     figure = drawn("worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}]))
     first, second = (axes for axes in figure.axes if axes.get_xlabel() == "east [m]")
@@ -41,7 +41,7 @@ def test_worst_draws_the_cells_of_each_stretch_and_no_line_through_unordered_poi
     assert first.get_title().startswith("1: 50 m heading north ↑")
 
 
-def test_grip_of_a_day_has_that_day_and_the_cells_that_only_have_a_bound_on_its_axis() -> None:
+def test_grip_of_a_day_shows_that_day_and_cells_with_bounds_only() -> None:
     table = pa.table({"day": ["2026-01-27"] * 3, "mu_p50": [0.3, 0.8, None]})
     (axes,) = drawn("grip", table).axes
     assert [label.get_text() for label in axes.get_xticklabels()] == ["2026-01-27"]

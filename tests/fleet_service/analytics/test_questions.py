@@ -103,9 +103,7 @@ def test_spells_are_the_runs_of_slippery_values(asked: Ask, rows: pd.DataFrame) 
     assert sorted(found, key=str) == sorted(expected, key=str)
 
 
-def test_before_and_after_a_treatment_the_planted_change_lies_in_the_interval(
-    asked: Ask, rows: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_planted_change_lies_in_the_before_after_interval(asked: Ask, rows: pd.DataFrame, tmp_path: Path) -> None:
     at = START_NS + 24 * HOUR_NS
     found = asked("before-after", at=at).to_pylist()[1]
     told = rows[rows["value"]].assign(after=lambda r: r["time"] >= at // 10**9)

@@ -9,11 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics.past_map import map_at
-from fleet_service.analytics.rebuilding import Rebuild, insist_on_empty, rebuild, rebuilt, zones_of
+from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuild_zone, require_empty, zones_of
 from fleet_service.analytics.synthetic import SyntheticFleet
 from fleet_service.archive import layout, rollup
 from fleet_service.archive.export import Extract
-from fleet_service.archive.reading import near
+from fleet_service.archive.reading import files_near
 from fleet_service.cli import main
 from schemas import grid
 from schemas.errors import InputError
@@ -49,26 +49,26 @@ def test_zone_by_zone_the_map_is_that_of_a_whole_replay(archive: Path, tmp_path:
 def test_the_roll_ups_are_those_of_the_archive_byte_for_byte(archive: Path, tmp_path: Path) -> None:
     out = made(archive, tmp_path / "out")
     assert contents(out / rollup.TABLE) == contents(archive / rollup.TABLE)
-    assert len(contents(out / rollup.TABLE)) == len(list(layout.compacted(archive, Kind.OBSERVATION)))
+    assert len(contents(out / rollup.TABLE)) == len(list(layout.compacted_files(archive, Kind.OBSERVATION)))
 
 
 def test_a_zone_done_again_leaves_the_same_files_and_no_draft(archive: Path, tmp_path: Path) -> None:
     out = made(archive, tmp_path / "out")
     before = contents(out)
-    rebuilt(Rebuild(archive, out, UNTIL), zones_of(archive)[0])
+    rebuild_zone(Rebuild(archive, out, UNTIL), zones_of(archive)[0])
     assert contents(out) == before
     assert {path.name for path in out.iterdir()} == {"map", "rollup"}
 
 
 def test_only_files_of_zones_near_a_box_are_read(archive: Path) -> None:
-    files = list(layout.compacted(archive, Kind.OBSERVATION))
-    zones = {layout.partition_of(path).zone for path in near(files, (BORDER - 0.1, 57.0, BORDER + 0.1, 58.0))}
+    files = list(layout.compacted_files(archive, Kind.OBSERVATION))
+    zones = {layout.partition_of(path).zone for path in files_near(files, (BORDER - 0.1, 57.0, BORDER + 0.1, 58.0))}
     assert len(zones) == 2
-    assert near(files, None) == files
-    assert not near(files, (0.0, 0.0, 1.0, 1.0))
+    assert files_near(files, None) == files
+    assert not files_near(files, (0.0, 0.0, 1.0, 1.0))
 
 
-def test_the_command_says_what_it_did_and_refuses_a_folder_with_something_in_it(
+def test_rebuild_reports_its_result_and_refuses_a_non_empty_folder(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["rebuild", "--archive", str(archive), "--out", str(tmp_path / "out"), "--to", "2026-01-28"]
@@ -81,4 +81,4 @@ def test_the_command_says_what_it_did_and_refuses_a_folder_with_something_in_it(
     assert "engine: 'abacus' is none" in capsys.readouterr().err
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="out: cannot use"):
-        insist_on_empty(tmp_path / "file")
+        require_empty(tmp_path / "file")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fleet_service.analytics.rebuilding import Rebuild, Rebuilt, rebuild, rebuilt, zones_of
+from fleet_service.analytics.rebuilding import Rebuild, RebuildResult, rebuild, rebuild_zone, zones_of
 from fleet_service.analytics.synthetic import SyntheticFleet
 from schemas.errors import InputError
 from schemas.runtime import spark
@@ -36,7 +36,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_both_engines_write_the_same_bytes(session: Any, archive: Path, tmp_path: Path) -> None:  # noqa: ANN401
-    done: dict[str, list[Rebuilt]] = {}
+    done: dict[str, list[RebuildResult]] = {}
     for engine in ("local", "spark"):
         (tmp_path / engine).mkdir()
         done[engine] = list(rebuild(Rebuild(archive, tmp_path / engine, UNTIL), engine))
@@ -52,7 +52,7 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
 ) -> None:
     out, tries = tmp_path / "out", tmp_path / "tries"
     out.mkdir()
-    dying = spark_sessions.killed_at_first(partial(rebuilt, Rebuild(archive, out, UNTIL)), str, tries)
+    dying = spark_sessions.killed_at_first(partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries)
     zones = zones_of(archive)
     told = spark.spread(session, zones, dying)
     assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, "none was killed"

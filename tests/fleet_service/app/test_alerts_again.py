@@ -15,7 +15,7 @@ def fleet(service: Running, session: zenoh.Session) -> Fleet:
     return Fleet(session).meet()
 
 
-def test_an_alert_that_stands_is_put_again_for_who_was_away_and_one_that_is_cleared_is_not(fleet: Fleet) -> None:
+def test_standing_alerts_are_repeated_and_cleared_ones_are_not(fleet: Fleet) -> None:
     moments = seconds()
     fleet.settle(*(batch(f"sim-{k:03}", 1, next(moments), [0.2]) for k in range(3)))
     raised = fleet.alerts.get(timeout=10.0)

@@ -11,7 +11,7 @@ import pytest
 
 from fleet_service.app.clock import SteadyClock, TimeNow
 from fleet_service.app.engine import Engine
-from fleet_service.app.service import take
+from fleet_service.app.service import ingest_messages
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
@@ -36,12 +36,12 @@ class System:
         return SteadyClock(seen, lambda: self.wall, lambda: self.steady)
 
 
-def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() -> None:
+def test_unconfirmed_clock_jumps_are_not_followed() -> None:
     start = time.time_ns()
     system = System(start)
     clock = system.clock()
     system.passes(SECOND)
-    clock.heard({"car-a": system.wall})
+    clock.record_reports({"car-a": system.wall})
     assert clock.moment() == TimeNow(start + SECOND, 0, 0, start + SECOND)
     system.passes(SECOND, jump=-HOUR)
     assert (clock.now(), clock.lag()) == (start + 2 * SECOND, HOUR)
@@ -49,14 +49,14 @@ def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() 
     assert (clock.now(), clock.moment().doubt, clock.lag()) == (start + 3 * SECOND, YEAR, -YEAR)
     for _ in range(20):
         system.passes(SECOND)
-        clock.heard({"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall})
+        clock.record_reports({"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall})
     assert clock.now() == start + 23 * SECOND
     system.passes(SECOND, jump=-YEAR)
     assert clock.moment() == TimeNow(start + 24 * SECOND, 0, 0, start + 24 * SECOND)
 
 
 @pytest.mark.parametrize("wrong", [-30 * 365, 365])
-def test_a_clock_that_was_wrong_and_is_put_right_is_followed_when_most_reports_agree(wrong: int) -> None:
+def test_a_corrected_clock_is_followed_when_most_reports_agree(wrong: int) -> None:
     true = time.time_ns()
     system = System(true + wrong * DAY)
     clock = system.clock()
@@ -65,7 +65,7 @@ def test_a_clock_that_was_wrong_and_is_put_right_is_followed_when_most_reports_a
     system.passes(SECOND, jump=-wrong * DAY)
     for second in range(1, 12):
         system.passes(SECOND)
-        clock.heard({"car-a": true + second * SECOND, "car-b": true + second * SECOND, "parked": true - HOUR})
+        clock.record_reports({"car-a": true + second * SECOND, "car-b": true + second * SECOND, "parked": true - HOUR})
     assert clock.moment() == TimeNow(system.wall, 0, 0, system.wall)
 
 
@@ -91,7 +91,7 @@ def test_after_a_restart_what_was_seen_before_is_not_the_future() -> None:
     assert not at.sure
 
 
-def test_after_a_restart_a_year_ahead_nothing_is_too_old_and_nothing_ends_by_time() -> None:
+def test_restart_with_a_clock_a_year_ahead_refuses_and_ends_nothing() -> None:
     seen = time.time_ns()
     clock = System(seen + YEAR).clock(seen)
     assert clock.moment().least == seen
@@ -112,7 +112,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
             clock = system.clock(engine.seen)
             for step in range(2):
-                take(engine, clock, [message(1 + 2 * start + step, true)])
+                ingest_messages(engine, clock, [message(1 + 2 * start + step, true)])
                 engine.flush()
                 true += SECOND
                 system.passes(SECOND, jump=jump * (start == step == 0))
@@ -120,7 +120,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
             assert engine.counts["refused.time"] == 0
 
 
-def test_a_vehicle_whose_clock_is_a_day_ahead_is_refused_and_does_not_make_the_others_late(tmp_path: Path) -> None:
+def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.ingest([message(1, now + DAY)], now)

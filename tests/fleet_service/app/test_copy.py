@@ -69,7 +69,7 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         if with_checkpoint:
             checkpoints.save(root, engine._image())
             assert engine.copy is not None
-            engine.copy.follow()
+            engine.copy.sync()
         take(engine, second)
         engine.flush()
         assert engine.alerts > 0
@@ -189,7 +189,7 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
 @pytest.mark.campaign
-def test_a_service_killed_between_disk_and_bucket_loses_and_doubles_nothing(
+def test_service_killed_between_disk_and_bucket_loses_nothing(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
     root, fleet = tmp_path / "archive", Fleet(session)

@@ -96,7 +96,7 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         sent += [sent_by(vehicle, seq + 1) for vehicle in OTHERS]
         until(settled, PATIENCE_S)
         at_last = shown(session)
-        assert not requests.waiting(root)
+        assert not requests.open_requests(root)
         process.terminate()
         assert process.wait(PATIENCE_S) == 0
     names = Pseudonyms(root / "keys")
@@ -124,7 +124,7 @@ def filled(root: Path, *names: str) -> Engine:
 
 def answered(engine: Engine, root: Path) -> None:
     """Do what is asked for, with a worker."""
-    thread = threading.Thread(target=erasing.asked, args=(engine, ServiceConfig(), root, threading.Event()))
+    thread = threading.Thread(target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event()))
     thread.start()
     while thread.is_alive():
         engine.flush()
@@ -137,7 +137,7 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
         engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
         engine.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
-        question = requests.ask(tmp_path, Erasure(MONTH))
+        question = requests.write_request(tmp_path, Erasure(MONTH))
         answered(engine, tmp_path)
         assert requests.answer_to(question) == {"rows": 0, "files": []}
         assert engine.fusion.size
@@ -150,23 +150,23 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
 
 def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:
     with closing(filled(tmp_path, *OTHERS)) as engine:
-        none = requests.ask(tmp_path, Erasure("1999-01", GONE))
+        none = requests.write_request(tmp_path, Erasure("1999-01", GONE))
         (tmp_path / requests.FOLDER / "other.json").write_text("[]")
         answered(engine, tmp_path)
         with pytest.raises(InputError, match="no key of 1999-01"):
             requests.answer_to(none)
         with pytest.raises(InputError, match="other.json is none"):
             requests.answer_to(tmp_path / requests.FOLDER / "other.json")
-        assert not requests.waiting(tmp_path)
+        assert not requests.open_requests(tmp_path)
 
 
-def test_a_question_outlives_a_service_that_ends_and_the_command_does_it_then(tmp_path: Path) -> None:
+def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Path) -> None:
     engine = filled(tmp_path, GONE, *OTHERS)
     stopped = threading.Event()
     stopped.set()
-    question = requests.ask(tmp_path, Erasure(MONTH, GONE))
-    assert erasing.asked(engine, ServiceConfig(), tmp_path, stopped) is None
-    assert requests.waiting(tmp_path) == [question]
+    question = requests.write_request(tmp_path, Erasure(MONTH, GONE))
+    assert erasing.handle_requests(engine, ServiceConfig(), tmp_path, stopped) is None
+    assert requests.open_requests(tmp_path) == [question]
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         answered(again, tmp_path)

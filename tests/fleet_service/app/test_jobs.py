@@ -1,4 +1,4 @@
-"""What a running service does for its archive beside its work."""
+"""Background jobs of a running service."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import zenoh
 from fleet_service.app import tasks
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import Job, Upkeep, archive_jobs
+from fleet_service.app.jobs import BackgroundJobs, Job, archive_jobs
 from fleet_service.archive import layout, reserve
-from fleet_service.archive.compaction import compacting
+from fleet_service.archive.compaction import hold_compaction_lock
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from schemas import wire
@@ -60,13 +60,13 @@ def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None
 
     counts: Counter[str] = Counter()
     lines: list[str] = []
-    with Upkeep([Job("mending", 0.001, work)], counts, lines.append):
+    with BackgroundJobs([Job("mending", 0.001, work)], counts, lines.append):
         until(lambda: len(turns) > 2)
     assert counts["mending_failures"] == 1
     assert lines == ["mending failed: no disk", "well"]
 
 
-def test_a_job_that_fails_in_a_way_nobody_foresaw_ends_no_other_and_is_a_trouble(tmp_path: Path) -> None:
+def test_an_unforeseen_job_failure_ends_no_other_job_and_is_reported(tmp_path: Path) -> None:
     turns: list[int] = []
 
     def work(stop: threading.Event) -> str | None:
@@ -74,10 +74,10 @@ def test_a_job_that_fails_in_a_way_nobody_foresaw_ends_no_other_and_is_a_trouble
 
     counts: Counter[str] = Counter()
     jobs = [Job("broken", 0.001, work), Job("other", 0.001, lambda _: turns.append(1))]
-    with Upkeep(jobs, counts, lambda _: None) as upkeep:
+    with BackgroundJobs(jobs, counts, lambda _: None) as upkeep:
         until(lambda: len(turns) > 5 and counts["broken_failures"] > 5)
-        assert upkeep.troubles()[0].startswith("broken failed ")
-        assert not upkeep.ended
+        assert upkeep.health_problems()[0].startswith("broken failed ")
+        assert not upkeep.has_ended
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -85,10 +85,10 @@ def test_upkeep_that_has_died_is_known_and_told() -> None:
     def work(stop: threading.Event) -> str | None:
         raise KeyboardInterrupt
 
-    with Upkeep([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
-        until(lambda: upkeep.ended)
-        assert upkeep.troubles()[-1] == "upkeep has ended; start the service again"
-    assert not upkeep.ended, "it was stopped"
+    with BackgroundJobs([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
+        until(lambda: upkeep.has_ended)
+        assert upkeep.health_problems()[-1] == "background jobs have ended; restart the service"
+    assert not upkeep.has_ended, "it was stopped"
 
 
 def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
     assert [path.name for path in layout.days(tmp_path, "observations")] == ["date=2026-01-31"]
 
 
-def test_a_checkpoint_that_no_good_segment_comes_for_does_not_keep_the_jobs_that_make_room(
+def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tasks, "MOST_S", 0.05)
@@ -109,27 +109,27 @@ def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reserve, "SIZE", 1 << 16)
-    reserve.keep(tmp_path)
+    reserve.allocate(tmp_path)
     assert (tmp_path / "reserve").stat().st_size == 1 << 16
-    assert not reserve.give(tmp_path), "there is room"
+    assert not reserve.release(tmp_path), "there is room"
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
-    assert reserve.give(tmp_path)
+    assert reserve.release(tmp_path)
     assert not (tmp_path / "reserve").exists()
-    reserve.keep(tmp_path)
+    reserve.allocate(tmp_path)
     assert not (tmp_path / "reserve").exists()
 
 
 def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
     done: Callable[[threading.Event], str | None] = lambda _: "done"  # noqa: E731
     lines: list[str] = []
-    with Upkeep([Job("never", 0.0, done)], Counter(), lines.append):
+    with BackgroundJobs([Job("never", 0.0, done)], Counter(), lines.append):
         pass
     assert not lines
 
 
 def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "inbox").mkdir()
-    with compacting(tmp_path):
+    with hold_compaction_lock(tmp_path):
         assert main(["compact", "--archive", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: archive: ")
 
@@ -140,7 +140,7 @@ def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().err.startswith("error: round-rows: ")
 
 
-def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_service(tmp_path: Path) -> None:
+def test_failing_compaction_is_reported_and_a_running_one_is_stopped(tmp_path: Path) -> None:
     engine = Engine(ServiceConfig(), tmp_path)
     with closing(engine):
         engine.ingest(
@@ -148,7 +148,7 @@ def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_s
         )
         engine.flush()
         compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path, SteadyClock().moment)
-        with compacting(tmp_path), pytest.raises(InputError, match="being compacted"):
+        with hold_compaction_lock(tmp_path), pytest.raises(InputError, match="being compacted"):
             compaction.work(threading.Event())
         stopped = threading.Event()
         stopped.set()

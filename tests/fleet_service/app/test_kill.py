@@ -43,7 +43,7 @@ def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[st
 
 
 @pytest.mark.campaign
-def test_a_killed_service_keeps_what_it_acknowledged_and_counts_nothing_twice(
+def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(7)

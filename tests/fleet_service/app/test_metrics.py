@@ -56,7 +56,7 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
         assert (status, json.loads(text)["troubles"]) == (200, [])
 
 
-def test_damaged_files_are_counted_by_a_job_and_not_by_who_reads_the_metrics(tmp_path: Path) -> None:
+def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Path) -> None:
     config, pulse = ServiceConfig(), Pulse(turn_age_s=0.1, queued=0, routers=1, clock_lag_s=0.0)
     engine = Engine(config, tmp_path)
 
@@ -80,13 +80,13 @@ def test_each_trouble_is_told(tmp_path: Path) -> None:
     config = ServiceConfig(queue_batches=100)
     engine = Engine(config, tmp_path)
     well = Pulse(turn_age_s=0.1, queued=3, routers=1, clock_lag_s=0.0)
-    assert metrics.troubles(engine, well, config) == []
+    assert metrics.health_problems(engine, well, config) == []
     engine.failing = True
     ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0, answer_s=60.0)
-    assert metrics.troubles(engine, ill, config) == [
+    assert metrics.health_problems(engine, ill, config) == [
         "no router is connected",
-        "the worker has done nothing for 60 s",
-        "a tile of an answer is being made for 60 s",
+        "the worker has been idle for 60 s",
+        "a tile of an answer has been in progress for 60 s",
         "segments cannot be written",
         "the queue is full",
     ]

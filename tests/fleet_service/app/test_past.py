@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fleet_service.app import past
 from fleet_service.app.engine import Engine
 from fleet_service.archive import files, layout, segments
-from fleet_service.archive.between import Between
+from fleet_service.archive.between import ValueRange
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.load import load, load_groups
 from fleet_service.ingest.inbox import Message
@@ -50,8 +50,8 @@ def question(**parameters: str) -> past.PastQuery:
 
 
 @pytest.fixture
-def asker(root: Path) -> Iterator[past.PastMaps]:
-    with closing(past.PastMaps(root)) as asker:
+def asker(root: Path) -> Iterator[past.HistoricalMaps]:
+    with closing(past.HistoricalMaps(root)) as asker:
         yield asker
 
 
@@ -63,14 +63,14 @@ def test_rows_are_counted_before_any_is_read(root: Path) -> None:
 
 
 def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
-    root: Path, asker: past.PastMaps, monkeypatch: pytest.MonkeyPatch
+    root: Path, asker: past.HistoricalMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(past, "MOST_ROWS", 399)
     with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
         list(asker.ask(question(), lambda _: True))
     assert list(asker.ask(question(bbox="0,0,1,1"), lambda _: True)) == []
     with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
-        list(past.replies(root, question(bbox=NEAR)))  # as many lie in the box itself
+        list(past.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
     monkeypatch.setattr(past, "LOOKED_ROWS", 399)
     with pytest.raises(InputError, match="at: would have to read too much"):
         list(asker.ask(question(bbox=NEAR), lambda _: True))
@@ -81,20 +81,20 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
 def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     root: Path, monkeypatch: pytest.MonkeyPatch, group: int
 ) -> None:
-    (path,) = layout.compacted(root, Kind.OBSERVATION)
+    (path,) = layout.compacted_files(root, Kind.OBSERVATION)
     table = pq.read_table(path, partitioning=None)
     monkeypatch.setattr(files, "ROW_GROUP", group)
     files.write_table(table, path, files.COMPACTED)
     assert pq.read_metadata(path).num_row_groups == -(-400 // group)
     schema, begin = segments.SCHEMAS[Kind.OBSERVATION], table["leave_time"].cast(pa.int64()).to_numpy()
-    wanted: list[tuple[Between, NDArray[Any]]] = [
-        (Between("seq", 2, 3), np.isin(table["seq"], [2, 3])),
-        (Between("leave_time", most=int(np.median(begin))), begin <= np.median(begin)),
-        (Between("vehicle", table["vehicle"][7].as_py(), table["vehicle"][7].as_py()), np.array([
+    wanted: list[tuple[ValueRange, NDArray[Any]]] = [
+        (ValueRange("seq", 2, 3), np.isin(table["seq"], [2, 3])),
+        (ValueRange("leave_time", most=int(np.median(begin))), begin <= np.median(begin)),
+        (ValueRange("vehicle", table["vehicle"][7].as_py(), table["vehicle"][7].as_py()), np.array([
             one == table["vehicle"][7].as_py() for one in table["vehicle"].to_pylist()
         ])),
-        (Between("latitude", LATITUDE - 1.0, LATITUDE + 1.0), np.ones(400, bool)),
-        (Between("seq", 100), np.zeros(400, bool)),
+        (ValueRange("latitude", LATITUDE - 1.0, LATITUDE + 1.0), np.ones(400, bool)),
+        (ValueRange("seq", 100), np.zeros(400, bool)),
     ]  # fmt: skip
     for where, right in wanted:
         for columns in (["vehicle", "seq", "row", "leave_time", "latitude"], None):
@@ -109,9 +109,9 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     assert 0 < wanted[0][1].sum() < 400
 
 
-def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path, asker: past.PastMaps) -> None:
+def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path, asker: past.HistoricalMaps) -> None:
     asked = question(bbox=NEAR)
-    (mine,) = past.replies(root, asked)
+    (mine,) = past.replies_to(root, asked)
     (theirs,) = asker.ask(asked, lambda _: True)
     assert theirs == mine
     assert mine[0] == TILE
@@ -134,7 +134,7 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_a_process_answers_one_question_after_the_other(
-    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     answers = [list(asker.ask(question(bbox=box), lambda _: True)) for box in (NEAR, "0,0,1,1", NEAR)]
     assert [len(answer) for answer in answers] == [1, 0, 1]
@@ -144,7 +144,7 @@ def test_a_process_answers_one_question_after_the_other(
 
 
 def test_a_process_that_died_while_nobody_asked_is_begun_anew(
-    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     for _ in range(2):
         assert len(list(asker.ask(question(bbox=NEAR), lambda _: True))) == 1
@@ -154,7 +154,7 @@ def test_a_process_that_died_while_nobody_asked_is_begun_anew(
 
 
 def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
-    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     left = asker.ask(question(bbox=NEAR), lambda _: True)
     next(left)

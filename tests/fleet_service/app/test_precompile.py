@@ -58,7 +58,7 @@ def test_a_ready_service_compiles_nothing() -> None:
     assert heard.stdout.strip() == "[]", heard.stdout + heard.stderr
 
 
-def test_what_was_never_compiled_is_compiled_by_a_process_of_its_own_and_once(
+def test_missing_kernels_are_compiled_once_by_a_separate_process(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ran = tmp_path / "ran"

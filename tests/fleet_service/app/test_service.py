@@ -134,7 +134,7 @@ def test_a_changed_tile_is_put_on_its_own_key(fleet: Fleet) -> None:
     assert table["cell"].to_pylist() == [CELL]
 
 
-def test_a_batch_that_comes_again_is_acknowledged_again_and_not_counted_again(fleet: Fleet, service: Running) -> None:
+def test_repeated_batch_is_acknowledged_again_and_not_counted_again(fleet: Fleet, service: Running) -> None:
     sent = batch("sim-001", 1, now(), [0.8])
     fleet.settle(sent)
     before = fleet.acks
@@ -195,7 +195,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
-    """What a client hears that comes late."""
+    """Return the alerts that a late client receives."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]

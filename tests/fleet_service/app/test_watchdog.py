@@ -1,4 +1,4 @@
-"""What systemd hears of a service: signs of life, until something hangs beside its worker."""
+"""Watchdog signals of a service, until something hangs next to its worker."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.fleet_service.conftest import running
 from tests.waiting import until
 
 LIFE = b"READY=1\nWATCHDOG=1"
-SAID = "no sign of life is given: a tile of an answer is being made for "
+SAID = "watchdog signal withheld: a tile of an answer has been in progress for "
 
 
 def test_signs_of_life_end_with_a_reason_when_an_answer_hangs(

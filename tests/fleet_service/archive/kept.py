@@ -51,7 +51,7 @@ def now_of(turn: int) -> int:
 
 
 def observed(turn: int, vehicle: int) -> Batch:
-    """What a vehicle sends in a round: ice in every second cell, bounds from every third vehicle."""
+    """Return the reports of a vehicle in a round: ice in every second cell, bounds from every third vehicle."""
     rng = np.random.default_rng([turn, vehicle])
     latitude, longitude = PLACES[vehicle % 2]
     step = int(rng.integers(0, 4))

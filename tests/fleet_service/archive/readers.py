@@ -14,7 +14,7 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """What a tool made of the observations."""
+    """Result of a tool that read the observations."""
 
     rows: int
     mu: float

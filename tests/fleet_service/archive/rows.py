@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fleet_service.archive import reading
-from fleet_service.archive.segments import SCHEMAS, Rows, Writer, stepped
+from fleet_service.archive.segments import SCHEMAS, Rows, Writer, round_to_steps
 from fleet_service.fusion.standing import UNCORRECTED
 from schemas import grid, mugrid, tables
 from schemas.wire import Kind
@@ -47,7 +47,7 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
         rows["weight"] = np.full(count, 0.75, np.float32)
         rows["late_by"] = np.zeros(count, np.int64)
         rows |= {name: np.full(count, value, np.float32) for name, value in UNCORRECTED.items()}
-    return stepped(rows)
+    return round_to_steps(rows)
 
 
 def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:

@@ -17,7 +17,7 @@ import pytest
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive import reading, segments
-from fleet_service.archive.files import lock
+from fleet_service.archive.files import lock_archive
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.ingest.inbox import Message
 from schemas import tables, wire
@@ -71,7 +71,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         assert settled(acks) == {"sim-001": [(seq, seq)]}
 
 
-def test_nothing_is_acknowledged_while_the_disk_fails_and_all_of_it_afterwards(engine: Engine, tmp_path: Path) -> None:
+def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(engine: Engine, tmp_path: Path) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")
     engine.ingest([sent("sim-001", 1)], time.time_ns())
     assert engine.flush() == []
@@ -85,9 +85,9 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_all_of_it_afterwards(e
 
 def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^archive: .* belongs to a running service; "):
-        lock(tmp_path)
+        lock_archive(tmp_path)
     engine.close()
-    lock(tmp_path).close()
+    lock_archive(tmp_path).close()
 
 
 def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
         assert again.counts["duplicates"] == bool(held)
 
 
-def test_names_that_could_not_be_synced_are_synced_before_anything_is_acknowledged(
+def test_unsynced_names_are_synced_before_any_acknowledgement(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(folder: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_pseudonym_is_its_number_and_its_number_is_the_pseudonym(tmp_path: Pat
     assert texts(numbers).astype(str).tolist() == names
 
 
-def test_a_pseudonym_holds_for_its_month_and_across_restarts_and_not_beyond(tmp_path: Path) -> None:
+def test_pseudonym_holds_for_its_month_across_restarts_not_beyond(tmp_path: Path) -> None:
     now = time.time_ns()
     first, again = Pseudonyms(tmp_path), Pseudonyms(tmp_path)
     name = first.of("sim-001", now)
@@ -209,7 +209,7 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
     assert Pseudonyms(tmp_path).of("sim-001", now) != name
 
 
-def test_a_late_observation_is_archived_with_its_mark_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
+def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
     engine.ingest([sent("sim-001", 1)], now)

@@ -20,7 +20,7 @@ import pytest
 from fleet_service.app.engine import Engine
 from fleet_service.archive import compaction, files, layout, reading, segments
 from fleet_service.archive import load as loading
-from fleet_service.archive.compaction import compact, compacting
+from fleet_service.archive.compaction import compact, hold_compaction_lock
 from fleet_service.archive.segments import Writer
 from schemas import grid, tables
 from schemas.config import ServiceConfig
@@ -181,7 +181,7 @@ def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: py
 
 def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
-    with compacting(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
+    with hold_compaction_lock(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
         compact(tmp_path)
     with pytest.raises(InputError, match="^archive: .* is no folder; "):
         compact(tmp_path / "nowhere")
@@ -196,7 +196,7 @@ def test_a_damaged_segment_is_set_aside_and_the_rest_compacted(tmp_path: Path) -
     assert {boot for boot, _ in public(tmp_path, Kind.OBSERVATION)} == {0, 2}
 
 
-def test_names_of_compacted_segments_are_not_used_again_even_if_the_clock_went_back(
+def test_segment_names_are_not_reused_even_if_the_clock_went_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill(tmp_path, 1, ROWS)
@@ -208,7 +208,7 @@ def test_names_of_compacted_segments_are_not_used_again_even_if_the_clock_went_b
     assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
 
 
-def test_a_service_on_a_compacted_archive_has_the_same_map_and_knows_what_it_holds(tmp_path: Path) -> None:
+def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: Path) -> None:
     messages = [sent(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 20, 4):

@@ -14,12 +14,12 @@ import pytest
 from fleet_service.archive import copies, layout, segments
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.copied import copy_of
-from fleet_service.archive.copies import OWNER, Copy
+from fleet_service.archive.copied import last_copy_url
+from fleet_service.archive.copies import OWNER, BucketReplica
 from fleet_service.archive.load import set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.retention import retire
+from fleet_service.archive.retention import retire_rows
 from schemas.config import ServiceConfig, load
 from schemas.errors import InputError
 from schemas.wire import Kind
@@ -28,17 +28,17 @@ from tests.fleet_service.archive.rows import identities, rows_of
 from tests.waiting import until
 
 NAME = "shard-0"
-Make = Callable[[Path], Copy]
+Make = Callable[[Path], BucketReplica]
 
 
 @pytest.fixture
 def make(bucket: BucketServer) -> Iterator[Make]:
     """A copy of an archive, which was begun."""
-    made: list[Copy] = []
+    made: list[BucketReplica] = []
 
-    def begun(root: Path) -> Copy:
+    def begun(root: Path) -> BucketReplica:
         root.mkdir(exist_ok=True)
-        made.append(Copy(root, bucket.url, bucket.store))
+        made.append(BucketReplica(root, bucket.url, bucket.store))
         made[-1].begin(NAME)
         return made[-1]
 
@@ -51,7 +51,7 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
     return {name: content for name, content in bucket.objects().items() if name != OWNER}
 
 
-def filled(root: Path, copy: Copy | None, seeds: range = range(3)) -> SegmentLog[int]:
+def filled(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
     """A log with segments of both kinds, which are settled."""
     log: SegmentLog[int] = SegmentLog(root, NAME, copy)
     Pseudonyms(root / "keys").of("sim-001", 0)
@@ -69,7 +69,7 @@ def test_what_is_settled_is_in_the_bucket_byte_for_byte(bucket: BucketServer, ma
         assert there(bucket) == held(root)
 
 
-def test_nothing_is_settled_while_the_bucket_is_away_and_all_of_it_once_when_it_is_back(
+def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -110,10 +110,10 @@ def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(bucket: BucketServer
         (first, *others) = segments.paths(root, Kind.OBSERVATION)
         bucket.place("inbox").mkdir(parents=True)
         bucket.place(f"inbox/{first.name}").write_bytes(first.read_bytes())
-        copy.settle([first])
+        copy.upload_segments([first])
         bucket.place(f"inbox/{others[0].name}").write_bytes(b"another's")
         with pytest.raises(CopyError, match="another service"):
-            copy.settle([others[0]])
+            copy.upload_segments([others[0]])
 
 
 def test_the_copy_follows_compaction_and_retention(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
@@ -122,17 +122,17 @@ def test_the_copy_follows_compaction_and_retention(bucket: BucketServer, make: M
     with closing(filled(root, copy)):
         assert compact(root).segments == 6
         assert any(name.startswith("inbox/") for name in there(bucket))
-        assert copy.follow() > 0
+        assert copy.sync() > 0
         assert there(bucket) == held(root)
         assert not any(name.startswith("inbox/") for name in there(bucket))
-        assert copy.follow() == 0
-        retire(root, 31, date(2100, 1, 1))
-        assert not list(layout.compacted(root, Kind.OBSERVATION))
-        copy.follow()
+        assert copy.sync() == 0
+        retire_rows(root, 31, date(2100, 1, 1))
+        assert not list(layout.compacted_files(root, Kind.OBSERVATION))
+        copy.sync()
         assert there(bucket) == held(root)
 
 
-def test_a_segment_that_was_compacted_before_its_put_is_settled_by_what_it_became(
+def test_segment_compacted_before_its_upload_is_settled_by_the_result(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -140,7 +140,7 @@ def test_a_segment_that_was_compacted_before_its_put_is_settled_by_what_it_becam
     with closing(filled(root, None)):
         gone = segments.paths(root, Kind.OBSERVATION)
         compact(root)
-        copy.settle(gone)
+        copy.upload_segments(gone)
         assert there(bucket) == held(root)
         assert any(name.startswith("observations/") for name in there(bucket))
 
@@ -150,7 +150,7 @@ def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp
     copy = make(root)
     with closing(filled(root, copy)):
         compact(root)
-        copy.follow()
+        copy.sync()
     with closing(filled(root, copy, range(3, 5))):
         pass
     (half := bucket.place("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(parents=True)
@@ -159,7 +159,7 @@ def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp
     assert held(new) == held(root)
     assert len(identities(new, Kind.OBSERVATION)) == 5 * 5
     assert {path.stat().st_mode & 0o777 for path in (new / "keys").iterdir()} == {0o600}
-    assert copy_of(new) == bucket.url
+    assert last_copy_url(new) == bucket.url
 
 
 def test_what_was_cut_off_is_made_good_at_the_next_start(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: 
     make(tmp_path / "archive")
     (tmp_path / "other").mkdir()
     with (
-        closing(Copy(tmp_path / "other", bucket.url, bucket.store)) as copy,
+        closing(BucketReplica(tmp_path / "other", bucket.url, bucket.store)) as copy,
         pytest.raises(InputError, match="another service, shard-0"),
     ):
         copy.begin("shard-1")
@@ -196,7 +196,7 @@ def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
 ) -> None:
     monkeypatch.setattr(copies, "SLOW_S", 1.0)
     bucket.away(kind)
-    with closing(Copy(tmp_path, bucket.url, bucket.store)) as copy, pytest.raises(InputError) as told:
+    with closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy, pytest.raises(InputError) as told:
         copy.begin(NAME)
     assert told.value.field == "archive.copy"
     assert SECRET not in str(told.value)
@@ -210,15 +210,15 @@ def test_settings_that_cannot_be_used_say_which_and_why(tmp_path: Path, monkeypa
         ("s3://bucket", {"endpiont": SECRET}, "archive.store"),
     ]:
         with pytest.raises(InputError) as told:
-            Copy(tmp_path, url, store)
+            BucketReplica(tmp_path, url, store)
         assert told.value.field == field
         assert SECRET not in str(told.value)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(InputError, match="obstore, which is not installed.*gripmap\\[objects\\]"):
-        Copy(tmp_path, "s3://bucket", {})
+        BucketReplica(tmp_path, "s3://bucket", {})
 
 
-def test_a_bucket_is_reached_by_the_environment_alone_and_the_same_trouble_is_the_same_line(
+def test_bucket_works_by_environment_alone_and_errors_are_stable_lines(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in bucket.store.items():

@@ -63,7 +63,7 @@ def test_what_retention_removes_leaves_the_tables_first(tmp_path: Path, capsys: 
     fill(root, 2, 100)
     compact(root)
     exported(root, capsys)
-    assert retention.retire(root, 31, DATE + timedelta(days=32)) == (2, 4)
+    assert retention.retire_rows(root, 31, DATE + timedelta(days=32)) == (2, 4)
     assert rows_different(root, uri(root)) == 0  # read whole: no table names a file that is gone
     told = exported(root, capsys)
     assert (told["added"], told["dropped"]) == (0, 0)
@@ -79,11 +79,11 @@ def test_a_catalogue_that_is_away_holds_retention_up(tmp_path: Path, capsys: pyt
     (tmp_path / "tables.db").rename(tmp_path / "elsewhere.db")
     (tmp_path / "tables.db").mkdir()
     with pytest.raises(InputError, match="^catalog: sqlite://.*OperationalError"):
-        retention.retire(root, 31, DATE + timedelta(days=32))
+        retention.retire_rows(root, 31, DATE + timedelta(days=32))
     assert set(files) <= set(root.rglob("zone=*/*.parquet"))
     (tmp_path / "tables.db").rmdir()
     (tmp_path / "elsewhere.db").rename(tmp_path / "tables.db")
-    assert retention.retire(root, 31, DATE + timedelta(days=32)) == (2, 4)
+    assert retention.retire_rows(root, 31, DATE + timedelta(days=32)) == (2, 4)
     assert rows_different(root, uri(root)) == 0
 
 

@@ -1,4 +1,4 @@
-"""What waits for the disk: nothing is settled before it is durable, and what fails is not lost."""
+"""The log: nothing is settled before it is durable, and a failed write loses nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from fleet_service.archive import layout, segments
 from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.pseudonyms import kept_key
+from fleet_service.archive.pseudonyms import load_or_create_key
 from schemas.wire import Kind
 from tests.faults.crash_disk import CrashDisk
 from tests.fleet_service.archive.rows import identities, rows_of
@@ -53,9 +53,7 @@ def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]
     assert log.flush() == []
 
 
-def test_what_cannot_be_written_is_not_settled_and_comes_with_the_next_each_row_once(
-    log: SegmentLog[str], tmp_path: Path
-) -> None:
+def test_failed_writes_are_not_settled_and_come_once_with_the_next(log: SegmentLog[str], tmp_path: Path) -> None:
     inbox, away = (segments.folder(tmp_path, Kind.STATE), tmp_path / "away")
     add(log, "seen", 1)
     add(log, "state", 2, Kind.STATE)
@@ -73,7 +71,7 @@ def test_what_cannot_be_written_is_not_settled_and_comes_with_the_next_each_row_
     assert len(identities(tmp_path, Kind.STATE)) == 3
 
 
-def test_a_segment_is_older_than_the_next_however_many_digits_their_numbers_have() -> None:
+def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
     newer, older = (layout.segment_name("shard-0-0000000007", number) for number in (100_000_000, 99_999_999))
     assert sorted([newer, older], key=layout.age) == [older, newer]
 
@@ -85,7 +83,7 @@ def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path
         live.mkdir()
         disk = CrashDisk(live, random.Random(seed), None, range(0))
         with disk.mounted():
-            key = kept_key(live / "keys" / "2026-01.key")
+            key = load_or_create_key(live / "keys" / "2026-01.key")
         disk.image(after)
         assert (after / "keys" / "2026-01.key").exists()
-        assert kept_key(after / "keys" / "2026-01.key") == key
+        assert load_or_create_key(after / "keys" / "2026-01.key") == key

@@ -1,4 +1,4 @@
-"""What goes: old raw rows, keys, one vehicle's rows; and what stays."""
+"""Removal of old raw rows, of keys and of one vehicle's rows, and the data that stays."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def vehicles_in(root: Path, kind: Kind) -> list[str]:
 def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     fill(tmp_path, 2, 100)
     compact(tmp_path)
-    assert retention.retire(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
+    assert retention.retire_rows(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
     days = {kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind}
     assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
     whole = len(identities(tmp_path, Kind.OBSERVATION))
-    done = retention.retire(tmp_path, 31, DATE + timedelta(days=32))
+    done = retention.retire_rows(tmp_path, 31, DATE + timedelta(days=32))
     assert done == (2, 4)  # a day of observations and one of states, two zones each
     left = len(identities(tmp_path, Kind.OBSERVATION))
     assert 0 < left < whole
@@ -57,7 +57,7 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
 def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
     with pytest.raises(InputError, match="^raw-days: 7 are too few "):
-        retention.retire(tmp_path, 7, DATE)
+        retention.retire_rows(tmp_path, 7, DATE)
 
 
 def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
     assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, (), None)
 
 
-def test_what_could_tell_of_a_forgotten_vehicle_goes_too_here_and_in_the_mirror(tmp_path: Path) -> None:
+def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: Path) -> None:
     root, there = tmp_path / "archive", tmp_path / "there"
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
@@ -116,7 +116,7 @@ ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 
 
 def told(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """What the sender of a batch is told, once a segment is written."""
+    """Return the acknowledgement of a batch, once a segment is written."""
     engine.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [stream for _, data in engine.flush() for stream in wire.decode_ack(data)[1]]
     assert all(stream.durable in ((), ((sent.seq, sent.seq),)) for stream in streams)
@@ -127,7 +127,7 @@ def rows_kept(root: Path) -> int:
     return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["vehicle"]))
 
 
-def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
     old, away, after = batch("car-001", 1, NOON, [0.8]), batch("car-002", 1, NOON - DAY, [0.8]), NOON + 3 * DAY
     later = batch("car-001", 2, after, [0.8])
@@ -147,7 +147,7 @@ def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_rest
     assert not list((tmp_path / "keys").glob("2026-01.key"))
 
 
-def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
     """A spool that was brought back from a copy may hold what was acknowledged long ago."""
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)
@@ -168,7 +168,7 @@ def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(
     assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], "it goes with the key"
 
 
-def test_the_last_of_a_forgotten_vehicle_does_not_come_in_again_when_its_month_is_forgotten_after_it(
+def test_forgetting_a_month_does_not_readmit_an_already_forgotten_vehicle(
     tmp_path: Path,
 ) -> None:
     other, last = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2))
@@ -190,7 +190,7 @@ def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_pa
     assert rows_kept(tmp_path) == 0
 
 
-def test_of_a_month_that_goes_on_all_is_forgotten_until_the_newest_there_is(tmp_path: Path) -> None:
+def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> None:
     seen, new = batch("car-001", 1, NOON - DAY, [0.8]), batch("car-001", 2, NOON, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert told(engine, seen, NOON) == ["durable"]
@@ -219,11 +219,11 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
     originals = [path for folder in mirror.FOLDERS for path in (root / folder).rglob("*.parquet")]
     assert copies == {path.relative_to(root): path.read_bytes() for path in originals}
     assert not [path for path in there.rglob("*") if path.name.endswith(".tmp")]
-    assert mirror.put(root, there.as_uri()) == 0
+    assert mirror.copy_new_files(root, there.as_uri()) == 0
     originals[0].write_bytes(originals[1].read_bytes() + b"")
-    assert mirror.put(root, there.as_uri()) == 1
+    assert mirror.copy_new_files(root, there.as_uri()) == 1
     with pytest.raises(InputError, match="^to: cannot use nonsense://x "):
-        mirror.put(root, "nonsense://x")
+        mirror.copy_new_files(root, "nonsense://x")
 
 
 @pytest.mark.parametrize("ending", [".parquet", ".geojson", ".csv"])

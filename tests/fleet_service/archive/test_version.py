@@ -56,7 +56,7 @@ def files(root: Path) -> Iterator[Path]:
     return (path for path in sorted(root.rglob("*.parquet")))
 
 
-def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(old: Path) -> None:
+def test_kept_archive_is_of_version_one_and_has_every_kind_of_file(old: Path) -> None:
     kinds = Counter(path.relative_to(old).parts[0] for path in files(old))
     assert kinds.keys() == {"inbox", "observations", "states", "rollup", "map", "weather"}
     digests = set()
@@ -69,9 +69,7 @@ def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(o
 
 
 @pytest.mark.parametrize("begin", ["checkpoint", "log"])
-def test_a_service_on_the_kept_archive_makes_the_same_map_of_it_with_its_checkpoint_and_without(
-    old: Path, begin: str
-) -> None:
+def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, begin: str) -> None:
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
@@ -83,7 +81,7 @@ def test_a_service_on_the_kept_archive_makes_the_same_map_of_it_with_its_checkpo
     assert not list(old.rglob("*.bad"))
 
 
-def test_what_is_kept_is_compacted_together_with_what_is_new_and_gives_the_same_map(old: Path) -> None:
+def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         for turn in (ROUNDS, ROUNDS + 1):
             engine.ingest(list(messages(turn)), now_of(turn))
@@ -164,7 +162,7 @@ def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) 
     assert len(_identities(tmp_path, Kind.OBSERVATION)) == 20
 
 
-def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(tmp_path: Path) -> None:
+def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
     first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
     rewritten(first, without_columns, "1.0")
@@ -173,7 +171,7 @@ def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(t
     compact(tmp_path)
     assert _identities(tmp_path, Kind.OBSERVATION) == before
     parts = []
-    for path in layout.compacted(tmp_path, Kind.OBSERVATION):
+    for path in layout.compacted_files(tmp_path, Kind.OBSERVATION):
         found = content(path)
         assert found is not None
         assert found.version == (1, 7), "who knows the column may be told that it is there"
@@ -186,10 +184,10 @@ def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(t
 
 def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> None:
     compact(old)
-    for path in layout.compacted(old, Kind.OBSERVATION):
+    for path in layout.compacted_files(old, Kind.OBSERVATION):
         rewritten(path, with_columns, "1.7", COMPACTED)
     assert cli.main(["forget", "--archive", str(old), "--period", "2024-10", "--vehicle", "sim-003"]) == 0
-    for path in layout.compacted(old, Kind.OBSERVATION):
+    for path in layout.compacted_files(old, Kind.OBSERVATION):
         found = content(path)
         assert found is not None
         assert (found.version, "road_wetness" in found.table.column_names) == ((1, 7), True)
@@ -197,7 +195,7 @@ def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> Non
     assert len(_identities(old, Kind.OBSERVATION)) == 7 * 2 * ROUNDS
 
 
-def test_the_questions_of_analysts_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
+def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
     for seed, change in enumerate((without_columns, with_columns, lambda table: table)):
         fill(tmp_path, 1, 20, seed)
         rewritten(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
@@ -213,7 +211,7 @@ AHEAD = {
 
 
 @pytest.mark.parametrize("folder", AHEAD)
-def test_a_service_refuses_an_archive_of_a_newer_major_version_and_touches_nothing(old: Path, folder: str) -> None:
+def test_archive_of_a_newer_major_version_is_refused_untouched(old: Path, folder: str) -> None:
     path = next((old / folder).glob("*.parquet"), None) or next((old / folder).rglob("*.parquet"))
     rewritten(path, lambda table: table, "2.0", AHEAD[folder])
     with pytest.raises(InputError, match=r"^archive: .* is of version 2\.0, .* reads 1\.x; use a newer GripMap$"):
@@ -254,7 +252,7 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
     rewritten(path, wider, "1.2")
     compact(tmp_path)
     assert pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type == pa.int32()
-    rewritten(next(layout.compacted(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
+    rewritten(next(layout.compacted_files(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
         t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)), "1.2")  # fmt: skip
     with pytest.raises(InputError, match="^archive: column health is string and not int32; "):
         list(reading.read(tmp_path, Kind.OBSERVATION))
@@ -266,7 +264,7 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
 def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(tmp_path: Path, name: str) -> None:
     fill(tmp_path, 1, 5)
     compact(tmp_path)
-    path = next(layout.compacted(tmp_path, Kind.OBSERVATION))
+    path = next(layout.compacted_files(tmp_path, Kind.OBSERVATION))
     assert content(path) is not None
     path.write_bytes(path.read_bytes().replace(name.encode(), name[:-1].encode() + b"z"))
     assert content(path) is None
@@ -278,7 +276,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
     with closing(Engine(ServiceConfig(), old)) as engine:
         harmed = [
             segments.paths(old, Kind.OBSERVATION)[0],
-            next(layout.compacted(old, Kind.OBSERVATION)),
+            next(layout.compacted_files(old, Kind.OBSERVATION)),
             next((old / rollup.TABLE).rglob("*.parquet")),
             next((old / "weather").glob("*.parquet")),
         ]

@@ -1,4 +1,4 @@
-"""What the routers let through: real sessions with real certificates against the generated access list."""
+"""Access list of the routers: real sessions with real certificates against the generated list."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
 
 
 def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
-    """Whether what a vehicle puts on its own key reaches a service."""
+    """Return True if a vehicle's message on its own key reaches a service."""
     received: list[bytes] = []
     with listener.declare_subscriber(f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())):
         publisher = listener.declare_publisher(key(name))  # only a service is told who hears
@@ -103,8 +103,8 @@ def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
 
 def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: Network) -> None:
     where = settings(next(iter(running.endpoints.values())), running.folder)
-    served = keys.Served("1202/310/*", SERVICE, "1f")
-    false = keys.Served("1202/311/*", HONEST, "2f")
+    served = keys.ServiceToken("1202/310/*", SERVICE, "1f")
+    false = keys.ServiceToken("1202/311/*", HONEST, "2f")
     with (
         zenoh.open(configuration(where, SERVICE)) as service,
         zenoh.open(configuration(where, HONEST)) as vehicle,
@@ -114,14 +114,14 @@ def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: 
         token = service.liveliness().declare_token(served.key)
 
         def sees(looks: zenoh.Session) -> bool:
-            return served in tokens.standing(looks)
+            return served in tokens.active_tokens(looks)
 
         for looks in (vehicle, reader):
             until(partial(sees, looks))
-        with tokens.watched(reader) as seen:
-            assert seen.here == {served}
+        with tokens.track_tokens(reader) as seen:
+            assert seen.active == {served}
             token.undeclare()
-            until(lambda: seen.withdrawn == {served})
+            until(lambda: seen.lost == {served})
 
 
 def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:
@@ -191,9 +191,7 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
 
 
 @pytest.mark.parametrize("own", [keys.ahead_key, keys.vss_key])
-def test_what_is_ahead_of_a_vehicle_and_under_it_is_seen_by_it_and_its_owner_alone(
-    tmp_path: Path, own: Callable[[str], str]
-) -> None:
+def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(tmp_path: Path, own: Callable[[str], str]) -> None:
     other = next(name for name in VEHICLES if name != HONEST)
     fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
     listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")

@@ -1,4 +1,4 @@
-"""What `fleet-service certs` leaves in its folder, whatever was there before."""
+"""Results of `fleet-service certs`, for any former content of its folder."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) 
     (authority,) = trusted(folder)
     for name in EVERYONE:
         found = certificate(folder, name)
-        assert ca.signed(found, authority)
+        assert ca.is_signed_by(found, authority)
         assert found.subject.rfc4514_string() == f"CN={name}"
         assert found.not_valid_after_utc == NOW + timedelta(days=365)
         uses = found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
@@ -85,7 +85,7 @@ def test_a_pair_that_was_cut_off_half_way_is_made_whole(folder: Path) -> None:
     assert ca.read(folder / READER) is not None
 
 
-def test_a_name_off_the_list_is_revoked_and_not_given_again_before_its_certificate_ended(folder: Path) -> None:
+def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> None:
     gone, left = VEHICLES
     fewer = enrolment(vehicles=[left])
     assert at(folder).enrol(fewer).revoked == [gone]
@@ -96,7 +96,7 @@ def test_a_name_off_the_list_is_revoked_and_not_given_again_before_its_certifica
     assert gone in at(folder, 366.0).enrol(enrolment()).made
 
 
-def test_another_authority_comes_in_three_steps_and_both_are_trusted_in_between(folder: Path) -> None:
+def test_change_of_authority_takes_three_steps_with_both_trusted(folder: Path) -> None:
     (first,) = trusted(folder)
     assert not at(folder).enrol(enrolment(), "next").made, "everyone must trust it before it signs"
     assert first in trusted(folder)
@@ -104,7 +104,7 @@ def test_another_authority_comes_in_three_steps_and_both_are_trusted_in_between(
     assert set(at(folder).enrol(enrolment(), "switch").made) == EVERYONE
     second = trusted(folder)[0]
     assert set(trusted(folder)) == {first, second}
-    assert ca.signed(certificate(folder, SERVICE), second)
+    assert ca.is_signed_by(certificate(folder, SERVICE), second)
     assert set(at(folder).enrol(enrolment(), "drop").kept) == EVERYONE
     assert trusted(folder) == [second]
 

@@ -43,7 +43,7 @@ def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
     n = 200
     updated = fusion.update(observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1))
     assert slippery(belief(fusion, cell=1)) < 0.1
-    assert not Alerts(fusion).updated(updated.slots)
+    assert not Alerts(fusion).update(updated.slots)
 
 
 def test_a_vehicle_that_keeps_changing_its_mind_has_two_votes() -> None:

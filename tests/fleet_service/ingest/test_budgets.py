@@ -18,7 +18,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive import reading
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.retention import drop_checkpoints, forget_period
-from fleet_service.archive.witnesses import Witnesses, read
+from fleet_service.archive.witnesses import VehicleIds, read
 from fleet_service.ingest.budgets import FASTEST, STREAMS_AT_ONCE, Bucket, NewCells, Tracks
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
@@ -47,7 +47,7 @@ def months(now: int) -> tuple[int, int]:
     return at - SECOND, at + 2 * SECOND
 
 
-def test_one_car_is_one_witness_over_midnight_of_a_month_live_and_after_a_replay(tmp_path: Path) -> None:
+def test_one_car_is_one_witness_over_midnight_live_and_after_replay(tmp_path: Path) -> None:
     before, after = months(time.time_ns())
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq, at in enumerate((before, after), 1):
@@ -62,7 +62,7 @@ def test_one_car_is_one_witness_over_midnight_of_a_month_live_and_after_a_replay
         assert again.alerts == 0
 
 
-def test_a_start_that_lasts_over_midnight_of_a_month_links_none_of_its_pseudonyms(tmp_path: Path) -> None:
+def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) -> None:
     before, after = months(time.time_ns())
     sent = [batch("car-001", seq, at, [0.8]) for seq, at in enumerate((before, after), 1)]
     for again in (False, True):
@@ -80,9 +80,7 @@ def test_a_start_that_lasts_over_midnight_of_a_month_links_none_of_its_pseudonym
     assert table["boot"].to_numpy().min() >= 0
 
 
-def test_batches_of_an_archive_that_keeps_starts_as_they_were_sent_are_known_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batches_with_unhashed_starts_are_recognised_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = time.time_ns()
     sent = [message(batch("car-001", seq, now, [0.8])) for seq in (1, 2, 3)]
     with monkeypatch.context() as before:
@@ -109,20 +107,20 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
 
 
 def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
-    pseudonyms, witnesses, now = Pseudonyms(tmp_path), Witnesses(tmp_path), time.time_ns()
+    pseudonyms, witnesses, now = Pseudonyms(tmp_path), VehicleIds(tmp_path), time.time_ns()
     names = {f"car-{k:03}": number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
-    known = {p: witnesses.of(name, pseudonyms.month(now), p) for name, p in names.items()}
+    known = {p: witnesses.id_of(name, pseudonyms.month(now), p) for name, p in names.items()}
     assert read(tmp_path) == known
     path = next(tmp_path.glob("*.witnesses"))
     data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data)
     assert len(read(tmp_path)) == 2
-    assert Witnesses(tmp_path).of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
+    assert VehicleIds(tmp_path).id_of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
     assert path.stat().st_mode & 0o077 == 0
 
 
-def test_a_service_counts_damaged_lines_takes_them_out_and_writes_them_again(tmp_path: Path) -> None:
+def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(3):
@@ -243,7 +241,7 @@ def test_a_budget_fills_again() -> None:
     ]
 
 
-def test_of_a_month_nothing_is_left_that_names_a_vehicle_when_it_is_forgotten(tmp_path: Path) -> None:
+def test_a_forgotten_month_leaves_nothing_that_names_a_vehicle(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.ingest([message(batch("car-001", 1, now, [0.8]))], now)

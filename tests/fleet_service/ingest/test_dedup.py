@@ -1,4 +1,4 @@
-"""What was admitted, against a plain set as oracle; and how little of it is remembered."""
+"""Admitted batches against a plain set as oracle, and the bound on what is remembered."""
 
 from __future__ import annotations
 

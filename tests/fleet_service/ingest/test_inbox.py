@@ -54,7 +54,7 @@ def test_what_waits_is_bounded_in_messages_too_and_a_step_takes_so_many() -> Non
     assert [len(queue.drain(0.0)) for _ in range(4)] == [STEP_MESSAGES] * 3 + [0]
 
 
-def test_a_start_opens_each_segment_that_waits_for_compaction_twice_however_many_there_are(
+def test_start_opens_each_waiting_segment_twice_whatever_their_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     segments = 60
@@ -78,7 +78,7 @@ def test_a_start_opens_each_segment_that_waits_for_compaction_twice_however_many
     assert max(opened.values()) <= 2, "once for its rows, once for who sent them"
 
 
-def test_who_goes_on_sending_is_not_looked_up_again_and_days_that_are_over_are_forgotten(tmp_path: Path) -> None:
+def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         intake = engine._intake
 

@@ -1,4 +1,4 @@
-"""Who is listened to, and how much: buckets against the clock, names that are made up, long acknowledgements."""
+"""Rate limits: buckets against the clock, invented names, long acknowledgements."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_who_is_not_enrolled_is_not_looked_at() -> None:
     assert len(found) == 1
 
 
-def test_names_that_are_made_up_share_one_bucket_and_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_names_share_one_bucket_and_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "MOST_NAMES", 100)
     clock = Clock()
     found, _ = buckets(clock)
@@ -94,10 +94,10 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
         head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
-        acks.rejected("sim-001", head, 0, "x" * 120)
+        acks.record_rejected("sim-001", head, 0, "x" * 120)
     stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
     stream.vehicle, stream.boot = "sim-001", sent[0].boot
-    acks.durable((stream, seq) for seq in range(5001, 9001, 2))
+    acks.record_durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
     told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
     assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES
@@ -105,7 +105,7 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     assert [first for part in told for first, _ in part.durable] == list(range(5001, 9001, 2))
 
 
-def test_a_service_listens_to_those_on_its_list_and_drops_without_an_answer_what_is_too_much(
+def test_service_ignores_unlisted_vehicles_and_excess_data(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     file = tmp_path / "fleet.json"

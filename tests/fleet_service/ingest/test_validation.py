@@ -1,4 +1,4 @@
-"""What is let in: rules one by one, and bytes that mean harm."""
+"""Validation: rules one by one, and malicious bytes."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
     assert desk.take(Message(Kind.OBSERVATION, key("sim-001"), payload, wire.JSON)) == 0
 
 
-def test_a_batch_whose_records_cannot_be_used_is_refused_for_good_where_its_head_says_which_it_is(desk: Desk) -> None:
+def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
     """Else it would come again for ever, and stop its stream after 65 536 others."""
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]

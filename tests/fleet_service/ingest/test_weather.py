@@ -25,9 +25,9 @@ from fleet_service.ingest.weather import (
     WAITING,
     WeatherInbox,
     WeatherMessage,
-    archived,
+    archived_reports,
     files,
-    gather,
+    join_daily_files,
     read_file,
     retire,
 )
@@ -101,7 +101,7 @@ def beliefs(engine: Engine, now: int) -> np.ndarray:
     return engine.fusion.beliefs(np.arange(engine.fusion.size), now)
 
 
-def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_same_map(tmp_path: Path) -> None:
+def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> None:
     start = time.time_ns() - 7200 * SECOND
     path = file(
         tmp_path / "w.parquet", region=[grid.quadkey(REGION, grid.REGION_ZOOM)],
@@ -123,13 +123,13 @@ def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_
     now = start + 5000 * SECOND
     np.testing.assert_allclose(beliefs(again, now), beliefs(engine, now), atol=1e-6)
     assert np.abs(beliefs(dry, now) - beliefs(engine, now)).max() > 1e-3
-    assert len(archived(tmp_path / "a").time) == 2  # the file's row is known already
+    assert len(archived_reports(tmp_path / "a").time) == 2  # the file's row is known already
     assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(tables.WEATHER_ARCHIVE)
     again.close()
     dry.close()
 
 
-def test_reports_of_a_day_are_gathered_in_a_file_and_the_map_stays_whatever_a_checkpoint_knew(tmp_path: Path) -> None:
+def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -> None:
     start, root = time.time_ns() - 7200 * SECOND, tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
@@ -140,19 +140,19 @@ def test_reports_of_a_day_are_gathered_in_a_file_and_the_map_stays_whatever_a_ch
             if k == 3:
                 checkpoints.save(root, taken(engine))
         now = start + 5000 * SECOND
-        right, before = beliefs(engine, now), archived(root)
+        right, before = beliefs(engine, now), archived_reports(root)
     path = files(root)[2]
     shutil.copy(path, tmp_path / path.name)
-    assert (gather(root), gather(root), len(files(root))) == (5, 0, 1)
+    assert (join_daily_files(root), join_daily_files(root), len(files(root))) == (5, 0, 1)
     shutil.copy(tmp_path / path.name, path)  # a power loss before its name was gone
-    assert len(archived(root).time) == 7
+    assert len(archived_reports(root).time) == 7
     for kept in (1, 0):
         assert len(checkpoints.newest(root)) == kept
         with closing(Engine(ServiceConfig(), root)) as again:
             np.testing.assert_array_equal(beliefs(again, now), right)
         drop_checkpoints(root)
-    assert gather(root) == 1
-    assert {*archived(root).time.tolist()} == {*before.time.tolist()}
+    assert join_daily_files(root) == 1
+    assert {*archived_reports(root).time.tolist()} == {*before.time.tolist()}
     day = start // DAY_NS
     assert (retire(root, day - 2), len(files(root))) == (0, 1)
     assert (retire(root, day + 1), len(files(root))) == (1, 0)

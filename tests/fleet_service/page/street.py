@@ -89,5 +89,5 @@ def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def known(*parts: str) -> int:
-    """How many cells and headings are on the map when parts were driven."""
+    """Return the number of cells and headings on the map after parts were driven."""
     return sum(len(cells(PARTS[name])) * len(PARTS[name].headings) for name in parts or PARTS)

@@ -54,7 +54,7 @@ def town(path: Path) -> Path:
     return tiles_in(path, {(ZOOM, x, y): png(BLUE)})
 
 
-def test_rows_are_counted_from_the_south_in_the_file_and_from_the_north_by_who_asks(tmp_path: Path) -> None:
+def test_mbtiles_rows_count_from_the_south_and_requests_from_the_north(tmp_path: Path) -> None:
     of = base_map(str(tiles_in(tmp_path / "a.mbtiles", {(2, 1, 0): b"north", (2, 1, 3): b"south"})))
     assert of.file is not None
     assert (of.address, of.zooms, of.file.kind) == (OWN, (2, 2), "image/png")

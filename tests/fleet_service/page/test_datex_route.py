@@ -87,7 +87,7 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
 
 
 def pull(address: str) -> Callable[[], bytes]:
-    """What the page answers; NOTHING while it has nothing to say yet."""
+    """Return the page's answer; NOTHING while it has none yet."""
 
     def pulled() -> bytes:
         status, headers, body = ask(address, ROUTE)

@@ -47,7 +47,7 @@ def data(seen: Opened, name: str) -> str:
 
 
 def kinds(seen: Opened) -> list[int]:
-    """How many places of each kind were drawn."""
+    """Return the number of drawn places of each kind."""
     return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
 
 
@@ -68,7 +68,7 @@ def cell_of(part: str, index: int = 1) -> int:
 
 
 def read(seen: Opened, sector: int) -> dict[str, str]:
-    """What the panel says of one heading."""
+    """Return the panel's text of one heading."""
     found: dict[str, str] = seen.page.evaluate(
         "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
         ".map(one => [one.dataset.value, one.textContent]))",
@@ -77,7 +77,7 @@ def read(seen: Opened, sector: int) -> dict[str, str]:
     return found
 
 
-def test_all_cells_of_the_map_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningPage, drive: Drive) -> None:
+def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningPage, drive: Drive) -> None:
     drive("dry", "snow", "ice", "wet", "passed", "avenue")
     with shown(page) as seen:
         near(seen, cell_of("ice"), 17.2)
@@ -239,7 +239,7 @@ def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage)
 
 
 @pytest.mark.campaign
-def test_the_slider_shows_a_known_cell_as_it_was_and_two_moments_side_by_side(page: RunningPage, drive: Drive) -> None:
+def test_slider_shows_a_past_cell_and_two_moments_side_by_side(page: RunningPage, drive: Drive) -> None:
     drive("snow")
     until(lambda: kept(page.archive))
     before = kept(page.archive)[-1]

@@ -1,4 +1,4 @@
-"""What is painted, point by point: the unknown share, seams, guesses, a route, the world before any service spoke."""
+"""Painted points: the unknown share, seams, guesses, a route, the world before any service answered."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ALL: Final = """() => {
 }"""
 
 
-def test_the_share_that_is_unknown_is_seen_in_the_smallest_square_and_no_square_vanishes(page: RunningPage) -> None:
+def test_unknown_share_shows_in_the_smallest_square(page: RunningPage) -> None:
     with shown(page) as seen:
         for side in (3.3, 4.0, 4.7, 5.6, 7.9, 12.2):
             for unknown in (1, 60, 127, 253):
@@ -62,7 +62,7 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
 
 
 def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: RunningPage, drive: Drive) -> None:
-    """Of a tile, too, that has changed since it was first heard of."""
+    """Paint a tile that has changed since it was first received."""
     drive("dry")
     with shown(page) as seen:
         near(seen, cell_of("ice"))

@@ -36,7 +36,7 @@ def table() -> pa.Table:
     return cell_table(fusion, np.arange(fusion.size), START + 60 * 10**9)
 
 
-def test_a_record_is_at_most_half_a_step_off_in_mu_and_never_narrower_or_drier(table: pa.Table) -> None:
+def test_a_record_is_accurate_and_never_narrower_or_drier(table: pa.Table) -> None:
     found = records.of_table(table)
     place = (table["cell"].to_numpy() & 0x3FFF) * 4 + table["sector"].to_numpy()
     row = {key: k for k, key in enumerate(place.tolist())}
@@ -60,11 +60,9 @@ def test_a_bound_has_no_number_to_colour_by_whoever_sent_it(table: pa.Table) -> 
 
 
 @pytest.mark.parametrize("level", range(LEAST_LEVEL, CELL_LEVEL + 1))
-def test_an_ancestor_is_the_worst_of_what_was_measured_below_it_and_tells_the_unknown_share(
-    table: pa.Table, level: int
-) -> None:
+def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(table: pa.Table, level: int) -> None:
     cells = records.of_table(table)
-    found = records.worst(cells, level)
+    found = records.aggregate_worst(cells, level)
     shift = 2 * (CELL_LEVEL - level)
     assert len(np.unique(found["place"])) == len(found)
     for one in found:
@@ -85,7 +83,7 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
     for name, whole in (("mu", 170), ("lower", 160), ("upper", 180), ("basis", MEASURED)):
         cells[name] = whole
     cells[1234] = (0, 1234 * 4, 24, 14, 40, 254, MEASURED, 3, 0)
-    far = records.worst(cells, LEAST_LEVEL)
+    far = records.aggregate_worst(cells, LEAST_LEVEL)
     assert len(far) == 1
     assert (far["mu"][0], far["upper"][0], far["slippery"][0]) == (24, 40, 254)
 
@@ -93,12 +91,12 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
 def test_what_changed_laid_over_what_was_is_what_is(table: pa.Table) -> None:
     before, after = records.of_table(table)[:700], records.of_table(table)[300:].copy()
     after["mu"][::7] = 11
-    change = records.changed(before, after)
+    change = records.changed_records(before, after)
     held = {int(one["place"]): one for one in before} | {int(one["place"]): one for one in change}
     left = {place: one for place, one in held.items() if one["basis"] != GONE}
     assert left == {int(one["place"]): one for one in after}
     assert len(change) < len(before) + len(after)
-    assert len(records.changed(after, after)) == 0
+    assert len(records.changed_records(after, after)) == 0
 
 
 def test_a_cell_takes_thirteen_bytes(table: pa.Table) -> None:

@@ -43,7 +43,7 @@ def shares(found: dict[str, Any]) -> dict[str, float]:
     return {basis: length / found["length_m"] for basis, length in lengths.items()}
 
 
-def test_stretches_follow_each_other_and_what_nobody_measured_has_no_number() -> None:
+def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
     found = profile(ends(-20, 30), told())
     stretches = found["stretches"]
     assert stretches[0]["from_m"] == 0.0

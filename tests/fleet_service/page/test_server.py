@@ -27,7 +27,7 @@ from fleet_service.page.files import Files
 from fleet_service.page.health import values
 from fleet_service.page.records import HEAD
 from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from fleet_service.serve.encode import cell_table
 from schemas.config import ZenohSettings
 from tests.faults.processes import Part
@@ -106,7 +106,7 @@ def test_a_file_outside_the_page_and_another_hosts_name_are_refused(bare: str) -
     assert ask(bare, "/", Host="localhost:1")[0] == 200
 
 
-def test_a_file_comes_packed_where_the_browser_takes_it_and_not_again_where_it_has_it(bare: str) -> None:
+def test_file_is_compressed_if_accepted_and_not_sent_again(bare: str) -> None:
     _, plain, text = ask(bare, "/static/main.js")
     assert "content-encoding" not in plain
     _, packed, body = ask(bare, "/static/main.js", **{"Accept-Encoding": "gzip"})
@@ -221,7 +221,7 @@ def test_a_page_without_a_router_says_so(router: ZenohSettings) -> None:
 
 def test_a_slow_watcher_is_told_to_reload_and_nothing_else_piles_up() -> None:
     async def slow() -> list[bytes]:
-        world = HeldWorld()
+        world = MapMirror()
         watchers = Watchers(world, dict, most=1)
         stream = watchers.enter(WORLD)
         with pytest.raises(TooManyWatchersError):

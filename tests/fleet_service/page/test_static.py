@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fleet_service.page.files import SCRIPT
-from fleet_service.page.joined import joined
+from fleet_service.page.joined import bundle_modules
 from tests.house import ROOT
 
 
@@ -42,7 +42,7 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
         "export class Not {}\n",
         "b": 'import { ONE } from "./a.js";\nconst own = 41;\nexport const two = () => own + ONE;\n',
     }
-    assert joined(modules, "main") == (
+    assert bundle_modules(modules, "main") == (
         "const from_a = (() => {\nconst own = 1;\nconst ONE = own;\nfunction add(x, y) { return x + y; }\n"
         "class Not {}\nreturn { ONE, add };\n})();\n"
         "const from_b = (() => {\nconst { ONE } = from_a;\nconst own = 41;\nconst two = () => own + ONE;\n"
@@ -56,15 +56,15 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
 )
 def test_what_cannot_be_joined_is_said(text: str) -> None:
     with pytest.raises(ValueError, match="cannot be joined"):
-        joined({"main": text}, "main")
+        bundle_modules({"main": text}, "main")
     with pytest.raises(CycleError):
-        joined({"main": 'import { a } from "./main.js";\n'}, "main")
+        bundle_modules({"main": 'import { a } from "./main.js";\n'}, "main")
 
 
 def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
     static = ROOT / "fleet_service/page/static"
     modules = {path.stem: path.read_text() for path in static.glob("*.js")}
-    script = joined(modules, "main")
+    script = bundle_modules(modules, "main")
     assert all(f"const from_{name} = " in script for name in modules if name != "main")
     assert re.findall(r"<script[^>]*>", (static / "index.html").read_text()) == [
         f'<script type="module" src="/static/{SCRIPT}">'
@@ -72,7 +72,7 @@ def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)
-def test_a_module_is_short_enough_to_be_read_and_takes_nothing_from_elsewhere(path: Path) -> None:
+def test_page_modules_are_short_and_take_nothing_from_elsewhere(path: Path) -> None:
     text = path.read_text()
     assert text.count("\n") <= 400
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")

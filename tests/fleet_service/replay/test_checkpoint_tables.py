@@ -27,7 +27,7 @@ def stored(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
 
 
 @pytest.mark.parametrize("cut", [0, 1, 700, 1500])
-def test_a_fusion_from_its_checkpoint_goes_on_bit_for_bit_as_the_one_that_never_stopped(cut: int) -> None:
+def test_fusion_from_its_checkpoint_continues_bit_for_bit(cut: int) -> None:
     o = drive(11, 1500, 8.0 * 3600.0)  # longer than vehicles are remembered
     order = delayed(o, 100.0, 12)
     whole = Fusion(LATENESS_S)

@@ -120,8 +120,8 @@ def known(engine: Engine) -> dict[str, NDArray[Any]]:
 
 
 @pytest.mark.parametrize("oldest_s", [30 * DAY_S, DAY_S])
-def test_a_batch_that_is_too_old_to_come_again_is_not_fused_again_by_a_restart(tmp_path: Path, oldest_s: float) -> None:
-    """What was compacted after the checkpoint lies in one file with what it knows."""
+def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(tmp_path: Path, oldest_s: float) -> None:
+    """Restart after a compaction that joined old and new rows in one file."""
     config, now = ServiceConfig(oldest_s=oldest_s), time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
     with closing(Engine(config, tmp_path)) as engine:
@@ -139,7 +139,7 @@ def test_a_batch_that_is_too_old_to_come_again_is_not_fused_again_by_a_restart(t
         assert again.fusion.live.visits[: again.fusion.size].tolist() == [3]
 
 
-def test_what_is_known_is_bit_for_bit_the_same_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
+def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
     """Whatever comes late, in disorder, and last before the checkpoint."""
     rng, now = np.random.default_rng(3), time.time_ns()
     sent = []
@@ -221,7 +221,7 @@ def _set() -> threading.Event:
     return event
 
 
-def test_what_came_after_the_checkpoint_is_replayed_whatever_the_clock_said(tmp_path: Path) -> None:
+def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
     """The checkpoint's run was an hour ahead; then the clock is put right, and ice is found."""
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
@@ -242,7 +242,7 @@ def test_what_came_after_the_checkpoint_is_replayed_whatever_the_clock_said(tmp_
         np.testing.assert_allclose(beliefs(again, at), running, atol=1e-6)
 
 
-def test_a_compacted_file_that_reaches_over_the_checkpoint_is_not_replayed_twice(tmp_path: Path) -> None:
+def test_compacted_file_across_the_checkpoint_is_not_replayed_twice(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
@@ -264,5 +264,5 @@ def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None
         checkpoints.begin(path)
     with pytest.raises(InputError, match="died at once"):
         checkpoints.load(path)
-    checkpoints.survived(tmp_path)
+    checkpoints.mark_survived(tmp_path)
     checkpoints.load(path)

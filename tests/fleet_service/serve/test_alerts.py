@@ -23,14 +23,14 @@ def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
     raised = []
     for k, vehicle in enumerate(vehicles):
         updated = fusion.update(observations([10.0 * k], [vehicle], value([0.2])))
-        raised.append(any(alert.raised for alert in alerts.updated(updated.slots)))
+        raised.append(any(alert.raised for alert in alerts.update(updated.slots)))
     return fusion, alerts, raised
 
 
 def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
     _, alerts, raised = icy([1, 2, 3, 4])
     assert raised == [False, True, False, False]
-    assert alerts.raised == {0}
+    assert alerts.slots == {0}
 
 
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
@@ -42,7 +42,7 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
     alerts, slots = Alerts(fusion), np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
-    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.updated(slots)}
+    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
     known = {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
     assert told.items() <= known.items()
     assert {cell for cell, p in known.items() if p > 0.95} <= set(told)  # evidence below 1 nat is no witness
@@ -52,31 +52,31 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
 def test_one_vehicle_with_many_unexcited_others_raises_nothing() -> None:
     fusion, alerts, raised = icy([1] * 20)
     updated = fusion.update(observations(300.0 + np.arange(20), np.arange(2, 22), at_least(np.full(20, 0.1))))
-    assert not alerts.updated(updated.slots)
+    assert not alerts.update(updated.slots)
     assert not any(raised)
     assert fusion.live.vehicles[0] == 21
 
 
 def test_an_alert_that_nobody_confirms_ends_by_itself_with_the_reason() -> None:
     _, alerts, _ = icy([1, 2, 3])
-    assert not alerts.faded(START + HOUR // 4)
-    (ended,) = alerts.faded(START + 6 * HOUR)
+    assert not alerts.expire(START + HOUR // 4)
+    (ended,) = alerts.expire(START + 6 * HOUR)
     assert (ended.cell, ended.raised, ended.reason) == (CELL, False, "no visit has confirmed it for too long")
-    assert not alerts.faded(START + 7 * HOUR)
+    assert not alerts.expire(START + 7 * HOUR)
 
 
 def test_between_the_two_limits_an_alert_stays() -> None:
     fusion, alerts, _ = icy([1, 2, 3])
     updated = fusion.update(observations([100.0], [4], value([0.85])))
-    assert not alerts.updated(updated.slots)
-    assert alerts.raised == {0}
+    assert not alerts.update(updated.slots)
+    assert alerts.slots == {0}
 
 
 def test_old_ice_does_not_corroborate_new_ice() -> None:
     fusion, alerts, _ = icy([1, 2])
-    alerts.faded(START + 6 * HOUR)
+    alerts.expire(START + 6 * HOUR)
     updated = fusion.update(observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2])))
-    assert not alerts.updated(updated.slots)
+    assert not alerts.update(updated.slots)
 
 
 def called(
@@ -89,8 +89,8 @@ def called(
     for k, vehicle in enumerate([*vehicles, *others]):
         later = k >= len(vehicles)  # by then the first ones are known
         updated = fusion.update(observations([20.0 * k + wait * later], [vehicle], value([then if later else mu])))
-        alerts.updated(updated.slots)
-        under.append(bool(alerts.raised))
+        alerts.update(updated.slots)
+        under.append(bool(alerts.slots))
     return fusion, under[len(vehicles) :]
 
 
@@ -106,9 +106,7 @@ def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> No
 
 
 @pytest.mark.parametrize(("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)])
-def test_neighbours_confirm_two_who_found_ice_where_their_reports_outweigh_what_was(
-    drivers: int, found: int, raised: bool
-) -> None:
+def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(drivers: int, found: int, raised: bool) -> None:
     fusion, (before, here, behind) = Fusion(120.0), grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
     for cell in (before, here, behind):  # of a road where more grip was used than ice has
         seconds = 20.0 * np.arange(drivers)
@@ -120,7 +118,7 @@ def test_neighbours_confirm_two_who_found_ice_where_their_reports_outweigh_what_
     own, believed = float(fusion.slippery(slots)[0]), float(fusion.believed(slots)[0] @ SLIPPERY_SHARE)
     assert own < 0.5
     assert believed > RAISE_ABOVE or not found
-    assert bool(Alerts(fusion).updated(slots)) is raised is (own > LIKELY and found == 2)
+    assert bool(Alerts(fusion).update(slots)) is raised is (own > LIKELY and found == 2)
 
 
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
@@ -128,9 +126,9 @@ def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None
         fusion, alerts, _ = icy([1, 2, 3])
         updated = fusion.update(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))  # the belief turns
         later = fusion.update(observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used))))
-        alerts.updated(updated.slots)
-        alerts.updated(later.slots)
-        assert bool(alerts.raised) is stands
+        alerts.update(updated.slots)
+        alerts.update(later.slots)
+        assert bool(alerts.slots) is stands
 
 
 @pytest.mark.parametrize(("wait", "needed"), [(400.0, 5), (700.0, 4)])
@@ -140,7 +138,7 @@ def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(wait: float
     assert under == [True] * (needed - 1) + [False] * (7 - needed)
 
 
-def test_who_lost_its_trust_corroborates_nothing_of_what_it_reported_before() -> None:
+def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
     fusion, _ = called(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
     assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
@@ -158,7 +156,7 @@ def test_an_alert_ends_only_when_grip_is_sure() -> None:
     ended = []
     for vehicle in range(10, 18):
         updated = fusion.update(observations([200.0 + 10.0 * vehicle], [vehicle], value([0.85])))
-        ended += alerts.updated(updated.slots)
+        ended += alerts.update(updated.slots)
     (only,) = ended
     assert (only.raised, only.reason) == (False, "later visits found grip")
     assert only.p_slippery < 0.05

@@ -1,4 +1,4 @@
-"""What an unvisited cell borrows: less with the distance, never surer than whom it borrows from, and marked."""
+"""Borrowed cells: less with the distance, never surer than their sources, and marked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """What thirty cells in a row borrow, in all tiles, when three vehicles gave a value of some of them."""
+    """Return the beliefs that thirty cells in a row borrow, in all tiles, when three vehicles gave a value of some of
+    them."""
     fusion = Fusion(120.0)
     for place, mu in visited.items():
         o = observations(np.arange(3) * 2.0, np.arange(3), value(np.full(3, mu)), cell=int(EAST[place]))

@@ -1,4 +1,4 @@
-"""What the public sees: cells of enough vehicles, and how hard one may brake on them."""
+"""Public view: cells of enough vehicles, and their safe deceleration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fleet_service.archive.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
-from fleet_service.serve.view import CellView, coarse
+from fleet_service.serve.view import CellView, coarsen
 from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
@@ -106,10 +106,10 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
     cells = CellView(
         zeros, zeros, np.zeros((len(counts), 32)), zeros.astype(np.float32), counts, counts, zeros, zeros, zeros > 0
     )
-    seen = coarse(cells)
+    seen = coarsen(cells)
     assert (seen.vehicles <= counts).all()
     assert (seen.vehicles >= 0.39 * counts).all()
-    assert (coarse(seen).vehicles == seen.vehicles).all()
+    assert (coarsen(seen).vehicles == seen.vehicles).all()
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
@@ -168,7 +168,7 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
         o = observations(np.arange(40) * 0.1, who, value(np.full(40, 0.8)))
         o = replace(o, time=o.time + turn * PART_NS)
         fusion.update(o)
-        visitors.heard(o)
+        visitors.add(o)
         now = int(o.time[-1])
     slots = np.arange(fusion.size)
     assert 40 < visitors.count(slots, now)[0] <= 64
@@ -179,7 +179,7 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
     assert Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist() == []
 
 
-def test_cells_that_nobody_visits_for_a_week_are_dropped_by_the_service_and_by_a_restart(start: Start) -> None:
+def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start) -> None:
     engine, now = start(1), time.time_ns()
     names, alone = [f"sim-{k:03}" for k in range(4)], LATITUDE - 0.002
     old = now - 8 * 86_400 * SECOND
@@ -196,7 +196,7 @@ def test_cells_that_nobody_visits_for_a_week_are_dropped_by_the_service_and_by_a
     at = now + 601 * SECOND
     (row,) = [one for one in rows(engine, at) if one["cell"] == CELL]
     assert row["vehicles"] == 8
-    assert [alert.cell for alert in engine.repeated(9)] == [ice[0].cell]
+    assert [alert.cell for alert in engine.alerts_to_repeat(9)] == [ice[0].cell]
     hear(engine, "sim-020", now=at + SECOND)
     shown = {one["cell"]: one["vehicles"] for one in rows(engine, at + 2 * SECOND)}
     engine.close()

@@ -36,7 +36,7 @@ def texts(session: zenoh.Session, selector: str) -> list[str]:
 
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
 @pytest.mark.parametrize("parameters", ["", "?at=2026-01-31T07:00:00Z"], ids=["now", "past"])
-def test_an_answer_that_fails_on_the_way_is_an_error_and_the_next_one_is_answered(
+def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
     session: zenoh.Session, failure: Exception, parameters: str
 ) -> None:
     turns: list[int] = []
@@ -62,7 +62,7 @@ def test_an_answer_that_fails_on_the_way_is_an_error_and_the_next_one_is_answere
     queryable.undeclare()
 
 
-def test_a_question_whose_answer_would_be_too_large_is_refused_with_the_way_to_ask(session: zenoh.Session) -> None:
+def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.Session) -> None:
     key, counts, asked = (
         keys.map_key(TILE),
         Counter[str](),

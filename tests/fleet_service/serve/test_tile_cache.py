@@ -22,7 +22,7 @@ NOW = START + 60 * SECOND
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
     """One visit, noted as the engine does."""
-    state.changed(state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots)
+    state.mark_changed(state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots)
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state:
     assert made.shown(TILE, NOW - 1) is not later  # the clock jumped back
 
 
-def test_a_change_is_seen_at_once_when_it_was_acknowledged_and_within_a_second_anyway(state: MapState) -> None:
+def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
     assert vehicles(made, NOW) == [1]
     visit(state, 2)
@@ -93,7 +93,7 @@ def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState
     assert (made.columns["vehicles"] == before).all()
 
 
-def test_a_box_gets_exactly_the_cells_that_it_touches_wherever_its_borders_lie() -> None:
+def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
     state, rng = MapState(Fusion(120.0)), np.random.default_rng(0)
     for vehicle in (1, 2):
         for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):

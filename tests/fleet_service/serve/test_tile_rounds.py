@@ -33,7 +33,7 @@ class Made:
         return len(self.puts) - before
 
 
-def test_a_turn_never_puts_more_tiles_than_its_share_and_every_tile_has_its_turn() -> None:
+def test_a_turn_puts_at_most_its_share_and_every_tile_has_its_turn() -> None:
     made = Made()
     made.changed = set(range(1000))
     turns = [made.turn(0.01) for _ in range(1000)]
@@ -41,7 +41,7 @@ def test_a_turn_never_puts_more_tiles_than_its_share_and_every_tile_has_its_turn
     assert sorted(tile for tile, _ in made.puts) == list(range(1000))
 
 
-def test_rounds_for_which_there_is_no_time_are_counted_and_what_changed_meanwhile_is_in_the_next() -> None:
+def test_skipped_tile_rounds_are_counted_and_changes_come_in_the_next() -> None:
     made = Made()
     made.changed = set(range(300))  # three seconds of tiles alone, and as much of the rest of the turns
     while len(made.puts) < 300:
@@ -67,7 +67,7 @@ def test_when_somebody_passed_does_not_move_the_moment_of_a_put() -> None:
     assert len(set(moments)) == 1
 
 
-def test_a_worker_that_stood_still_begins_one_round_and_says_how_many_it_missed() -> None:
+def test_a_stalled_worker_begins_one_round_and_counts_the_missed_ones() -> None:
     made = Made()
     made.changed = {7}
     made.turn(5.5)

@@ -1,4 +1,4 @@
-"""What a service that was followed still puts: it takes the place of nothing that its successor put."""
+"""Late uploads of a service that lost its lease replace nothing of its successor."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections import Counter
 from pathlib import Path
 
 from fleet_service.archive import witnesses
-from fleet_service.archive.witnesses import Witnesses
+from fleet_service.archive.witnesses import VehicleIds
 from fleet_service.fusion import Fusion
-from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, gather
-from fleet_service.ingest.weather import archived as archived_weather
+from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, join_daily_files
+from fleet_service.ingest.weather import archived_reports as archived_weather
 from schemas import keys, weather, wire
 from tests.buckets import BucketServer
 from tests.fleet_service.shards.test_successor import Machine
@@ -21,8 +21,8 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: Bucke
     month, known = "2026-11", dict[int, int]()
 
     def meets(one: Machine, pseudonym: int) -> None:
-        list_ = Witnesses(one.root / "keys")
-        known[pseudonym] = list_.of(f"car-{pseudonym}", month, pseudonym)
+        list_ = VehicleIds(one.root / "keys")
+        known[pseudonym] = list_.id_of(f"car-{pseudonym}", month, pseudonym)
         list_.sync()
 
     def hears(one: Machine, region: int) -> None:
@@ -36,22 +36,22 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: Bucke
     for number in (1, 2):
         meets(one, number)
         hears(one, number)
-    one.copy.settle([])
-    one.copy.follow()
+    one.copy.upload_segments([])
+    one.copy.sync()
     one.freeze()
     two = Machine(tmp_path / "two", bucket)
     for number in (3, 4):
         meets(two, number)
         hears(two, number)
-    gather(two.root)
-    two.copy.settle([])
-    two.copy.follow()
+    join_daily_files(two.root)
+    two.copy.upload_segments([])
+    two.copy.sync()
     known_there = dict(known)
     meets(one, 5)  # the frozen one wakes
-    gather(one.root)
-    one.copy.settle([])
+    join_daily_files(one.root)
+    one.copy.upload_segments([])
     one.copy._may, one.copy._alone = lambda: True, None  # as if it had been frozen right behind its looks
-    one.copy.follow()
+    one.copy.sync()
     found = restored(tmp_path / "new", bucket)
     held = witnesses.read(found / "keys")
     assert {name: held.get(name) for name in known_there} == known_there

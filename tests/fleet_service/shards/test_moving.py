@@ -14,9 +14,9 @@ import zenoh
 from fleet_service.app.service import Service
 from fleet_service.archive.bucket import ObjectBucket
 from fleet_service.cli import main
-from fleet_service.shards.holding import hold
+from fleet_service.shards.holding import acquire
 from fleet_service.shards.lease import Lease
-from fleet_service.shards.serving import standing_by
+from fleet_service.shards.serving import standby_signs
 from schemas.config import ServiceConfig, ZenohSettings
 from tests.buckets import BucketServer
 from tests.fleet_service.app.test_copy import BATCHES, known, reports
@@ -54,8 +54,8 @@ class Machine:
         return self.service
 
     def _run(self) -> None:
-        with standing_by(self._config, self.stop) as signs:
-            holding = hold(self._config, self._root, self.stop, self.lines.append, signs)
+        with standby_signs(self._config, self.stop) as signs:
+            holding = acquire(self._config, self._root, self.stop, self.lines.append, signs)
         if holding is not None:
             self.service = Service(self._config, self._root, self.lines.append, holding)
             self.service.run(self.stop)
@@ -127,12 +127,12 @@ def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(bucket: 
     lease_s = 3.0
     one, two, three = (Lease(name, store, name, lease_s) for name in ("one", "two", "three"))
     assert one._take(None, lambda: 0, threading.Event())
-    one.end("two")
+    one.release("two")
     stop = threading.Event()
     threading.Timer(lease_s / 3, stop.set).start()
     assert not three.wait(stop, print, lambda: 0, None)
     assert two.wait(threading.Event(), print, lambda: 0, None)
     assert two.former == ("one",)
-    two.end("one")
+    two.release("one")
     assert three.wait(threading.Event(), print, lambda: 0, None)  # in the end anybody may
     assert three.former == ("one", "two")

@@ -20,7 +20,7 @@ import zenoh
 from fleet_service.app.service import Service
 from fleet_service.cli import main
 from fleet_service.client import map_client, watching
-from fleet_service.shards.serving import claimed, rivals, serving
+from fleet_service.shards.serving import announce_regions, claim_regions, rival_tokens
 from schemas import grid, keys, query, regions
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -45,7 +45,7 @@ CARS = 3
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
     """Begin with no token: the router may hear of the end of the test before after that test."""
-    until(lambda: not tokens.standing(session))
+    until(lambda: not tokens.active_tokens(session))
 
 
 def visits(vehicle: str) -> list[Batch]:
@@ -81,14 +81,14 @@ def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
     return map_client.ask(router, parameters)
 
 
-def test_answers_over_three_services_are_whole_in_order_and_say_what_is_missing(
+def test_answers_over_three_services_are_ordered_and_name_gaps(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     box = f"{WEST - 0.05},{SOUTH},{EAST + 0.05},{NORTH}"
     dead = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
     lines: list[str] = []
     stop = threading.Event()
-    wishes = watching.Wishes(box, as_json=True)
+    wishes = watching.WatchOptions(box, as_json=True)
     watcher = threading.Thread(target=watching.watch, args=(router, wishes, stop, lines.append))
     try:
         with three(router, tmp_path) as services:
@@ -141,26 +141,26 @@ def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tm
         with (
             pytest.raises(InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"),
             zenoh_session(router) as other,
-            claimed(other, name, NAMES[1:2], threading.Event()),
+            claim_regions(other, name, NAMES[1:2], threading.Event()),
         ):
             pass
 
     with running(router, tmp_path / "one", name="first", regions=[wide]), ThreadPoolExecutor() as both:
         list(both.map(refused, ("first", "second")))  # also one of the same name, on another machine
-    with zenoh_session(router) as other, claimed(other, "second", NAMES[1:2], threading.Event()) as mine:
-        assert tokens.standing(other) == set()
+    with zenoh_session(router) as other, claim_regions(other, "second", NAMES[1:2], threading.Event()) as mine:
+        assert tokens.active_tokens(other) == set()
         with (
             pytest.raises(InputError, match="served by second already"),
             zenoh_session(router) as third,
-            claimed(third, "third", NAMES[1:2], threading.Event()),
+            claim_regions(third, "third", NAMES[1:2], threading.Event()),
         ):
             pass
-        with serving(other, mine):
-            assert tokens.standing(other) == set(mine)
-        assert rivals(mine, tokens.standing(other)) == []
+        with announce_regions(other, mine):
+            assert tokens.active_tokens(other) == set(mine)
+        assert rival_tokens(mine, tokens.active_tokens(other)) == []
 
 
-def test_a_region_is_said_to_be_served_only_while_all_that_is_asked_is_answered(
+def test_region_is_announced_only_while_queries_are_answered(
     router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
@@ -169,14 +169,14 @@ def test_a_region_is_said_to_be_served_only_while_all_that_is_asked_is_answered(
     @contextmanager
     def looked(service: Service, session: zenoh.Session) -> Iterator[None]:
         with answering(service, session):
-            seen.append(tokens.standing(session))
+            seen.append(tokens.active_tokens(session))
             yield
-            until(lambda: not tokens.standing(session))
+            until(lambda: not tokens.active_tokens(session))
             seen.append(set())
 
     monkeypatch.setattr(Service, "_declared", looked)
     with running(router, tmp_path / "one", name="first", regions=NAMES[:1]), zenoh_session(router) as other:
-        assert {token.service for token in tokens.standing(other)} == {"first"}
+        assert {token.service for token in tokens.active_tokens(other)} == {"first"}
     assert seen == [set(), set()]
 
 
@@ -186,12 +186,12 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
     with zenoh_session(router) as other, zenoh_session(router) as third:
-        mine = frozenset({keys.Served(NAMES[1], "late", "1f")})
-        coming = serving(other, mine)
+        mine = frozenset({keys.ServiceToken(NAMES[1], "late", "1f")})
+        coming = announce_regions(other, mine)
 
         def come(*_: object) -> bool:
             coming.__enter__()
-            until(lambda: tokens.standing(third) == mine)
+            until(lambda: tokens.active_tokens(third) == mine)
             return True
 
         with monkeypatch.context() as meanwhile:
@@ -231,22 +231,22 @@ def drive_one(session: zenoh.Session, service: Running) -> None:
 
 
 @pytest.mark.parametrize("comes_back", [False, True])
-def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed_it(
+def test_a_leaving_service_may_be_asked_instead_of_its_successor(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, comes_back: bool
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
-    frozen, follows = (frozenset({keys.Served(NAMES[1], name, "1f")}) for name in ("frozen", "follows"))
-    with zenoh_session(router) as other, zenoh_session(router) as third, serving(other, follows):
-        held, again = serving(other, frozen), serving(other, frozen)
+    frozen, follows = (frozenset({keys.ServiceToken(NAMES[1], name, "1f")}) for name in ("frozen", "follows"))
+    with zenoh_session(router) as other, zenoh_session(router) as third, announce_regions(other, follows):
+        held, again = announce_regions(other, frozen), announce_regions(other, frozen)
         held.__enter__()
-        until(lambda: len(tokens.standing(third)) == 2)
+        until(lambda: len(tokens.active_tokens(third)) == 2)
 
         def replies(*_: object) -> Iterator[tuple[str, bytes]]:
             held.__exit__(None, None, None)
-            until(lambda: len(tokens.standing(third)) == 1)
+            until(lambda: len(tokens.active_tokens(third)) == 1)
             if comes_back:  # a frozen one wakes
                 again.__enter__()
-                until(lambda: len(tokens.standing(third)) == 2)
+                until(lambda: len(tokens.active_tokens(third)) == 2)
             return iter(())
 
         with monkeypatch.context() as meanwhile:
@@ -257,18 +257,18 @@ def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed
             again.__exit__(None, None, None)
 
 
-def test_of_a_service_that_is_killed_while_it_is_asked_the_token_may_fall_after_the_answer(
+def test_token_of_a_killed_service_may_fall_after_the_answer(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
     with zenoh_session(router) as other, zenoh_session(router) as third:
-        held = serving(other, frozenset({keys.Served(NAMES[1], "killed", "1f")}))
+        held = announce_regions(other, frozenset({keys.ServiceToken(NAMES[1], "killed", "1f")}))
         held.__enter__()
-        until(lambda: len(tokens.standing(third)) == 1)
+        until(lambda: len(tokens.active_tokens(third)) == 1)
 
         def falls(_: float) -> None:
             held.__exit__(None, None, None)
-            until(lambda: not tokens.standing(third))
+            until(lambda: not tokens.active_tokens(third))
 
         monkeypatch.setattr(map_client, "replies", lambda *_: iter(()))
         monkeypatch.setattr(map_client, "time", SimpleNamespace(sleep=falls))
@@ -277,7 +277,7 @@ def test_of_a_service_that_is_killed_while_it_is_asked_the_token_may_fall_after_
 
 @contextmanager
 def zenoh_session(router: ZenohSettings) -> Iterator[zenoh.Session]:
-    with map_client.joined(router) as opened:
+    with map_client.open_connected(router) as opened:
         yield opened
 
 
@@ -296,7 +296,7 @@ def test_what_nobody_serves_is_said_in_as_few_regions_as_there_are() -> None:
 
 def test_a_token_says_its_region_and_a_stranger_says_none() -> None:
     for region in ("*/*/*", NAMES[0], "1202/*/*"):
-        told = keys.Served(region, "shard-0", "1f")
+        told = keys.ServiceToken(region, "shard-0", "1f")
         assert keys.parse_served(told.key) == told
     for key in ("gripmap/v1/shard/shard-0", f"{keys.SERVES}/1202/all/x/a/b", f"{keys.SERVES}/1/2/3", keys.SERVES):
         with pytest.raises(InputError):

@@ -17,9 +17,9 @@ import zenoh
 from fleet_service.archive import compaction, segments
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.log import SegmentLog
-from fleet_service.shards.holding import Holding, alone, hold
+from fleet_service.shards.holding import Ownership, acquire, open_exclusive
 from fleet_service.shards.lease import Lease, holder_of
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
@@ -74,7 +74,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         one.to_router.mend()
         if how not in {"killed", "stopped"}:  # cut from the bucket, it hears of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
-            assert one.said("followed: ")
+            assert one.said("lease lost to another service")
         one.to_bucket.mend()
         one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
         one.part.line_with("standby: ")
@@ -88,7 +88,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 
 
 def driven(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
-    """Whether all is acknowledged; what is not is sent again each second, as spools do."""
+    """Return True if all is acknowledged; the rest is sent again each second, as outboxes do."""
     last = [0.0]
 
     def done() -> bool:
@@ -143,13 +143,13 @@ class Machine:
         self.config = ServiceConfig.model_validate(told)
         there = (lambda: True, lambda _: False, lambda: None)  # it reaches a router, and no token stands
         signs = there if standby else None
-        held = hold(self.config, root, threading.Event(), say, signs)
+        held = acquire(self.config, root, threading.Event(), say, signs)
         assert held is not None
-        self.holding: Holding = held
+        self.holding: Ownership = held
         self.log: SegmentLog[int] = SegmentLog(root, self.config.name, held.copy, held.epoch)
 
     @property
-    def copy(self) -> Copy:
+    def copy(self) -> BucketReplica:
         assert self.holding.copy is not None
         return self.holding.copy
 
@@ -187,15 +187,15 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketSe
     assert not acknowledges(one)
     compact(one.root)
     with pytest.raises(CopyError):
-        one.copy.follow()
+        one.copy.sync()
     one.copy._may = lambda: True  # as if it had been frozen right behind the look at its lease
     with pytest.raises(CopyError, match="another service has the lease"):
-        one.copy.follow()
+        one.copy.sync()
     names = bucket.objects()
     assert any(name.startswith("observations/") for name in names)
     assert sum(name.startswith("inbox/") for name in names) == 4  # nothing was deleted
     compact(two.root)
-    two.copy.follow()
+    two.copy.sync()
     for root in (two.root, restored(tmp_path / "new", bucket)):
         assert sorted(rows_in(root, Kind.OBSERVATION)) == sorted(before)
     two.close()
@@ -209,13 +209,11 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketSe
     back.close()
 
 
-def test_a_folder_that_was_served_without_its_bucket_is_not_made_what_the_bucket_is(
-    bucket: BucketServer, tmp_path: Path
-) -> None:
+def test_folder_served_without_its_bucket_is_not_synchronised(bucket: BucketServer, tmp_path: Path) -> None:
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
     one.close()
-    alone(ServiceConfig(), one.root).close()
+    open_exclusive(ServiceConfig(), one.root).close()
     two = Machine(tmp_path / "two", bucket)
     two.close()
     with pytest.raises(InputError, match="is no archive of"):
@@ -230,7 +228,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
     with monkeypatch.context() as killed:  # between the disk and the bucket
-        killed.setattr(one.copy, "settle", lambda _: None)
+        killed.setattr(one.copy, "upload_segments", lambda _: None)
         one.write(1)
     has_read, goes_on, place = threading.Event(), threading.Event(), compaction._place
 
@@ -259,15 +257,13 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     goes_on.set()
     for thread in (still, start):
         thread.join(PATIENCE_S)
-    back[0].copy.follow()
+    back[0].copy.sync()
     for root in (one.root, restored(tmp_path / "new", bucket)):
         assert len(rows_in(root, Kind.OBSERVATION)) == 5
     back[0].close()
 
 
-def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_standby(
-    bucket: BucketServer, tmp_path: Path
-) -> None:
+def test_start_without_bucket_ends_or_waits_as_a_standby(bucket: BucketServer, tmp_path: Path) -> None:
     bucket.stop()
     with pytest.raises(InputError, match="cannot be used .* see that it is reached"):
         Machine(tmp_path / "one", bucket, standby=False)
@@ -283,7 +279,7 @@ def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_stan
 
 
 @pytest.mark.campaign
-def test_a_standby_is_ready_for_systemd_gives_signs_of_life_and_shows_that_it_does_not_serve(
+def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
     router: ZenohSettings, bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     holder = Machine(tmp_path / "one", bucket)
@@ -337,7 +333,7 @@ def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended")
 @pytest.mark.parametrize("lease_s", [4.0, 40.0])
-def test_half_a_lease_after_a_renewal_began_nothing_is_acknowledged_any_more(
+def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float
 ) -> None:
     now = [100.0]

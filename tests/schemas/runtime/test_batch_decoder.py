@@ -45,7 +45,7 @@ def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobu
 
 
 def agrees(kind: Kind, payload: bytes) -> bool:
-    """Whether the reader understands the bytes; if so, it has read what the module reads, or this fails."""
+    """Return True if the scanner understands the bytes; fail if it then reads something else than the library."""
     data = np.frombuffer(payload, np.uint8)
     found = walk(kind, data, np.array([len(payload)]))
     if not found.understood[0]:
@@ -140,7 +140,7 @@ def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> Non
     assert with_error.indices[-1] == 2
 
 
-def test_a_message_with_unknown_fields_columns_apart_or_unpacked_is_read_all_the_same() -> None:
+def test_unknown_fields_and_unpacked_columns_are_read() -> None:
     message = _example()
     plain = decode(message.SerializeToString(), "", Kind.OBSERVATION)
     unpacked = b"".join(bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", v) for v in (3.0, 4.0))
@@ -150,7 +150,7 @@ def test_a_message_with_unknown_fields_columns_apart_or_unpacked_is_read_all_the
     assert odd.columns["health"].tolist() == [-1, 2]
 
 
-def test_a_name_that_is_not_ascii_is_read_by_the_module_and_a_broken_one_refused() -> None:
+def test_non_ascii_names_go_to_the_library_and_broken_ones_are_refused() -> None:
     message = _example()
     message.vehicle = "müller"
     payload = message.SerializeToString()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.runtime.durable import draft_of, make_folder, written
+from schemas.runtime.durable import draft_of, make_folder, open_durably
 
 
 def test_a_file_has_its_name_when_it_is_whole_and_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -25,11 +25,11 @@ def test_a_file_has_its_name_when_it_is_whole_and_synced(tmp_path: Path, monkeyp
     monkeypatch.setattr(os, "fsync", seen_fsync)
     monkeypatch.setattr(Path, "rename", seen_rename)
     path = tmp_path / "a"
-    with written(path) as file:
+    with open_durably(path) as file:
         file.write(b"one")
         assert not path.exists()
     assert order == ["file", "name", "folder"]
-    with written(path, named=False) as file:
+    with open_durably(path, named=False) as file:
         file.write(b"two")
     assert order[3:] == ["file", "name"]
     assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"two", ["a"])
@@ -41,7 +41,7 @@ def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseExcepti
     path.write_bytes(b"old")
 
     def half() -> None:
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(b"new")
             raise error
 
@@ -50,10 +50,10 @@ def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseExcepti
     assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"old", ["a"])
 
 
-def test_a_secret_is_never_readable_by_others_not_even_in_a_draft_that_was_left(tmp_path: Path) -> None:
+def test_a_secret_is_never_readable_by_others_even_in_a_draft(tmp_path: Path) -> None:
     path = tmp_path / "key"
     draft_of(path).write_bytes(b"of a process that died, open to all")
-    with written(path, 0o600) as file:
+    with open_durably(path, 0o600) as file:
         assert os.fstat(file.fileno()).st_mode & 0o777 == 0o600
     assert path.stat().st_mode & 0o777 == 0o600
 

@@ -24,7 +24,7 @@ from schemas.runtime.figures import Figure, commit, markdown, write
         (Figure("a", float("nan"), "s"), False),
     ],
 )
-def test_a_figure_holds_on_the_right_side_of_its_bar_and_never_when_missing(figure: Figure, holds: bool) -> None:
+def test_figure_holds_on_the_right_side_and_never_when_missing(figure: Figure, holds: bool) -> None:
     assert figure.holds is holds
 
 

@@ -28,7 +28,7 @@ FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0));
 
 
 def run(folder: Path, factor: str, before: str = "") -> str:
-    """What outer(1.0) gives in a new process, with `inner` multiplying by `factor`."""
+    """Return the result of outer(1.0) in a new process, with `inner` multiplying by `factor`."""
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
     source = Path(__file__).parents[3] / "schemas"
@@ -61,7 +61,7 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("place", ["/proc/nowhere", ""])
-def test_without_a_cache_that_can_be_written_kernels_are_compiled_at_each_start(tmp_path: Path, place: str) -> None:
+def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, place: str) -> None:
     """A service account without a home, a read-only container: no traceback, and nothing left in places of others."""
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()

@@ -1,4 +1,4 @@
-"""What a scraper and an operator's programs see: real HTTP on loopback, and lines of JSON."""
+"""Metrics and health for a scraper and for programs: real HTTP on loopback, and lines of JSON."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from schemas.errors import InputError
-from schemas.runtime.metrics import Metric, gauge, serving
-from schemas.runtime.process import Line, line_logger, log_as
+from schemas.runtime.metrics import Metric, gauge, serve_metrics
+from schemas.runtime.process import LogLine, line_logger, log_as
 
 HOSTILE = 'a"b\\c\nd<script>'
 
@@ -36,8 +36,8 @@ def fetch(address: str) -> tuple[int, str, str]:
             return error.code, error.headers["Content-Type"], error.read().decode()
 
 
-def test_values_are_read_by_the_formats_own_parser_whatever_their_labels_hold() -> None:
-    with serving("127.0.0.1", 0, read, list) as address:
+def test_metric_values_survive_the_formats_own_parser() -> None:
+    with serve_metrics("127.0.0.1", 0, read, list) as address:
         status, form, text = fetch(f"{address}/metrics")
     families = {family.name: family for family in text_string_to_metric_families(text)}
     assert status == 200
@@ -49,7 +49,7 @@ def test_values_are_read_by_the_formats_own_parser_whatever_their_labels_hold() 
 
 def test_health_follows_the_troubles() -> None:
     troubles: list[str] = []
-    with serving("127.0.0.1", 0, read, lambda: troubles) as address:
+    with serve_metrics("127.0.0.1", 0, read, lambda: troubles) as address:
         assert fetch(f"{address}/healthz")[0] == 200
         troubles.append("the disk is full")
         status, form, text = fetch(f"{address}/healthz")
@@ -63,7 +63,7 @@ def test_health_follows_the_troubles() -> None:
 
 
 def test_without_a_port_nothing_listens() -> None:
-    with serving("127.0.0.1", None, read, list) as address:
+    with serve_metrics("127.0.0.1", None, read, list) as address:
         assert address is None
 
 
@@ -73,11 +73,11 @@ def test_a_taken_port_is_said() -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"^metrics_port: cannot listen on 127.0.0.1:{port}"):
-            serving("127.0.0.1", port, read, list).__enter__()
+            serve_metrics("127.0.0.1", port, read, list).__enter__()
 
 
 def test_lines_are_text_for_people_and_json_for_programs() -> None:
-    line = Line("status: 3 rows", rows=3, counts={"late": 1})
+    line = LogLine("status: 3 rows", rows=3, counts={"late": 1})
     plain, structured = io.StringIO(), io.StringIO()
     line_logger("text", plain)(line)
     line_logger("json", structured, service="shard-0")(line)

@@ -1,4 +1,4 @@
-"""What lies behind standard output never ends a process."""
+"""Errors of standard output never end a process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TALK += "for _ in range(3): print_line('hello', sys.stderr)\nsys.exit(7)"
 
 LEAVE = """
 import atexit, threading
-from schemas.runtime.process import leave
+from schemas.runtime.process import exit_fast
 class Held:
     def __del__(self):
         print("taken apart", flush=True)
@@ -22,8 +22,8 @@ print("said", end=" ")
 """
 
 
-def test_a_command_that_is_done_leaves_without_taking_the_interpreter_apart() -> None:
-    done = subprocess.run([sys.executable, "-c", f"{LEAVE}leave(3)"], capture_output=True, text=True, check=False)
+def test_finished_command_exits_without_interpreter_teardown() -> None:
+    done = subprocess.run([sys.executable, "-c", f"{LEAVE}exit_fast(3)"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, "said registered\n")
 
 
@@ -34,7 +34,7 @@ def work():
         pass
     print("worked")
 threading.Thread(target=work).start()
-leave(3)"""
+exit_fast(3)"""
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, "said worked\nregistered\n")
 

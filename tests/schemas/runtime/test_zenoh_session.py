@@ -12,7 +12,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime import zenoh_session
 
 
-def test_who_waits_for_a_router_says_so_once_and_nothing_of_where_zenoh_was_built(
+def test_waiting_for_a_router_is_reported_once_without_build_paths(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries, stop = list[int](), threading.Event()

@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_service.analytics.roads.join import REACH_M, joined, read_roads
+from fleet_service.analytics.roads.join import REACH_M, join_roads, read_roads
 from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from fleet_service.cli import main
 from schemas import grid
@@ -42,7 +42,9 @@ def on(frame: pd.DataFrame, x: float, y: float, sector: int) -> list[tuple[str, 
 
 
 def frame_of(*roads: list[DirectedLink]) -> pd.DataFrame:
-    found: pd.DataFrame = joined(RoadNetwork([link for own in roads for link in own], {"extract": "test"})).to_pandas()
+    found: pd.DataFrame = join_roads(
+        RoadNetwork([link for own in roads for link in own], {"extract": "test"})
+    ).to_pandas()
     return found
 
 

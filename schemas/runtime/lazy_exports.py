@@ -1,0 +1,26 @@
+"""Lazy public names of a package: each is imported at first use, so that importing the package is fast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+
+def lazy_exports(
+    package: str, names: Mapping[str, str]
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__all__`, `__getattr__` and `__dir__` of a package (PEP 562).
+
+    Args:
+        package: its name, for the error message.
+        names: each public name and the module that defines it.
+    """
+    face = sorted(names)
+
+    def look_up(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
+        if name not in names:
+            raise AttributeError(f"{package} has no {name!r}; its face is {', '.join(face)}")
+        return getattr(import_module(names[name]), name)
+
+    return face, look_up, lambda: face

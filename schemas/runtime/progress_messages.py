@@ -1,0 +1,118 @@
+"""Progress messages of a command: on stderr, never on stdout, and none in quiet mode.
+
+On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a long operation is
+reported once as a line. An imported library reports nothing: only the command lines call `enable_messages`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+from schemas.runtime.process import print_line
+
+PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
+TICK_S: Final = 1.0
+COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the default estimator"
+
+
+class _State:
+    """State of the progress messages; one per process."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.words = ""
+        self.said_once: set[str] = set()
+        self.shown: Any = None
+        self.timer: threading.Timer | None = None
+        self.lock = threading.Lock()
+
+
+_voice = _State()
+
+
+def enable_messages(*, quiet: bool = False) -> None:
+    """Enable progress messages; the command lines call it."""
+    _voice.on = not quiet
+    _voice.said_once.clear()
+
+
+def report(line: str) -> None:
+    """Print a line of progress."""
+    if _voice.on:
+        print_line(line, sys.stderr)
+
+
+def report_once(line: str) -> None:
+    """Report something once; on a terminal it becomes the spinner's text."""
+    if line not in _voice.said_once:
+        _voice.said_once.add(line)
+        report(line)
+
+
+def set_status(words: str) -> None:
+    """Set the current activity, shown by the spinner."""
+    with _voice.lock:
+        _voice.words = words
+        if _voice.shown is not None:
+            _voice.shown.update(0, description=words)
+
+
+@contextmanager
+def show_status(words: str) -> Iterator[None]:
+    """Show a spinner while the block runs, from PATIENCE_S on and only on a terminal."""
+    if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
+        yield
+        return
+    set_status(words)
+    _voice.timer = threading.Timer(PATIENCE_S, _show)
+    _voice.timer.daemon = True
+    _voice.timer.start()
+    try:
+        yield
+    finally:
+        stop_status()
+
+
+def stop_status() -> None:
+    """Stop the spinner: the command has ended, or asks the user a question."""
+    timer, _voice.timer = _voice.timer, None
+    if timer is not None:
+        timer.cancel()
+        timer.join()
+    with _voice.lock:
+        shown, _voice.shown = _voice.shown, None
+    if shown is not None:
+        shown.stop()
+
+
+def _show() -> None:
+    began = time.monotonic()
+    loading = threading.Thread(target=_load_drawing, daemon=True)
+    loading.start()
+    while loading.is_alive():  # seconds, beside a command that computes or loads its own
+        with suppress(OSError):
+            waited = PATIENCE_S + time.monotonic() - began
+            print(f"{_voice.words} … {waited:.0f} s", end="\r", file=sys.stderr, flush=True)
+        loading.join(TICK_S)
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    shown = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=Console(stderr=True),
+        transient=True, redirect_stdout=sys.stdout.isatty(),
+    )  # fmt: skip
+    shown.add_task(_voice.words, total=None)
+    shown.start()
+    with _voice.lock:
+        _voice.shown = shown
+
+
+def _load_drawing() -> None:
+    """Import the drawing library before it is needed."""
+    importlib.import_module("rich.progress")

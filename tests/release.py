@@ -1,0 +1,83 @@
+"""Prepare a release: check the changelog, set the version, and build sdist, wheel and SBOM in `dist/`.
+
+    python -m tests.release 0.2.0
+
+It changes `pyproject.toml` and `CITATION.cff`, and commits and tags nothing. `CHANGELOG.md` must have a section
+`## 0.2.0` with text: rename "Unreleased" first.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from schemas.errors import InputError
+from tests.house import ROOT
+
+VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
+
+
+def changelog_section(text: str, version: str) -> str:
+    """Return the changelog's section of a version.
+
+    Raises:
+        InputError: it is missing or empty.
+    """
+    found = re.search(rf"^## {re.escape(version)}\b[^\n]*\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    if found is None or not found[1].strip():
+        raise InputError("changelog", f"has no section '## {version}'", "rename the section Unreleased")
+    return found[1].strip()
+
+
+def with_version(text: str, pattern: str, version: str) -> str:
+    """Return a file's text with the version that a pattern finds replaced.
+
+    Args:
+        text: of the file.
+        pattern: regular expression with one group, the text before the version.
+        version: the new one.
+
+    Raises:
+        InputError: the pattern does not match exactly once.
+    """
+    changed, count = re.subn(pattern + r"[^\"\n]+", rf"\g<1>{version}", text, flags=re.MULTILINE)
+    if count != 1:
+        raise InputError("version", f"{pattern!r} matches {count} times", "correct the file or the pattern")
+    return changed
+
+
+def set_version(root: Path, version: str, day: str) -> None:
+    """Write version and date into `pyproject.toml` and `CITATION.cff`."""
+    project = root / "pyproject.toml"
+    project.write_text(with_version(project.read_text(encoding="utf-8"), r'^(version = ")', version), encoding="utf-8")
+    citation = root / "CITATION.cff"
+    text = with_version(citation.read_text(encoding="utf-8"), r"^(version: )", version)
+    citation.write_text(with_version(text, r'^(date-released: ")', day), encoding="utf-8")
+
+
+def main() -> int:
+    """Run all steps; print what remains to be done by hand."""
+    version = next(iter(sys.argv[1:]), "")
+    if not VERSION.fullmatch(version):
+        print("error: version: must be like 0.2.0; make release VERSION=0.2.0", file=sys.stderr)
+        return 2
+    try:
+        section = changelog_section((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), version)
+        set_version(ROOT, version, f"{datetime.now(UTC):%Y-%m-%d}")
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    subprocess.run([sys.executable, "-m", "build", "--outdir", "dist", str(ROOT)], cwd=ROOT, check=True)
+    sbom = ROOT / "dist" / f"gripmap-{version}.cdx.json"
+    command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(sbom)]
+    subprocess.run(command, cwd=ROOT, check=True)
+    print(f"dist/ holds version {version}. Commit, then: git tag -a v{version}\n\n{section}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""Progress messages on a terminal."""
+
+from __future__ import annotations
+
+import io
+import sys
+import threading
+
+import pytest
+
+from schemas.runtime import progress_messages
+from tests.waiting import until
+
+
+class Terminal(io.StringIO):
+    """Takes what is said, as a terminal."""
+
+    def isatty(self) -> bool:
+        """It is one."""
+        return True
+
+
+def test_progress_is_shown_while_the_drawing_library_still_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, loaded = Terminal(), threading.Event()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(progress_messages, "TICK_S", 0.01)
+    monkeypatch.setattr(progress_messages, "_load_drawing", loaded.wait)
+    progress_messages.enable_messages()
+    try:
+        with progress_messages.show_status("replay"):
+            until(lambda: terminal.getvalue().count("replay … 0 s\r") >= 3)
+            progress_messages.set_status("compiling step")
+            until(lambda: "compiling step … 0 s\r" in terminal.getvalue())
+            loaded.set()
+            until(lambda: "0:00:00" in terminal.getvalue())  # the line that turns
+    finally:
+        loaded.set()
+        progress_messages.enable_messages(quiet=True)
+
+
+def test_nobody_is_told_anything_who_asked_for_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.0)
+    progress_messages.enable_messages(quiet=True)
+    with progress_messages.show_status("replay"):
+        progress_messages.report("a line")
+    assert terminal.getvalue() == ""

@@ -1,0 +1,82 @@
+"""The results page and the results block of the root README are made from the kept figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from tests import results
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in place of deploy/figures, empty."""
+    monkeypatch.setattr(results, "FOLDER", tmp_path / "figures")
+    return tmp_path
+
+
+def test_results_pages_are_current() -> None:
+    assert results.stale() == []
+
+
+def test_readme_has_one_results_block_of_at_most_eight_rows() -> None:
+    block = results.readme_block()
+    rows = [line for line in block.splitlines() if line.startswith("| ")][1:]
+    assert 0 < len(rows) <= 8
+    assert results.README.read_text(encoding="utf-8").count(results.BEGIN) == 1
+    assert block in results.README.read_text(encoding="utf-8")
+
+
+def test_every_judged_figure_is_on_the_page_with_its_commit() -> None:
+    page = results.results_page()
+    for name in results.CAMPAIGNS:
+        for row in results.kept(name).values():
+            assert row["commit"]
+            if row["bar"] is not None:
+                assert f"|`{row['name']}`|" in page
+
+
+def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
+    left = folder / "left.json"
+    figures.write(left, "demo", [1, 2, 3], [Figure("demo.a", 0.9, "", 0.8, "more"), Figure("demo.b", 0.2, "", 0.1)])
+    assert results.keep("demo", left).startswith("demo: 2 figures")
+    page = results.results_page()
+    assert "2 figures have a bar; 1 hold and 1 do not." in page
+    assert f"|`demo.b` {results.MISSED}|0.2|≤ 0.1|" in page.split("\n## ")[1]
+    section = page[page.index("## `make demo`") :]
+    assert "seeds 1 to 3" in section
+    assert section.index("`demo.b`") < section.index("`demo.a`")
+
+
+def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
+    left = folder / "left.json"
+    figures.write(left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("unshown", 1.0, "")])
+    assert results.keep("demo", left).startswith("demo: 1 figures")
+    figures.write(left, "demo", [1], [Figure("demo.b", 0.1, "", 0.12)])
+    assert results.keep("demo", left).startswith("demo: 1 figures")
+    assert set(results.kept("demo")) == {"demo.a", "demo.b"}
+    figures.write(left, "demo --quick", [1], [Figure("demo.a", 0.5, "")])
+    assert "unchanged" in results.keep("demo", left)
+    assert results.kept("demo")["demo.a"]["value"] == 0.955
+    assert "run `make demo` first" in results.keep("demo", folder / "none.json")
+
+
+def test_an_older_run_replaces_nothing(folder: Path) -> None:
+    left = folder / "left.json"
+    figures.write(left, "demo", [1], [Figure("demo.a", 0.5, "", 0.9)])
+    results.keep("demo", left)
+    rows = json.loads(left.read_text())
+    rows[0]["date"] = "2000-01-01T00:00:00+00:00"
+    rows[1]["value"] = 0.1
+    left.write_text(json.dumps(rows))
+    assert "older" in results.keep("demo", left)
+    assert results.kept("demo")["demo.a"]["value"] == 0.5
+
+
+def test_a_table_without_its_figures_says_so() -> None:
+    table = next(table for table in results.TABLES if table.campaign == "fleet")
+    assert results._rendered(table, {}).startswith("Not complete: the kept run has no figure ")
