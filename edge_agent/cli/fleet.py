@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
-    parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7")
+    parser.add_argument(
+        "--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7"
+    )
     parser.add_argument(
         "--rough", type=float, default=0.0, help="share of them with the sensor errors of real cars (default 0)"
     )

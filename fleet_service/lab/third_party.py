@@ -130,13 +130,13 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
     alerts = Alerts(fusion)
     o = observe(drive)
     for rows in split_by(drive.visits.seconds, STEP_S):
-        alerts.updated(fusion.update(o.take(rows)).slots)
+        alerts.update(fusion.update(o.take(rows)).slots)
     now = START + 60 * MINUTES * NS
-    alerts.faded(now)
+    alerts.expire(now)
     slots = fusion.slots_of(drive.cells, np.zeros(CELLS, np.int64))
     belief = fusion.beliefs(slots, now)
     heard = np.bincount(drive.visits.place[drive.visits.excited], minlength=CELLS)
-    return of_beliefs(belief, mu, heard), np.isin(slots, list(alerts.raised)), heard
+    return of_beliefs(belief, mu, heard), np.isin(slots, list(alerts.slots)), heard
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
@@ -208,7 +208,7 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
     turned = 60.0 * MINUTES
     back = 2.0 * turned
     for rows in split_by(v.seconds, STEP_S):
-        alerts.updated(fusion.update(o.take(rows)).slots)
+        alerts.update(fusion.update(o.take(rows)).slots)
         last = v.seconds[rows[-1]]
         if last // turned != phase:
             phase = last // turned
@@ -216,7 +216,7 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
         excited = rows[v.excited[rows] & (v.place[rows] < CHANGE_CELLS)]
         passes += np.bincount(v.place[excited], minlength=CHANGE_CELLS)
         slots = fusion.slots_of(drive.cells[:CHANGE_CELLS], np.zeros(CHANGE_CELLS, np.int64))
-        under = np.isin(slots, list(alerts.raised))
+        under = np.isin(slots, list(alerts.slots))
         if turned <= last < back:
             raised[under & (raised == NEVER)] = passes[under & (raised == NEVER)]
         elif last >= back:
@@ -255,7 +255,7 @@ def count_cold(rng: Generator) -> int:
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     for k in range(n):
-        if any(alert.raised for alert in alerts.updated(fusion.update(o.take(np.array([k]))).slots)):
+        if any(alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots)):
             return k + 1
     return NEVER
 

@@ -36,7 +36,8 @@ ASKED_EVERY: Final = 10  # a query for so many messages
 POSSIBLE: Final = {
     "latitude": (-85.06, 85.06), "longitude": (-180.0, 180.0), "mu": (0.0, 2.0), "mu_lower": (0.0, 2.0),
     "mu_upper": (0.0, 2.0), "mu_utilised": (0.0, 2.0), "speed": (0.0, 100.0), "sector": (0, 3), "tyre_season": (0, 3),
-    "abs_active": (-1, 1), "esc_active": (-1, 1), "tcs_active": (-1, 1), "wiper": (0.0, 1.0), "used_longitudinal": (-2.0, 2.0), "used_lateral": (-2.0, 2.0),
+    "abs_active": (-1, 1), "esc_active": (-1, 1), "tcs_active": (-1, 1), "wiper": (0.0, 1.0),
+    "used_longitudinal": (-2.0, 2.0), "used_lateral": (-2.0, 2.0),
     "air_temperature": (-90.0, 80.0), "position_std": (0.0, 100.0), "vx": (-100.0, 100.0),
     "vy": (-100.0, 100.0), "yaw_rate": (-20.0, 20.0), "sideslip": (-4.0, 4.0), "yaw": (-1000.0, 1000.0),
     "yaw_std": (0.0, 10.0), "health": (0, 2**31 - 1), "boot": (0, 2**63 - 1), "seq": (1, 2**63 - 1),
