@@ -10,6 +10,9 @@ Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, an
     far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
     consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and bank return to their
                 prior where the wheels are FAR [1/s]
+    shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel slides (no, yes),
+                then demand (low, middle, high), then forces (as before, new) [nat] (12,)
+    strained    what is added to it where beliefs about the car are strained, by whether a wheel slides [nat] (2,)
 
 Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the range is covered.
 """
@@ -29,9 +32,19 @@ LARGEST_MISMATCH = 20.0
 LARGEST_STEP = 0.7  # [nat] a step of adaptation at most doubles R
 LARGEST_SCALE = 2.5  # [nat]
 NOISE = 2 * SETS + CHANNELS  # numbers of what concerns R alone
-LENGTHS = {"inputs": SETS, "outputs": SETS, "ln_scales": CHANNELS, "far": 2, "consequents": 2}
+LENGTHS = {
+    "inputs": SETS,
+    "outputs": SETS,
+    "ln_scales": CHANNELS,
+    "far": 2,
+    "consequents": 2,
+    "shares": 12,
+    "strained": 2,
+}
 RETIRED = ("stretched", "lately")  # in files of before: contradiction is a test of likelihoods now, and has no vertices
 RAMPS = ("far",)
+LEAST_SHARE = -8.0  # [nat]
+SHARE_REACH = 1.5  # [nat] to either side, in which an optimiser looks for a share
 CLOSEST = 0.01  # peaks of neighbouring sets stay apart
 
 
@@ -48,6 +61,8 @@ class Memberships:
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
     consequents: tuple[float, ...] = (0.67, 0.25)  # without: in town three times as many contradictions
+    shares: tuple[float, ...] = (-5.0, -3.1, -2.6, -0.7, -1.9, 0.0, -5.0, -1.6, -2.6, 0.0, -1.0, 0.0)
+    strained: tuple[float, ...] = (-0.9, -0.4)
 
     def __post_init__(self) -> None:
         for name, length in LENGTHS.items():
@@ -76,14 +91,17 @@ class Memberships:
                 raise InputError(f"memberships.{name}", "does not rise", f"give a foot and a peak {CLOSEST:g} above it")
         if min(self.consequents) < 0.0 or max(self.consequents) > LARGEST_SCALE:
             raise InputError("memberships.consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}")
+        for name in ("shares", "strained"):
+            if not all(LEAST_SHARE <= value <= 0.0 for value in getattr(self, name)):
+                raise InputError(f"memberships.{name}", "out of range", f"stay within {LEAST_SHARE:g} and 0 nat")
 
     def to_vector(self) -> FloatArray:
-        """Free numbers for an optimiser, shape (16,): the fields one after the other."""
+        """Free numbers for an optimiser, shape (30,): the fields one after the other."""
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """The memberships of a vector (16,) within `bounds`; inputs and outputs are sorted first, so all are valid.
+        """The memberships of a vector (30,) within `bounds`; inputs and outputs are sorted first, so all are valid.
 
         Of a vector (12,), which ends at ln_scales, the rest is as untuned.
         """
@@ -104,11 +122,14 @@ class Memberships:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Lower and upper ends of the vector, (16,) each: where an optimiser may look."""
+        """Lower and upper ends of the vector, (30,) each: where an optimiser may look."""
         lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -0.1, -0.1]
         lower += [0.3, 2.5, 0.5, 0.1]
         upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 0.1, 0.1]
         upper += [2.3, 8.0, 1.5, 0.5]
+        for value in (*Memberships.shares, *Memberships.strained):
+            lower.append(max(value - SHARE_REACH, LEAST_SHARE))
+            upper.append(min(value + SHARE_REACH, 0.0))
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:

@@ -5,6 +5,7 @@
 | the mismatch of the wheels, or of the axles, is one of five sets | ln R of that group moves by its step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
+| slide, demand, new forces and strain are in one set each | ln of the share of evidence taken | Takagi–Sugeno |
 
 Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`.
 Sets are ramps from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`. Inputs are
@@ -22,6 +23,8 @@ from edge_agent.adaptation.memberships import Memberships
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
+LOW, MIDDLE, HIGH = 0.06, 0.13, 0.3  # [1] peaks of the sets of demand, force over load
+CALM, STRAINED = 1.0, 2.5  # [1] peaks of the sets of strain, chi-square over degrees of freedom
 WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave their gain
 
 
@@ -32,12 +35,14 @@ class RuleBase(NamedTuple):
     wide: Annotated[FloatArray, 2]
     ln_noise: float  # of an axle whose steering is WIDE [nat]
     pace: float  # of offsets, slope and bank where the wheels are FAR [1/s]
+    shares: Annotated[FloatArray, 12]
+    strained: Annotated[FloatArray, 2]
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
     """The rules with the vertices of `memberships`."""
     m = memberships
-    return RuleBase(np.array(m.far), np.array(WIDE), *m.consequents)
+    return RuleBase(np.array(m.far), np.array(WIDE), *m.consequents, np.array(m.shares), np.array(m.strained))
 
 
 @compiled
@@ -56,3 +61,33 @@ def hurry(rules: RuleBase, wheels: float) -> float:
 def wide_noise(rules: RuleBase, angle: float) -> float:
     """Factor on R of an axle whose wheels are steered by `angle` [rad]."""
     return math.exp(rules.ln_noise * is_high(abs(angle), rules.wide))
+
+
+@compiled
+def evidence_share(rules: RuleBase, slides: float, demand: float, new: float, strain: float) -> float:
+    """Return the ln of the share of a block's evidence on friction that is taken, at most 0.
+
+    Zero-order Takagi-Sugeno rules with product inference; the memberships of each input sum to one.
+
+    Args:
+        rules: the consequents, `shares` (12,) and `strained` (2,) [nat].
+        slides: membership in "a wheel slides" [1].
+        demand: force over load of the axle that uses more [1].
+        new: membership of the forces in "new" [1].
+        strain: chi-square over degrees of freedom of the beliefs about the car [1].
+    """
+    rise = min(max((demand - LOW) / (MIDDLE - LOW), 0.0), 1.0)
+    top = min(max((demand - MIDDLE) / (HIGH - MIDDLE), 0.0), 1.0)
+    low = 1.0 - rise
+    middle = rise - top
+    tense = min(max((strain - CALM) / (STRAINED - CALM), 0.0), 1.0)
+    total = 0.0
+    for sliding in range(2):
+        of_slide = slides if sliding == 1 else 1.0 - slides
+        total += of_slide * tense * rules.strained[sliding]
+        for fresh in range(2):
+            of_force = new if fresh == 1 else 1.0 - new
+            first = 6 * sliding + fresh
+            asked = low * rules.shares[first] + middle * rules.shares[first + 2] + top * rules.shares[first + 4]
+            total += of_slide * of_force * asked
+    return min(total, 0.0)

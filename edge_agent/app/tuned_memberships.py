@@ -33,6 +33,9 @@ class Score(Record):
     coverage: Annotated[Finite | None, Field(description="share of true frictions inside it [1]")]
     log_likelihood: Annotated[Finite, Field(description="of the innovations, more is better [nat/s]")]
     nis_ratio: Annotated[Finite, Field(description="normalised innovation squared over its expectation [1]")]
+    surface_score: Annotated[Finite | None, Field(description="interval score, mean over kinds of surface [1]")] = None
+    false_ice: Annotated[Finite | None, Field(description="share of grippy samples called slippery [1]")] = None
+    missed_ice: Annotated[Finite | None, Field(description="share of felt slippery samples not called so [1]")] = None
 
 
 class SplitScores(Record):

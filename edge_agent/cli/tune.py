@@ -28,6 +28,7 @@ from edge_agent.lab.tuning.objectives import (
     TuningScores,
     TuningSet,
     choices,
+    detection_cost,
     objective_on,
     record_all,
     scores_of,
@@ -39,7 +40,7 @@ from schemas.runtime import figures
 from schemas.vehicle import load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
-ANTS, ITERATIONS, DURATION_S = 12, 8, 12.0
+ANTS, ITERATIONS, DURATION_S = 12, 8, 30.0
 QUICK_ANTS, QUICK_ITERATIONS, QUICK_DURATION_S = 3, 2, 2.0
 STUDY_DURATION_S: Final = 6.0
 REPEATS, QUICK_REPEATS = 8, 2  # searches each way of the study
@@ -126,11 +127,11 @@ def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tupl
 
 
 def _worth(score: Score, objective: str) -> float:
-    """Return the score that decides between the searches: the interval score if the truth is known, else the
-    objective."""
-    if score.interval_score is not None:
-        return -score.interval_score
-    return OBJECTIVES[objective](TuningScores(math.nan, math.nan, score.log_likelihood, score.nis_ratio))
+    """Return the worth of a search: minus the cost of false and missed ice if truth is known, else the objective."""
+    known = {name: value for name, value in score.model_dump().items() if value is not None}
+    unknown = {"interval_score": math.nan, "coverage": math.nan}
+    scores = TuningScores(**(unknown | known))
+    return -detection_cost(scores) if score.interval_score is not None else OBJECTIVES[objective](scores)
 
 
 def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:

@@ -51,6 +51,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.rolling[wheel] = row[Parameter.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
         change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
         features.spin[wheel] = 0.0 if math.isnan(change) else change
+    features.steering = 0.5 * (last.delta[0] + last.delta[1])
     features.change, features.steer_rate = ax, _steer_rate(memory, features.duration)
     health = _forces(memory, constants, features)
     _sides(memory, features)
@@ -96,7 +97,9 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
         torque = mean_or(block, S.TORQUE + wheel, math.nan)
         if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
             force = force_from_torque(torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS])
-            spread, unit = constants.force_share * abs(force), 0.0
+            inertial = row[Parameter.WHEEL_INERTIA] * features.spin[wheel] / row[Parameter.RADIUS]
+            spread = math.hypot(constants.force_share * force, constants.spin_share * inertial)
+            unit = 0.0
         else:
             if math.isnan(torque):
                 health |= flags.NO_TORQUE
@@ -248,10 +251,16 @@ def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatur
 
 @compiled
 def demand(features: BlockFeatures) -> float:
-    """Largest force over load of any wheel [1]; a missing lateral force counts as none."""
+    """Return the larger force over load of the two axles [1]; a missing lateral force counts as none.
+
+    An axle is taken as a whole: how its wheels share the force is not measured where an inner wheel is almost unloaded.
+    """
     most = 0.0
-    for wheel in range(4):
-        side = features.side[wheel // 2]
+    for axle in range(2):
+        left = 2 * axle
+        right = left + 1
+        side = features.side[axle]
         across = 0.0 if math.isnan(side) else side
-        most = max(most, math.hypot(features.force[wheel], across))
+        along = features.load_share[left] * features.force[left] + features.load_share[right] * features.force[right]
+        most = max(most, math.hypot(along, across))
     return most

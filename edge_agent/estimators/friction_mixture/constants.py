@@ -15,8 +15,8 @@ ALL_NODES = NODES + SPLIT_NODES
 PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
 CURVED = 4  # states in which the rows of measurement are not linear
 STRAIGHT = 10  # states up to this one are differentiated one by one; the others follow from these and from speeds
-ACTIVE = 16  # states that the rows see within a block
-STATES = 18
+ACTIVE = 18  # states that the rows see within a block
+STATES = 20
 ROWS = 6  # of measurement: four wheels along, two axles across
 
 
@@ -36,8 +36,10 @@ class NodeState(IntEnum):
     RADIUS = 10  # relative error of the radius of each of four wheels
     LAG_WHEEL = 14  # of the wheel speeds behind the accelerometers [s]
     LAG_STEER = 15  # of the steering behind the gyroscope [s]
-    SLOPE = 16  # gravity along the road, felt ahead: a force holds it, but it moves nothing [m/s^2]
-    BANK = 17  # gravity across the road, felt to the left [m/s^2]
+    COMPLIANCE = 16  # slip angle that steering and bushes take from the front axle, per side force over load [rad]
+    STEER_GAIN = 17  # relative error of the front steering angle
+    SLOPE = 18  # gravity along the road, felt ahead: a force holds it, but it moves nothing [m/s^2]
+    BANK = 19  # gravity across the road, felt to the left [m/s^2]
 
 
 class Constants(NamedTuple):
@@ -145,6 +147,14 @@ class Constants(NamedTuple):
     slope_time: float = 60.0
     # [rad] offset of steering and toe: 1 to 17 mrad on logs of real cars, mostly below 4
     steer_std: float = 0.004
+    # [1] gain of the steering ratio: vehicle files of real cars are 3 to 8 % off
+    steer_gain_std: float = 0.02
+    # [rad] steering compliance per side force over load: production cars have 0 to .035 (front C/F_z of 10 to 20)
+    compliance_mean: float = 0.005
+    # [rad] its spread
+    compliance_std: float = 0.01
+    # [s] return of gain and compliance to their prior: they are properties of the car
+    steer_time: float = 600.0
     # [1] radius of a wheel against the others: pressure, wear, and axles whose tyres differ (1 % on BMW M8 and AV-21)
     wheel_std: float = 0.008
     # [1] radius of all wheels together: nominal radii of real cars are up to 1.5 % off; nothing here tells it
@@ -173,8 +183,8 @@ class Constants(NamedTuple):
     abrupt_time: float = 0.15
     # [rad] white noise of steering in a block (vehicle)
     angle_std: float = 0.0003
-    # [1] steering ratio, compliance and how the wheels of an axle point, of the angle: gains are 3 % off
-    angle_share: float = 0.03
+    # [1] how the wheels of an axle point, of the angle; the common gain of the steering is a state
+    angle_share: float = 0.01
     # [rad/s] offset and white noise of the yaw rate in a block: turns an axle's slip, most at low speed
     gyro_std: float = 0.002
     # [1] rolling resistance, in force over load
@@ -193,6 +203,18 @@ class Constants(NamedTuple):
     no_torque_share: float = 0.1
     # [m/s^2] where torque is missing: a_x that is not force and not an offset
     no_torque_floor: float = 0.1
+
+    # [1] of the force that spins a wheel up or down: torque and wheel speed have clocks of their own, ABS acts at 8 Hz
+    spin_share: float = 0.3
+
+    # [s] for which a slide is remembered
+    slip_time: float = 1.0
+    # [1] probability of a road change where a wheel begins to slide
+    slip_change: float = 0.3
+    # [1/m] one road change per so much where a wheel has slid and grips again: ice comes in patches
+    slip_hazard: float = 0.04
+    # [1] factor on R of the rear axle until it reaches the place where a front wheel began to slide
+    rear_unlike: float = 10.0
 
     # [s] that wheels stand before the car does
     standing_time: float = 0.5

@@ -56,11 +56,14 @@ def nominal_states(constants: Constants) -> Nominal:
         *((x.RADIUS + wheel, c.wheel_std, c.bias_time) for wheel in range(4)),
         (x.LAG_WHEEL, c.lag_std, c.bias_time),
         (x.LAG_STEER, c.lag_std, c.bias_time),
+        (x.COMPLIANCE, c.compliance_std, c.steer_time),
+        (x.STEER_GAIN, c.steer_gain_std, c.steer_time),
         (x.SLOPE, c.slope_std, c.slope_time),
         (x.BANK, c.bank_std, c.slope_time),
     ):
         std[state], time[state] = spread, back
     mean[x.LEAK_Y] = c.leak_y_mean
+    mean[x.COMPLIANCE] = c.compliance_mean
     return Nominal(mean, std, time)
 
 

@@ -91,9 +91,19 @@ class RollingMotion:
     left_std: float
 
 
+class WheelSlip:
+    """Slip that the wheel speeds show by themselves."""
+
+    held: float  # membership of the last second in "a wheel slides" [1]
+    begins: float  # what this block adds to it [1]
+    ended: float  # what of it this block no longer shows [1]
+    rear_unlike_until: float  # time until which the rear axle is on another surface than the front axle [s]
+
+
 class Trust:
     """Whether any friction explains what is measured."""
 
+    ratio: float  # squared innovations of the axles over their stated variance, smoothed, as far as unexplained [1]
     odd: float  # how much more likely it is of late that none does [nat]
     distrust: float  # 1 where none does, else 0
     left: float  # of that, before it is tried again [s]
@@ -131,12 +141,12 @@ class MixtureMemory:
     overall_covariance: Annotated[FloatArray, STATES, STATES]
     actual: Annotated[FloatArray, 2]  # windowed innovation variances: wheels, axles
     theoretical: Annotated[FloatArray, 2]
-    stated: float  # as theoretical of the axles, with R as the constants state it
     factor: Annotated[FloatArray, 2]  # adapted over nominal R
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
     drive_odds: Annotated[FloatArray, 3]  # of a car that drives its rear axle, all wheels, its front axle
+    slip: WheelSlip
     rolling: RollingMotion
     grip: GripInUse
     trust: Trust

@@ -72,7 +72,8 @@ def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, met
     hazard = 1.0 - math.exp(-metres * constants.hazard)
     doubt = 1.0 - credence(memory.trust, constants)
     forgotten = 1.0 - math.exp(-(doubt**BRINK) * scratch.features.duration / FORGOTTEN_S)
-    hazard = max(hazard, forgotten)
+    slid = 1.0 - math.exp(-metres * constants.slip_hazard * memory.slip.ended)
+    hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
     predicted, weight, visit = scratch.predicted[:count], memory.weight[:count], memory.visit_weight[:count]

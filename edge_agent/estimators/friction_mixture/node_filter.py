@@ -43,6 +43,7 @@ from edge_agent.filters.sequential import potter, project
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
+REAR_ROWS = (2, 3, 5)
 DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
@@ -72,6 +73,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     price = linearize(memory, design, scratch, j)
     spread(memory, design, scratch, j)
     across = inflation * doubted_noise(memory.trust, constants) / features.novelty
+    unlike = rear_noise(memory, constants)
     plain = square = 0.0
     for r in range(ROWS):
         innovation[r] = -node.residual[r]
@@ -81,7 +83,10 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
             variance += node.deviation[r, column] ** 2
         theoretical[r] = variance + noise
         excess = node.residual[r] ** 2 / constants.huber**2 - variance
-        node.inflated[r] = max(noise * (inflation if r < 4 else across), excess) + node.nonlinearity[r] + node.abrupt[r]
+        factor = inflation if r < 4 else across
+        if r in REAR_ROWS:
+            factor *= unlike
+        node.inflated[r] = max(noise * factor, excess) + node.nonlinearity[r] + node.abrupt[r]
         if not math.isnan(node.residual[r]):
             ratio = node.residual[r] ** 2 / theoretical[r]
             square += ratio
@@ -132,7 +137,10 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
         axle = r // 2 if r < 4 else r - 4
         across = -features.side_leak[axle] / features.side_unit[axle]
         derivative[NodeState.LEAK_Y, r] = 0.0 if math.isnan(across) else derivative[NodeState.BIAS_Y, r] * across
-        derivative[NodeState.LAG_STEER, r] = derivative[NodeState.STEER, r] * features.steer_rate
+        by_angle = derivative[NodeState.STEER, r]
+        derivative[NodeState.LAG_STEER, r] = by_angle * features.steer_rate
+        derivative[NodeState.STEER_GAIN, r] = by_angle * features.steering
+        derivative[NodeState.COMPLIANCE, r] = 0.0 if math.isnan(features.side[0]) else -by_angle * features.side[0]
         if all_torques:  # an offset of a_x is then no force
             derivative[NodeState.BIAS_X, r] = 0.0
     return price
@@ -238,6 +246,12 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
     if trust.distrust > 0.0:
         return 1.0 + constants.distrust_noise
     return 1.0 + DOUBTED * constants.distrust_noise * (trust.odd / constants.odd_least) ** 2
+
+
+@compiled
+def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
+    """Return the factor on R of the rear axle's rows: the front axle has met another surface that the rear has not."""
+    return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
 
 @compiled

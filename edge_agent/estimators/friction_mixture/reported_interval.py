@@ -4,7 +4,7 @@ Evidence is tempered, lest the same error count twice; so where much has been me
 errors, and where nothing has been it is the prior, as wide as it should be. The level of the upper end goes from the
 one to the other by what has been learned, the divergence of the belief from its prior (Kullback and Leibler 1951), and
 further in a car that is as its file says (`trust.likeness`).
-Slippery for sure is said of nothing less than the belief itself holds by its own 99.5 %.
+Slippery for sure is said of nothing less than the belief itself holds by its own 99 %.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ DRAWN_IN = 0.085  # [1] most by which the upper end comes nearer: a belief that 
 # How much nearer it comes in a car that is as its file says, by level and at the most: what else is wrong of it is
 # small as well. On level drives one truth in eighty had lain above. The lower end stays: safe deceleration rests on it.
 NEARER, DRAWN_NEARER = 0.15, 0.15
-# Ice ends without a sign: of what .95 called slippery for sure in three towns .08 lay beyond it, now .05; .04 in others
-SURE_END = 0.995
+# Ice ends without a sign: of what .95 called slippery for sure in towns .08 lay beyond it
+SURE_END = 0.99
 
 
 @compiled

@@ -28,6 +28,7 @@ from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Node
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
+SPLIT_LIMIT = 0.9  # of its friction, that the slippery side gives before the other side takes the rest
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
 
 
@@ -79,8 +80,8 @@ def find_slips(
     vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
     mean_kx, mean_ky = mean[NodeState.LN_KX], mean[NodeState.LN_KY]
     for axle in range(2):
-        offset = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate if axle == 0 else 0.0
         blind = math.isnan(features.side[axle])  # slip across is then guesswork, and must not bend the force along
+        offset = steering_offset(x, features) if axle == 0 and not blind else 0.0
         ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
         slope_x, slope_y = row[Parameter.SLOPE_X] * math.exp(ln_kx), row[Parameter.SLOPE_Y] * math.exp(ln_ky)
@@ -100,6 +101,16 @@ def find_slips(
 
 
 @compiled
+def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
+    """Return by how much the front wheels point farther left than measured [rad], with state x (n,).
+
+    The front axle yields to its own side force: steering column and bushes of production cars take up to 35 mrad/g.
+    """
+    lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
+    return float(lagged + x[NodeState.STEER_GAIN] * features.steering - x[NodeState.COMPLIANCE] * features.side[0])
+
+
+@compiled
 def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
     """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right wheels."""
     slip, out = node.slip, node.shape_force
@@ -116,7 +127,11 @@ def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatu
 
 @compiled
 def correct_forces(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
-    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape."""
+    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape.
+
+    Without torque only the sum of both sides is measured; on a split road the slippery side gives SPLIT_LIMIT of its
+    friction at most, and the other side the rest.
+    """
     leak, shape, gain = node.point[NodeState.LEAK_Y], node.point[NodeState.SHAPE], node.point[NodeState.GAIN]
     bias_x, bias_y = node.point[NodeState.BIAS_X], node.point[NodeState.BIAS_Y]
     force, slip_at_force = node.force, node.slip_at_force
@@ -128,12 +143,30 @@ def correct_forces(curve: TyreCurve, side_mu: FloatArray, features: BlockFeature
         for wheel in range(left, right + 1):
             mu, load = side_mu[wheel % 2], features.load_share[wheel]
             along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
+            other = side_mu[1 - wheel % 2]
+            if other != mu and features.force_unit[wheel] != 0.0:
+                along = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
             mean_along += load * along
             mean_mu += load * mu
             force[wheel] = along - shape * node.shape_force[wheel]
             slip_at_force[wheel] = _slip_at_force(curve, mu, force[wheel], across)
         force[4 + axle] = side - shape * node.shape_force[4 + axle]
         slip_at_force[4 + axle] = _slip_at_force(curve, mean_mu, force[4 + axle], mean_along)
+
+
+@compiled
+def share_by_sides(mean: float, most: float, most_other: float) -> float:
+    """Return the force over load of one side where `mean` acts on both: alike until the slippery side is at its limit.
+
+    Args:
+        mean: of both sides, signed [1].
+        most: that this side gives [1].
+        most_other: that the other side gives [1].
+    """
+    size = abs(mean)
+    if most < most_other:
+        return math.copysign(min(size, most), mean)
+    return math.copysign(size + max(size - most_other, 0.0), mean)
 
 
 @compiled

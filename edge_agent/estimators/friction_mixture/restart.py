@@ -27,7 +27,8 @@ UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 FREE_FORCE = 0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
 ALIKE = 0.03  # relative difference of their speeds
-LOST_RATIO = 8.0  # of actual over nominal innovation variance in the window: no noise or curve does that
+FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
+LEAST_ROLLING_M_S = 0.5  # slower wheels may be locked
 LOST_SPREAD_M_S = 5.0
 FAR_M_S, FAR_SHARE, FAR_SPREADS = 0.7, 0.04, 2.0  # of the speed that agreeing wheels tell: beyond, the motion is lost
 SLOWEST_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
@@ -139,10 +140,11 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 
 @compiled
 def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Begin the motion and the friction anew where wheels that roll have long contradicted them.
+    """Call the motion back where it is far from what wheels tell that agree and roll; returns health flags.
 
-    Wheels that agree call the motion back at once when it is far from what they tell. A wheel without force
-    rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
+    Where wheels have agreed for long, vehicle and friction are forgotten with the motion. Where wheels have just begun
+    to roll without force, after a slide, only the motion is set: nodes that call them sliding would not find back by
+    themselves, because the tyre curve is flat there. Noise that a slide has raised is no reason for either.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):
@@ -153,18 +155,28 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
             astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
         if astray:
             return _begin_anew(memory, design, rolling.ahead)
-    if memory.actual[0] * memory.factor[0] < LOST_RATIO * memory.theoretical[0]:
+    speed = free_speed(memory, features)
+    if memory.last.time - rolling.disagreed_time < FREE_S or math.isnan(speed):
         return 0
-    least, most = math.inf, -math.inf
+    if abs(memory.overall_mean[NodeState.VX] - speed) > FAR_M_S + FAR_SHARE * speed:
+        restart_motion(memory, speed, FIRST_V_STD)  # friction stays: a slide that ended has taught it
+    return 0
+
+
+@compiled
+def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
+    """Return the speed [m/s] of wheels that turn alike and without force, so that they roll; NaN where they do not."""
+    slowest = math.inf
+    fastest = -math.inf
     for wheel in range(4):
         if abs(features.force[wheel]) > FREE_FORCE:
-            return 0
+            return math.nan
         if not math.isnan(features.rolling[wheel]):
-            least, most = min(least, features.rolling[wheel]), max(most, features.rolling[wheel])
+            slowest = min(slowest, features.rolling[wheel])
+            fastest = max(fastest, features.rolling[wheel])
     turning = abs(features.yaw_rate) * memory.row[Parameter.TRACK_REAR]
-    if most - least > ALIKE * max(most, SLOWEST_M_S) + turning:
-        return 0
-    return _begin_anew(memory, design, most if most >= 0.0 else math.nan)
+    alike = fastest - slowest <= ALIKE * max(fastest, SLOWEST_M_S) + turning
+    return fastest if alike and fastest > LEAST_ROLLING_M_S else math.nan
 
 
 @compiled
@@ -175,7 +187,6 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0
-    memory.stated = memory.actual[1]
     put_split_to_sleep(memory)
     clear(memory.patch)
     for j in range(NODES):

@@ -26,8 +26,10 @@ STANDING_STD = 0.05  # [m/s] sensors of a wheel that creeps show nothing
 STANDING_RAD_S = 0.05  # a wheel that turns slower stands
 RESTING_TIME = 1.0  # [s] smoothing of a_x while wheels stand
 STARTS = 0.25  # [m/s^2] from there within which the car does not start or stop
-SLOW_M_S = 3.0  # a faster car that stands has locked its wheels, or the filter is lost:
-LOCKED_S = 2.0  # no car slides on four locked wheels for longer
+SLOW_M_S = 3.0  # a faster car whose wheels stand has locked them, or the filter is lost:
+SLIDES_M_S2 = 1.0  # a car with locked wheels decelerates by more on all but the slipperiest ice
+LOST_S = 2.0  # [s] until wheels that stand without that are those of a car that stands
+LONGEST_SLIDE_S = 10.0  # [s] of a car with locked wheels
 AGREE_FLOOR = 0.15  # [m/s] within which wheels always agree
 TURN_SHARE = 0.05  # of the speed difference of the sides in a turn: track and yaw rate
 SIDE_SHARE = 0.5  # share by which sideslip differs from the side force over nominal stiffness
@@ -52,8 +54,10 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         least, most, total, seen = min(least, ahead), max(most, ahead), total + ahead, seen + 1
         fastest = max(fastest, abs(speed))
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
-    _stand(memory, constants, features, seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS])
-    if seen < 3:
+    still = seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
+    _stand(memory, constants, features, still)
+    locked = still and features.speed >= SLOW_M_S and not rolling.stands
+    if seen < 3 or locked:
         rolling.disagreed_time = time
         return
     middle = total / seen
@@ -77,7 +81,9 @@ def _stand(memory: MixtureMemory, constants: Constants, features: BlockFeatures,
         rolling.moved_time = time
     keep = math.exp(-features.duration / RESTING_TIME)
     rolling.resting_ax = keep * rolling.resting_ax + (1.0 - keep) * features.change
-    wait = constants.standing_time if features.speed < SLOW_M_S else LOCKED_S
+    wait = constants.standing_time
+    if features.speed >= SLOW_M_S:
+        wait = LOST_S if abs(features.change) < SLIDES_M_S2 else LONGEST_SLIDE_S
     quiet = abs(features.change - rolling.resting_ax) < STARTS
     rolling.stands = still and quiet and time - rolling.moved_time >= wait
 

@@ -27,8 +27,9 @@ from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.restart import recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
-from edge_agent.estimators.friction_mixture.trust import judge, likeness
+from edge_agent.estimators.friction_mixture.trust import LEAST_VARIANCE, judge, likeness
 from edge_agent.estimators.friction_mixture.weighing import measure
+from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -55,6 +56,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     features.speed = abs(memory.overall_mean[NodeState.VX])
     health = block_features(memory, design, features)
     learn_drive(memory, design.constants, features)
+    update_slip(memory, design.constants, features)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
     drive_on(memory, design, scratch, features.speed * features.duration)
@@ -62,7 +64,8 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     measure(memory, design, scratch)
     predict(memory, design, scratch)
     memory.health = health | recover(memory, design, features)
-    judge(memory, design, features.duration, memory.health)
+    ratio = scratch.actual_sum[1] / max(scratch.stated_sum, LEAST_VARIANCE)
+    judge(memory, design, features.duration, ratio, memory.health)
     if memory.trust.distrust > 0.0:
         memory.health |= flags.CONTRADICTION
     conclude(memory, design, scratch)

@@ -21,12 +21,13 @@ import math
 
 from edge_agent.adaptation.rule_base import hurry
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Trust
 from edge_agent.estimators.friction_mixture.node_filter import belief_cost
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import SLIPPERY_MU
 
 LEAST_VARIANCE = 1e-12  # before the first innovation
 FACTOR = 9.0  # contradiction: errors are three times what they can be
@@ -36,12 +37,15 @@ LONGEST_PATIENCE = 600.0  # [s]
 RELAPSE = 4.0  # times as long as the last time
 FORGIVEN_S = 300.0  # in which that is forgotten
 STRAIGHT = 0.6  # [m/s^2] a_y up to which it is tried again: there the wheels tell the motion
-SUSPECTED = 0.8  # of odd_least, where it is tried again: a relapse is found out within a second
+SLOW_FOOT, SLOW_PEAK = 3.0, 6.0  # [m/s] tight turns of parking lie outside the model's range, and test nothing
 
 
 @compiled
-def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, health: int) -> None:
-    """Renew memory.trust by the beliefs, the innovations and the health of the block."""
+def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int) -> None:
+    """Update memory.trust by the beliefs, the innovations and the health of the block.
+
+    `ratio` is the axles' squared innovation of the block over its stated variance.
+    """
     if not design.adaptive:
         return
     trust, constants = memory.trust, design.constants
@@ -52,12 +56,14 @@ def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, health:
     if trust.distrust > 0.0:
         trust.left -= duration
         if trust.left <= 0.0 and abs(memory.last.ay) < STRAIGHT:
-            trust.distrust, trust.odd = 0.0, SUSPECTED * constants.odd_least
-            memory.actual[1] = memory.theoretical[1] = memory.stated = 0.0
+            trust.distrust, trust.odd, trust.ratio = 0.0, 0.0, 0.0
+            memory.actual[1] = memory.theoretical[1] = 0.0
             memory.factor[1] = 1.0
         return
     keep = math.exp(-duration / FORGIVEN_S)
-    pace = axles_ratio(memory.actual[1], memory.stated) / constants.window
+    fading = math.exp(-duration / constants.window)
+    trust.ratio = fading * trust.ratio + (1.0 - fading) * unexplained(memory, design, ratio)
+    pace = axles_ratio(trust.ratio) / constants.window
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
     if health & flags.RESET:
@@ -65,6 +71,28 @@ def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, health:
     if trust.odd >= constants.odd_least:
         trust.patience = min(max(RELAPSE * trust.patience, constants.patience), LONGEST_PATIENCE)
         trust.left, trust.distrust, trust.odd = trust.patience, 1.0, constants.odd_least
+
+
+@compiled
+def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
+    """Return what of `ratio`, squared innovations over their variance, neither a slide nor slippery road explains.
+
+    A wheel that slides, or a road that is believed slippery, makes the axles' forces unlike those of the model for a
+    while. Tight turns at walking pace are outside the model's range.
+    """
+    speed = abs(memory.overall_mean[NodeState.VX])
+    moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
+    return moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio
+
+
+@compiled
+def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
+    """Return the probability that the mean friction of the two sides lies below SLIPPERY_MU."""
+    total = 0.0
+    for j in range(ALL_NODES if memory.split else NODES):
+        if 0.5 * (design.sides.mu[j, 0] + design.sides.mu[j, 1]) < SLIPPERY_MU:
+            total += memory.weight[j]
+    return total
 
 
 @compiled
@@ -90,12 +118,6 @@ def strained_noise(trust: Trust, constants: Constants) -> float:
 
 
 @compiled
-def strained_evidence(trust: Trust) -> float:
-    """Factor on the evidence on friction by strain; twice as much of a level car's read ice on a dry slalom."""
-    return 1.0 / max(trust.strain, 1.0)
-
-
-@compiled
 def likeness(trust: Trust, constants: Constants) -> float:
     """How much the car is as its file says, 0 to 1: 0 from the usual strain on."""
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
@@ -108,6 +130,6 @@ def credence(trust: Trust, constants: Constants) -> float:
 
 
 @compiled
-def axles_ratio(actual: float, stated: float) -> float:
-    """Log-likelihood ratio of the innovation variance of both axles; an R that was adapted has explained nothing."""
-    return (1.0 - 1.0 / FACTOR) * actual / max(stated, LEAST_VARIANCE) - math.log(FACTOR)
+def axles_ratio(ratio: float) -> float:
+    """Return the log-likelihood ratio of FACTOR times the stated variance against the stated one."""
+    return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.adaptation.fuzzy import adapted
+from edge_agent.adaptation.rule_base import evidence_share
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import reweigh
@@ -15,7 +16,7 @@ from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
 from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.trust import credence, strained_evidence
+from edge_agent.estimators.friction_mixture.trust import credence
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
@@ -48,7 +49,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
     scratch.stated_sum, surplus = 0.0, 1.0 - 1.0 / scratch.features.axle_scale
     top, nis, rows = -math.inf, 0.0, 0
-    scratch.features.novelty = novelty(memory.usual_force, scratch.features, design.constants)
+    features, steady = scratch.features, design.constants.steady_share
+    features.new = novelty(memory.usual_force, features, design.constants)
+    features.novelty = steady + (1.0 - steady) * features.new
     for j in range(count):
         factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
         found = update_node(memory, design, scratch, j, inflation)
@@ -86,8 +89,13 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
         best = max(best, scratch.log_likelihood[j])
     need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
-    share = features.novelty / (1.0 + need) * (strained_evidence(memory.trust) if design.adaptive else 1.0)
-    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * credence(memory.trust, constants)
+    slid = memory.slip.held
+    share = features.novelty / (1.0 + need)
+    if design.adaptive:
+        share = math.exp(evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain))
+    believed = credence(memory.trust, constants)
+    believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
+    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants.plausible_loss, 0.0)
@@ -122,7 +130,7 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 
 @compiled
 def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
-    """Share of the evidence that is new: forces against their smoothed past `usual` (6,), moved on by a block."""
+    """Return the membership of the forces in "new": against their smoothed past `usual` (6,), moved on by a block."""
     keep = math.exp(-features.duration / constants.steady_time)
     most = 0.0
     for r in range(6):
@@ -130,8 +138,7 @@ def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) ->
         if not math.isnan(force):
             most = max(most, abs(force - usual[r]))
             usual[r] = keep * usual[r] + (1.0 - keep) * force
-    least = constants.steady_share
-    return float(least + (1.0 - least) * most * most / (most * most + constants.steady_half**2))
+    return most * most / (most * most + constants.steady_half**2)
 
 
 @compiled
@@ -142,8 +149,6 @@ def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> Non
         if scratch.theoretical_sum[group] > 0.0:
             memory.actual[group] = keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
             memory.theoretical[group] = keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
-            if group == 1:
-                memory.stated = keep * memory.stated + (1.0 - keep) * scratch.stated_sum
             if design.adaptive:
                 memory.factor[group] = adapted(
                     memory.factor[group], memory.actual[group], memory.theoretical[group],

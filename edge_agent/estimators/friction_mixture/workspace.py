@@ -23,10 +23,12 @@ class BlockFeatures:
     sin: float
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # mean [rad/s]
-    novelty: float  # share of the forces that is new [1]
-    demand: float  # largest force over load of any wheel [1]
+    novelty: float  # share of the forces that is new, with the floor `steady_share` [1]
+    new: float  # membership of the forces in "new" [1]
+    demand: float  # larger force over load of the two axles [1]
     change: float  # measured a_x, mean [m/s^2]
-    steer_rate: float  # of the front wheels [rad/s]
+    steering: float  # mean angle of the front wheels [rad]
+    steer_rate: float  # of it [rad/s]
     asymmetry: float  # slip left against right beyond force and noise, in force over load [1]
     loads: Annotated[FloatArray, 4]  # [N]
     spin: Annotated[FloatArray, 4]  # wheel acceleration [rad/s^2]

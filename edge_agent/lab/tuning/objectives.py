@@ -31,8 +31,9 @@ from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
 from edge_agent.lab.simulation.scenarios import drawn
 from edge_agent.lab.tuning.search import Objective
 from schemas.errors import InputError
-from schemas.numeric import FloatArray
+from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CHANNELS, per_wheel
+from schemas.thresholds import SLIPPERY_MU, SURFACES
 from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
@@ -79,7 +80,13 @@ HELD_OUT: Final = (
     TuningDrive("j-turn", "sedan", 0.90, 910, "hilly"),
     TuningDrive("pulses", "van", 0.50, 911, "rolling"),
 )
-TOWNS: Final = {"train": ((61,), 6), "held_out": ((901, 902), 6)}  # seeds of towns, and rough cars in each
+TOWNS: Final = {"train": ((61, 62), 8), "held_out": ((901, 902), 8)}  # seeds of towns, and cars in each
+ROUGH_SHARE: Final = 0.5  # of these cars
+MOST_FALSE_ICE: Final = 0.0012  # share of the samples on wet and dry road up to which false ice costs nothing more
+FALSE_ICE_PRICE: Final = 60.0  # of interval score, for each share of 1 beyond it
+MISSED_ICE_PRICE: Final = 0.5  # of interval score, for a share of 1
+SURE_MARGIN: Final = 0.04  # below SLIPPERY_MU: closer to it slippery cannot be told from not
+FELT_SHARE: Final = 0.9  # of the friction in use, from which a slippery road is felt
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,8 @@ class TuningSet:
     vehicles: tuple[Vehicle, ...]
     t: FloatArray  # (T, N) [s]
     signals: FloatArray  # (T, N, channels)
-    mu: FloatArray  # (T, N) true friction, mean of the wheels; NaN where nobody knows it
+    mu: FloatArray  # (T, N) true friction, mean of the wheels; NaN where unknown
+    used: FloatArray  # (T, N) largest share of its friction that a wheel uses; NaN where unknown
 
 
 @dataclass(frozen=True)
@@ -100,11 +108,20 @@ class TuningScores:
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
     log_likelihood: float  # more is better [nat/s]
     nis_ratio: float  # near 1 where the stated covariance is right [1]
+    surface_score: float = math.nan  # interval score, mean over the kinds of surface; less is better [1]
+    false_ice: float = math.nan  # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
+    missed_ice: float = math.nan  # share of the samples on felt ice and snow whose interval does not [1]
+
+
+def detection_cost(scores: TuningScores) -> float:
+    """Return the interval score with prices on false and on missed ice: neither may be bought with the other."""
+    false_ice = max(scores.false_ice - MOST_FALSE_ICE, 0.0)
+    return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
 
 
 # objective by name -> the number to maximise
 OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
-    "interval": lambda scores: -scores.interval_score,
+    "interval": lambda scores: -detection_cost(scores),
     "innovation": lambda scores: scores.log_likelihood,
     "predictive": lambda scores: scores.log_likelihood - CALIBRATION * math.log(max(scores.nis_ratio, LEAST_NIS)) ** 2,
 }
@@ -112,7 +129,7 @@ OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
 
 def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
     """Simulate the drives, each `duration_s` [s] long."""
-    signals, truth, vehicles = [], [], []
+    signals, truth, used, vehicles = [], [], [], []
     for drive in drives:
         log, vehicle = simulate_manoeuvre(
             drive.manoeuvre, mu=drive.mu, seed=drive.seed, rate_hz=RATE_HZ, duration_s=duration_s,
@@ -120,9 +137,10 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
         )  # fmt: skip
         signals.append(np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(np.float64))
         truth.append(np.mean([log[name].to_numpy() for name in per_wheel("true_mu")], axis=0))
+        used.append(np.max([log[name].to_numpy() for name in per_wheel("true_utilisation")], axis=0))
         vehicles.append(vehicle)
     t = np.arange(len(signals[0]))[:, None] / RATE_HZ + np.zeros(len(drives))
-    return TuningSet(tuple(vehicles), t, np.stack(signals, axis=1), np.stack(truth, axis=1))
+    return TuningSet(tuple(vehicles), t, np.stack(signals, axis=1), np.stack(truth, axis=1), np.stack(used, axis=1))
 
 
 def record_all(name: str, duration_s: float) -> TuningSet:
@@ -137,15 +155,19 @@ def record_all(name: str, duration_s: float) -> TuningSet:
         t,
         np.concatenate([one.signals for one in sets], axis=1),
         np.concatenate([one.mu for one in sets], axis=1),
+        np.concatenate([one.used for one in sets], axis=1),
     )
 
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
-    """Rough cars in the town that the seed draws, from WARM_S on."""
-    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=1.0)
+    """Cars in the town that the seed draws, from WARM_S on; a share of them is rough."""
+    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
     t, signals = fleet.step(round(duration_s * RATE_HZ))
-    return TuningSet(tuple(fleet.vehicles), t - t[0], signals, fleet.truth.mu_wheel.mean(axis=-1))
+    truth = fleet.truth
+    return TuningSet(
+        tuple(fleet.vehicles), t - t[0], signals, truth.mu_wheel.mean(axis=-1), truth.utilisation.max(axis=-1)
+    )
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
@@ -166,7 +188,25 @@ def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> Tu
         coverage=float(np.where(np.isnan(truth), np.nan, (lower <= truth) & (truth <= upper)).mean()),
         log_likelihood=float(np.maximum(log_likelihoods, WORST).mean()) * rate_hz,
         nis_ratio=float(np.nanmean(estimates.innovation_nis[settled])),
+        **detection_scores(lower, upper, truth, drives.used[settled]),
     )
+
+
+def detection_scores(lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray) -> dict[str, float]:
+    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N); NaN where no sample decides."""
+    score = interval_score(lower, upper, truth)
+    surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
+    called = upper < SLIPPERY_MU
+    felt = (truth < SLIPPERY_MU - SURE_MARGIN) & (used >= FELT_SHARE)
+    return {
+        "surface_score": float(np.mean([score[met].mean() for met in surfaces if met.any()] or [np.nan])),
+        "false_ice": _share(called, truth > SURFACES["wet"][0]),
+        "missed_ice": _share(~called, felt),
+    }
+
+
+def _share(of: BoolArray, among: BoolArray) -> float:
+    return float(of[among].mean()) if among.any() else 0.0
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:

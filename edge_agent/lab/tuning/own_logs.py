@@ -46,4 +46,5 @@ def _side_by_side(parts: Sequence[tuple[SignalLog, Vehicle, int]], samples: int)
         ],
         axis=1,
     )
-    return TuningSet(tuple(vehicle for _, vehicle, _ in parts), t, signals, np.full(t.shape, np.nan))
+    unknown = np.full(t.shape, np.nan)
+    return TuningSet(tuple(vehicle for _, vehicle, _ in parts), t, signals, unknown, unknown)

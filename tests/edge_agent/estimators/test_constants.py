@@ -50,20 +50,22 @@ MOVES = {
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
-    "split_asymmetry": Move("split probability", "split-braking", 0.985),  # they wake later
+    "split_asymmetry": Move("split probability", "split-braking", 0.99),  # they wake later
     # how much a block counts
-    "demand_half": Move("width", "constant-radius", 1.5),  # the same force tells less
+    "demand_half": Move(
+        "least probabilities", "braking", 0.3
+    ),  # what is not taken as evidence is charged to more nodes
     "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
     "plausible_loss": Move("least probabilities", "constant-radius", 1.1),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
     "abrupt_share": Move("upper", "joints", 0.9, LESS),  # a bump reads as slip
     "abrupt_time": Move("upper", "joints", 0.99, LESS),  # ... sooner
-    "steady_half": Move("width", "constant-radius", 1.12),
-    "steady_share": Move("width", "constant-radius", 0.9),
-    "sliding_slope": Move("upper", "constant-radius", 1.2),  # more nodes pay for sliding: those of little friction
-    "sliding_penalty": Move("lower", "constant-radius", 1.05),
-    "axle_penalty": Move("upper", "slalom", 0.88),  # saturated nodes, of little friction, gain
+    "steady_half": Move("width", "constant-radius", 1.05),
+    "steady_share": Move("std VY", "constant-radius", 0.9),
+    "sliding_slope": Move("upper", "constant-radius", 1.08),  # more nodes pay for sliding: those of little friction
+    "sliding_penalty": Move("lower", "constant-radius", 1.03),
+    "axle_penalty": Move("upper", "constant-radius", 0.8),  # saturated nodes, of little friction, gain
     # limits
     "farthest": Move("penalty", "braking", 0.5, LESS),  # nodes may not go to where they would be charged
     "huber": Move("nis", "stopping", 5.0, LESS),  # R is inflated by what is refused, and follows it less
@@ -79,8 +81,18 @@ MOVES = {
     "stiffness_time": Move("std STEER", "turn and straight", 0.88),
     "stiffness_power_x": Move("nis", "acceleration", 0.6),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
-    "informing_x": Move("std LN_KX", "j-turn", 1.07),
+    "informing_x": Move("std LN_KX", "j-turn", 1.05),
     "informing_y": Move("std LN_KY", "pulses", 1.15),
+    "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
+    "compliance_mean": Move("strain", "constant-radius", 1.1),  # a car whose axle does not yield is not as expected
+    "compliance_std": Move("std COMPLIANCE", "stopping", 2.5),
+    "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),  # they are forgotten sooner
+    "spin_share": Move("nis", "braking", 0.9),
+    # wheels that slide
+    "slip_time": Move("least probabilities", "acceleration", 1.04, LESS),
+    "slip_change": Move("least probabilities", "acceleration", 1.1),  # the road may be any other sooner
+    "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
+    "rear_unlike": Move("adaptation", "acceleration", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
     # sensors
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
@@ -96,7 +108,7 @@ MOVES = {
     "bank_length": Move("std BANK", "braking", 1.2, LESS),  # it is another one sooner
     "slope_time": Move("std BANK", "acceleration", 1.05, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
-    "wheel_std": Move("std RADIUS", "standing", 2.5),
+    "wheel_std": Move("std RADIUS", "standing", 2.0),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
@@ -108,13 +120,13 @@ MOVES = {
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.97),
-    "angle_share": Move("std STEER", "slalom", 1.25),
+    "angle_share": Move("vy_std", "constant-radius", 1.25),
     "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
     "floor_x": Move("nis", "acceleration", 0.9),
     "floor_y": Move("nis", "j-turn", 0.86),
-    "force_share": Move("nis", "split-braking", 0.75),
+    "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
-    "shape_share": Move("nis", "acceleration", 0.92),
+    "shape_share": Move("nis", "acceleration", 0.95),
     "lag": Move("nis", "turn and straight", 0.94),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.89),
@@ -144,7 +156,7 @@ MOVES = {
     "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
     "distrust_noise": Move("nis", "side force without turning", 0.97, LESS),  # it no longer follows what it distrusts
     "distrust_drift": Move("vy_std", "side force without turning", 1.5),
-    "distrust_forget": Move("BIAS_Y", "side force without turning", 1.2),  # what was learned is kept for longer
+    "distrust_forget": Move("std RADIUS", "side force without turning", 0.9),  # what was learned is kept for longer
 }
 
 

@@ -18,6 +18,8 @@ from edge_agent.lab.tuning.objectives import (
     TuningScores,
     TuningSet,
     choices,
+    detection_cost,
+    detection_scores,
     interval_score,
     objective_on,
     record,
@@ -62,13 +64,15 @@ def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
     single = [
         scores_of(
             Memberships(),
-            TuningSet((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]]),
+            TuningSet((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]], drives.used[:, [n]]),
             ESTIMATOR,
         )
         for n, vehicle in enumerate(drives.vehicles)
     ]
-    mean = np.mean([astuple(one) for one in single], axis=0)
-    np.testing.assert_allclose(astuple(scores_of(Memberships(), drives, ESTIMATOR)), mean, rtol=1e-12)
+    both = scores_of(Memberships(), drives, ESTIMATOR)
+    for name in ("interval_score", "coverage", "log_likelihood", "nis_ratio"):
+        mean = np.mean([getattr(one, name) for one in single])
+        np.testing.assert_allclose(getattr(both, name), mean, rtol=1e-12)
 
 
 def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
@@ -94,13 +98,27 @@ def test_each_objective_maximises_its_own_score(drives: TuningSet) -> None:
     vector = Memberships().to_vector()
     found = scores_of(Memberships(), drives, ESTIMATOR)
     assert set(OBJECTIVES) == {"interval", "innovation", "predictive"}
-    assert objective_on(drives, ESTIMATOR, "interval")(vector) == -found.interval_score
+    assert objective_on(drives, ESTIMATOR, "interval")(vector) == -detection_cost(found)
     assert objective_on(drives, ESTIMATOR, "innovation")(vector) == found.log_likelihood
 
 
 def test_vector_that_is_no_membership_counts_as_the_worst(drives: TuningSet) -> None:
     vector = Memberships().to_vector()
     assert objective_on(drives, ESTIMATOR, "interval")(np.full_like(vector, np.nan)) == -np.inf
+
+
+def test_false_and_missed_ice_are_counted_on_their_own_samples() -> None:
+    truth = np.array([0.1, 0.1, 0.9, 0.9])
+    upper = np.array([0.3, 0.8, 0.3, 1.0])
+    used = np.array([0.95, 0.95, 0.1, 0.1])
+    found = detection_scores(np.full(4, 0.05), upper, truth, used)
+    assert (found["false_ice"], found["missed_ice"]) == (0.5, 0.5)
+
+
+def test_false_ice_and_missed_ice_both_cost() -> None:
+    plain = TuningScores(0.5, 0.9, 300.0, 1.0, surface_score=0.5, false_ice=0.0, missed_ice=0.0)
+    for worse in ({"false_ice": 0.01}, {"missed_ice": 0.2}):
+        assert detection_cost(replace(plain, **worse)) > detection_cost(plain) + 0.05
 
 
 def test_an_unknown_objective_is_refused(drives: TuningSet) -> None:
@@ -126,7 +144,7 @@ def test_a_wrong_calibration_costs_a_prediction_alike_on_both_sides() -> None:
 
 def test_towns_stand_beside_manoeuvres_and_share_no_seed() -> None:
     both = record_all("train", 2.0)
-    assert len(both.vehicles) == len(TRAIN) + 6
+    assert len(both.vehicles) == len(TRAIN) + sum(TOWNS["train"][1] for _ in TOWNS["train"][0])
     assert both.signals.shape[:2] == both.mu.shape == (200, len(both.vehicles))
     assert not set(TOWNS["train"][0]) & set(TOWNS["held_out"][0])
 
@@ -157,7 +175,7 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         provenance.command
         == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --repeats 1 --objective {objective} --quick"
     )
-    assert min(scores, key=lambda way: scores[way].held_out.interval_score or np.inf) == tuned.document.winner
+    assert max(scores, key=lambda way: tune._worth(scores[way].held_out, objective)) == tuned.document.winner
     assert {way: len(found) for way, found in tuned.document.candidates.items()} == {"random": 1, "colony": 1}
     assert provenance.budget.evaluations == {"random": 6, "colony": 6}
 

@@ -1,0 +1,80 @@
+"""Slip that the wheel speeds show by themselves, without any belief about friction or motion.
+
+A wheel slides when it runs at another speed than the other wheels by more than tyre radii explain, or when it changes
+its speed faster than the car does. This is the evidence that anti-lock and traction control work with. The filter uses
+it in three places: as an input of the rule base (`adaptation/rule_base.py`), as an explanation of large innovations
+(`trust.py`), and as a sign that the road has just changed (`mixing.py`).
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.estimators.friction_mixture.block_features import at_centre
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.runtime.jit import compiled
+
+SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like slip
+APART_FOOT, APART_PEAK = 0.04, 0.08  # of the speed, between two wheels: may slide, slides
+SPIN_FOOT, SPIN_PEAK = 6.0, 12.0  # [m/s^2] of a wheel beyond the car's: may slide, slides
+SEEN = 0.3  # membership from which slip counts as having begun
+REAR_LAG_S = 0.1  # [s] beside the time that the rear axle needs to reach the place of the front axle
+
+
+@compiled
+def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
+    """Update memory.slip by the wheel speeds of the block."""
+    slip = memory.slip
+    seen = slip_membership(memory, features)
+    slip.begins = max(seen - slip.held, 0.0)
+    slip.held = max(seen, slip.held * math.exp(-features.duration / constants.slip_time))
+    slip.ended = slip.held - seen
+    if slip.begins > SEEN and front_slides_more(memory, features):
+        wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
+        slip.rear_unlike_until = memory.last.time + wheelbase / max(features.speed, SLOWEST_M_S) + REAR_LAG_S
+
+
+@compiled
+def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
+    """Return the membership, 0 to 1, of the block in "a wheel slides"."""
+    slowest = math.inf
+    fastest = -math.inf
+    spin = 0.0
+    for wheel in range(4):
+        speed = wheel_speed(memory, features, wheel)
+        if not math.isnan(speed):
+            slowest = min(slowest, speed)
+            fastest = max(fastest, speed)
+            spin = max(spin, abs(memory.row[Parameter.RADIUS] * features.spin[wheel] - features.change))
+    if fastest < SLOWEST_M_S:
+        return 0.0
+    apart = (fastest - slowest) / fastest
+    by_speed = (apart - APART_FOOT) / (APART_PEAK - APART_FOOT)
+    by_spin = (spin - SPIN_FOOT) / (SPIN_PEAK - SPIN_FOOT)
+    return float(min(max(by_speed, by_spin, 0.0), 1.0))
+
+
+@compiled
+def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
+    """Return True if a front wheel is farther from the speed of the car than the rear wheels are."""
+    front = 0.0
+    rear = 0.0
+    for wheel in range(4):
+        apart = abs(wheel_speed(memory, features, wheel) - memory.overall_mean[NodeState.VX])
+        if math.isnan(apart):
+            continue
+        if wheel < 2:
+            front = max(front, apart)
+        else:
+            rear = max(rear, apart)
+    return front > rear
+
+
+@compiled
+def wheel_speed(memory: MixtureMemory, features: BlockFeatures, wheel: int) -> float:
+    """Return the speed ahead [m/s] by one wheel, with its radius as believed; NaN without a reading."""
+    radius = 1.0 + memory.overall_mean[NodeState.RADIUS + wheel]
+    return float(at_centre(memory.row, features, wheel) * radius)
