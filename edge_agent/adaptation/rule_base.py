@@ -42,7 +42,8 @@ class RuleBase(NamedTuple):
 def rule_base(memberships: Memberships) -> RuleBase:
     """The rules with the vertices of `memberships`."""
     m = memberships
-    return RuleBase(np.array(m.far), np.array(WIDE), *m.consequents, np.array(m.shares), np.array(m.strained))
+    ln_noise, pace = m.consequents
+    return RuleBase(np.array(m.far), np.array(WIDE), ln_noise, pace, np.array(m.shares), np.array(m.strained))
 
 
 @compiled

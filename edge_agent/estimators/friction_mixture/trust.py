@@ -82,7 +82,7 @@ def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> f
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
-    return moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio
+    return float(moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio)
 
 
 @compiled

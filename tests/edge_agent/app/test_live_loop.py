@@ -116,9 +116,10 @@ def test_a_simulated_source_hands_its_context_to_the_observations(caplog: pytest
         abs_active[:, 0] = place % 50 > 40
         abs_active[:, 1] = 1.0
         parts[place] = replace(
-            block, context=context_block(
+            block,
+            context=context_block(
                 block.t.shape[0], block.t.shape[1], {"abs_active": abs_active, "air_temperature": -3.0}
-            )
+            ),
         )
     _, basket, _ = run(iter(parts), fleet, threading.Event(), clock=count(0.0, 0.1).__next__)
     plain = Basket()
