@@ -82,8 +82,8 @@ def require_valid_signals(log: SignalLog, vehicle: Vehicle) -> None:
         raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
 
 
-def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> None:
-    """Print on stderr the faults that the signal doctor finds in a log that is only estimated."""
+def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> list[str]:
+    """Print on stderr the faults that the signal doctor finds in a log; return notes to print after the estimates."""
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.fix import small_lags
 
@@ -93,11 +93,13 @@ def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> None:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
         print("warning: the estimates below mean nothing until that is mended; run edge-agent check", file=sys.stderr)
-    elif not diagnosis.passed:
+    notes = []
+    if not found and not diagnosis.passed:
         channels = ", ".join(diagnosis.unknown)
-        print(f"note: the signal doctor did not pass this log: it cannot judge {channels}", file=sys.stderr)
+        notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
     for device, seconds in small_lags(diagnosis).items():
-        print(f"note: {device} speaks {seconds:+.3f} s late; edge-agent check --fix takes it out", file=sys.stderr)
+        notes.append(f"note: {device} is {seconds:+.3f} s late; edge-agent check --fix corrects it")
+    return notes
 
 
 @contextmanager

@@ -85,8 +85,9 @@ def run(args: argparse.Namespace) -> int:
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
         require_valid_signals(log, vehicle)
+        notes = []
     else:
-        warn_about_faults(log, vehicle)
+        notes = warn_about_faults(log, vehicle)
     with EstimatesFile(args.out) as file:
         code = 0
 
@@ -99,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             for block in log.blocks(start_ns):
                 keep(block, bank.advance(block.t, block.signals))
-    print(plausibility.line(), file=sys.stderr)
+    print("\n".join([*notes, plausibility.line()]), file=sys.stderr)
     return code or (IMPLAUSIBLE if plausibility.problems() else 0)
 
 

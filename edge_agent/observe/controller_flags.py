@@ -37,7 +37,7 @@ REASONS: Final = {
 
 
 class FlagRecord:
-    """What is carried of one flag of one vehicle, as a record."""
+    """State of one flag of one vehicle, as a record."""
 
     time: float  # of its last sample [s]
     off: float  # for how long it was off without a break [s]

@@ -87,7 +87,7 @@ class Visit:
 
 
 class Sample:
-    """What an estimator reports at one sample, as a record."""
+    """Report of an estimator at one sample, as a record."""
 
     health: int
     speed: float  # [m/s]
@@ -132,7 +132,7 @@ def observe(
 
 
 class SampleNotes(NamedTuple):
-    """What some samples come with.
+    """Context of samples.
 
     row, told: where the friction became another within a visit (T, N), and what its part before told: row of (k, 32).
     context: (T, N, len(CONTEXT)); no rows where nothing is known.
@@ -244,7 +244,7 @@ def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
 
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
-    """What controllers and surroundings say at one more sample of a visit, (len(CONTEXT),)."""
+    """Add one sample of controllers and surroundings to a visit; the sample is (len(CONTEXT),)."""
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
@@ -313,7 +313,7 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
 
 
 def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
-    """What controllers and surroundings said during visits, (n,) each.
+    """Return the columns of controllers and surroundings of visits, (n,) each.
 
     A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of them, else unknown.
     """

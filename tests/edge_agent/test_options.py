@@ -91,7 +91,10 @@ ELSEWHERE = {
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS,
             "--vss": "test_the_command_prints_lines_of_the_drive"},
-    "fleet": {"--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not"},
+    "fleet": {
+        "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",
+        "--winter": "test_a_share_of_winter_vehicles_beyond_one_is_refused",
+    },
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
     "tune": {"log": "test_drives_of_one_s_own_are_searched_on", "--vehicle": "test_drives_of_one_s_own_are_searched_on",
              "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",

@@ -1,4 +1,4 @@
-"""What does not change while driving: the tables that the kernels read, made of the constants."""
+"""Tables that the kernels read and that do not change while driving, made from the constants."""
 
 from __future__ import annotations
 

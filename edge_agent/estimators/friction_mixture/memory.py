@@ -1,4 +1,4 @@
-"""What a bank carries from sample to sample: one record per vehicle."""
+"""State that a bank carries from sample to sample: one record per vehicle."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class VelocityGain:
 
 
 class BlockSums:
-    """What a block has gathered since it began."""
+    """Sums that a block has gathered since it began."""
 
     time: float  # at which it began [s]
     samples: int
@@ -79,7 +79,7 @@ class GripInUse:
 
 
 class RollingMotion:
-    """What wheels tell of the motion without a tyre."""
+    """Motion that wheels show without a tyre model."""
 
     moved_time: float  # at which a wheel last turned [s]
     disagreed_time: float  # at which wheels last disagreed [s]

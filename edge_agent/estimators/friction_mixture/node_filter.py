@@ -48,7 +48,7 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """What one node's update found."""
+    """Result of one node's update."""
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
     moved: float  # change of `belief_cost` [nat]

@@ -1,4 +1,4 @@
-"""What a block's update means for friction: likelihoods tempered by demand and novelty, and the adaptation of R."""
+"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and the adaptation of R."""
 
 from __future__ import annotations
 

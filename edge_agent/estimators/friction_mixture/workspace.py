@@ -11,7 +11,7 @@ from schemas.numeric import FloatArray
 
 
 class BlockFeatures:
-    """What the measurement equations need of a block.
+    """Inputs of the measurement equations, of one block.
 
     The mean velocity of the block is rotation(cos, sin)*v + gains, v at the block's beginning. Wheels are in the order
     fl, fr, rl, rr, axles front, rear; rows of measurement are the four wheels along, then the two axles across.
@@ -103,7 +103,7 @@ class Scratch:
 
 
 class MixtureContext:
-    """What the filters of a thread share."""
+    """Design and scratch memory that the filters of a thread share."""
 
     design: MixtureDesign
     scratch: Scratch

@@ -1,4 +1,4 @@
-"""What is wrong with a log: one finding a fault, with its evidence; and what was found to be in order.
+"""Findings of the signal doctor: one per fault, with its evidence, and the channels that are in order.
 
 A channel is sound when an identity that was excited enough holds it and no fault explains the drive nearly as well;
 it is unknown when nothing was said of it. Only a log whose channels are all sound has passed.

@@ -77,3 +77,9 @@ def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
     assert warned == {"sim-001", "sim-004"}
     assert {one["way"] for one in lines if one.get("event") == "warning"} == {"route"}
     assert main([*words, "--warned", "2"]) == 2
+
+
+def test_a_share_of_winter_vehicles_beyond_one_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["fleet", "--scenario", "test", "--estimator", "ckf", "--vehicles", "2", "--duration", "1"]
+    assert main([*words, "--winter", "2"]) == 2
+    assert "error: winter: " in capsys.readouterr().err

@@ -21,7 +21,8 @@ def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> Non
     tuned = create(name, [vehicle], memberships=shipped(TUNED[name])).advance(t, signals)
     untuned = create(name, [vehicle], memberships=Memberships()).advance(t, signals)
     assert np.array_equal(reported.vx, tuned.vx)
-    assert not np.array_equal(reported.vx, untuned.vx)
+    if shipped(TUNED[name]) != Memberships():  # the default's hand-set vertices did best
+        assert not np.array_equal(reported.vx, untuned.vx)
 
 
 @pytest.mark.parametrize("name", TUNED)
