@@ -1,4 +1,4 @@
-"""What every estimator of the bank promises: causality, bit-equality, honesty without excitation, no NaN."""
+"""Promises of every estimator of the bank: causality, bit-equality, honesty without excitation, no NaN."""
 
 from __future__ import annotations
 

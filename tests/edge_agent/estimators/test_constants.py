@@ -30,7 +30,7 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """What changing a constant does to a figure of a drive."""
+    """Effect of changing a constant on a figure of a drive."""
 
     figure: str
     drive: str

@@ -1,4 +1,4 @@
-"""What the default promises on roads and in cars that are not level, aligned or synchronous."""
+"""Promises of the default estimator on roads and in cars that are not level, aligned or synchronous."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # once a second
 
 
 def told_at(t: float) -> dict[str, float]:
-    """What is true at a time."""
+    """Return the truth at a time."""
     flags = {name: float(first <= t < last) for name, (first, last) in FLAGS_AT.items()}
     return flags | {"air_temperature": AIR, "wiper": WIPES}
 

@@ -1,4 +1,4 @@
-"""What is learned of the vehicles: their weight, and how far their values fall with the grip they leave unused."""
+"""Vehicles' weights, and how far their values fall with the grip they leave unused, are learned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plot says of itself, and that an estimator is known by its colour."""
+"""Plots state what they show, and an estimator has one colour in all of them."""
 
 from __future__ import annotations
 
