@@ -28,6 +28,7 @@ RESTING_TIME = 1.0  # [s] smoothing of a_x while wheels stand
 STARTS = 0.25  # [m/s^2] from there within which the car does not start or stop
 SLOW_M_S = 3.0  # a faster car whose wheels stand has locked them, or the filter is lost:
 SLIDES_M_S2 = 1.0  # a car with locked wheels decelerates by more on all but the slipperiest ice
+LOCKED_SHARE = 0.1  # of the speed: wheels that all turn slower while the car decelerates are locked
 LOST_S = 2.0  # [s] until wheels that stand without that are those of a car that stands
 LONGEST_SLIDE_S = 10.0  # [s] of a car with locked wheels
 AGREE_FLOOR = 0.15  # [m/s] within which wheels always agree
@@ -56,7 +57,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
     still = seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
     _stand(memory, constants, features, still)
-    locked = still and features.speed >= SLOW_M_S and not rolling.stands
+    held = fastest < LOCKED_SHARE * features.speed and abs(features.change) > SLIDES_M_S2
+    locked = features.speed >= SLOW_M_S and (held or (still and not rolling.stands))
     if seen < 3 or locked:
         rolling.disagreed_time = time
         return
