@@ -3,15 +3,16 @@
 **Strain** is the chi-square of what is believed of vehicle and sensors against its prior, over the degrees of freedom
 that have been learned (Birge 1932). Errors share their cause: where offsets, radii, lags and steering are found to be
 small, the axles' other errors are small as well, and where much had to be believed, they are not. So strain scales R
-of the axles, and divides the evidence on friction.
+of the axles, and is an input of the rules that take a share of the evidence on friction.
 
 **Contradiction** is a test of two hypotheses in sequence (after Page 1954): that the model holds, and that the axles'
 innovations have FACTOR times the variance that it states: late steering, a race track's bank. Ice that explains the
 data is no sign of it, nor is a far belief alone. Likelihood ratios add up to `odd` [nat] where they speak against the
 model, and fade within minutes; a straight, on which it could not fail, does not speak for it. At `odd_least` nothing is
 concluded any more: the interval goes back to the prior, the axles have no say in the motion, and what was learned
-meanwhile is forgotten. Then the data test nothing, and the model is tried again after `patience` [s], four times as
-long with each relapse: sensors stay as they are. Motion that had to be called back by the wheels is half a
+meanwhile is forgotten. The test leaves out slides, road believed slippery and walking pace (`unexplained`). Then the
+data test nothing, and the model is tried again after `patience` [s], four times as long with each relapse: sensors
+stay as they are. Motion that had to be called back by the wheels is half a
 contradiction by itself.
 """
 
