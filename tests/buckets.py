@@ -98,7 +98,7 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
 
 def held(root: Path) -> dict[str, bytes]:
     """Return the files of an archive that must be in its copy."""
-    from fleet_service.archive.copies import FOLDERS
+    from fleet_service.replication.replica import FOLDERS
 
     paths = [path for name in FOLDERS for path in (root / name).rglob("*") if path.is_file()]
     return {

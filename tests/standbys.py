@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fleet_service.archive.copies import BucketReplica
+from fleet_service.replication.replica import BucketReplica
 from tests.buckets import BucketServer
 from tests.faults.processes import Part
 

@@ -44,17 +44,18 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "ingest": {"fusion", "archive"},
         "serve": {"fusion"},
         "replay": {"fusion", "archive", "ingest"},
-        "shards": {"archive"},
+        "replication": {"archive"},
+        "shards": set(),
         "enrolment": set(),
         "client": set(),
         "page": {"archive", "client"},
-        "app": {"fusion", "archive", "ingest", "serve", "replay", "shards", "enrolment"},
+        "app": {"fusion", "archive", "ingest", "serve", "replay", "replication", "shards", "enrolment"},
         "analytics": {"fusion", "archive", "serve", "replay"},
         "lab": {"fusion", "archive", "ingest", "serve", "replay", "app"},
-        "cli": {"archive", "shards", "app", "client", "page", "enrolment", "analytics", "lab"},
+        "cli": {"archive", "replication", "shards", "app", "client", "page", "enrolment", "analytics", "lab"},
     },
 }
-MOST_ARROWS = {"edge_agent": 30, "fleet_service": 32}
+MOST_ARROWS = {"edge_agent": 30, "fleet_service": 34}
 JUDGED_BY = "lab"  # nothing that is judged imports what judges; commands start both
 
 # The pure core takes time and randomness as arguments and does no input or output.

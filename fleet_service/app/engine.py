@@ -23,7 +23,6 @@ from fleet_service.app.memory import SLOTS, ServiceState, load_state, visitor_ta
 from fleet_service.app.past import HistoricalMaps, PastQuery
 from fleet_service.app.precompile import warm_up
 from fleet_service.app.tasks import Tasks
-from fleet_service.archive.bucket import CopyError
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
@@ -43,10 +42,11 @@ from fleet_service.ingest.weather import files as weather_files
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.restart import image_of
+from fleet_service.replication.bucket import CopyError
+from fleet_service.replication.ownership import Ownership, open_exclusive
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer, size_asked
 from fleet_service.serve.tile_cache import TileCache
-from fleet_service.shards.holding import Ownership, open_exclusive
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
@@ -98,7 +98,8 @@ class Engine:
         self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
         self._guard = threading.Lock()
         self._acks, self._now = Acks(), 0
-        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy, self.holding.epoch)
+        upload = None if self.copy is None else self.copy.upload_segments
+        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, upload, self.holding.epoch)
         self._wanted = Tasks()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
         memory = load_state(root, config, set_aside)

@@ -23,12 +23,12 @@ from fleet_service.app import beside
 from fleet_service.app.engine import Engine
 from fleet_service.app.memory import load_state
 from fleet_service.archive import requests
-from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.requests import Erasure
 from fleet_service.archive.retention import destroy_key, erase_files, forget_witness, key_of
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
+from fleet_service.replication.replica import BucketReplica
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 

@@ -25,10 +25,10 @@ from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
+from fleet_service.replication.ownership import Ownership
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 from fleet_service.shards import moving
-from fleet_service.shards.holding import Ownership
 from fleet_service.shards.serving import announce_regions as serving_regions
 from fleet_service.shards.serving import claim_regions, watch_successors
 from schemas import grid, keys, wire

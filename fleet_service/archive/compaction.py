@@ -21,7 +21,7 @@ from typing import BinaryIO, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, reading, readme, segments, terms
+from fleet_service.archive import layout, reading, readme, segments
 from fleet_service.archive.files import COMPACTED, lock_file, sync_tree, write_table
 from fleet_service.archive.load import conform_columns, content, set_aside
 from fleet_service.archive.version import KEY, VERSION
@@ -79,7 +79,7 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
     total = CompactionResult(0, 0, 0)
     with hold_compaction_lock(root):
         readme.keep(root)
-        term = terms.read_epoch(root)
+        term = layout.read_epoch(root)
         for kind in Kind:
             waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
             done = reading.compacted_partitions(layout.compacted_files(root, kind), {path.name for path in waiting})

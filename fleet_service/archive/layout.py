@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -23,12 +24,14 @@ from typing import Final, NamedTuple
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import IntArray
+from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
 TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the measurement, by which rows are kept
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old, and its month
 CHECKPOINTS: Final = "checkpoints"  # a folder
+EPOCH_FILE: Final = "term"  # holds the epoch of the service that owns the folder
 DAY_NS: Final = 86_400_000_000_000
 # Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
 MAP_DAYS: Final = 31
@@ -151,3 +154,20 @@ def age(name: str) -> tuple[int, int, str]:
     """Return a sort key of segments, and of files with their rows, from old to new: epoch, number, shard."""
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard
+
+
+def read_epoch(root: Path) -> int:
+    """Return the epoch of the service that owns an archive folder; 0 without terms."""
+    with suppress(OSError, ValueError):
+        return int((root / EPOCH_FILE).read_text())
+    return 0
+
+
+def write_epoch(root: Path, epoch: int) -> None:
+    """Write this epoch into the names of files compacted from now on.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with open_durably(root / EPOCH_FILE) as file:
+        file.write(f"{epoch}\n".encode())

@@ -7,19 +7,19 @@ settled.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.segments import Rows, Writer
 from schemas.wire import Kind
 
 Batch = TypeVar("Batch")
+Upload = Callable[[Sequence[Path]], None]
 
 
 class _Load(Generic[Batch]):
@@ -41,16 +41,16 @@ class _Load(Generic[Batch]):
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches
 
-    def write(self, writer: Writer, copy: BucketReplica | None) -> None:
-        """Write each kind that is not written yet, then make all of it durable, in the bucket too."""
+    def write(self, writer: Writer, upload: Upload | None) -> None:
+        """Write each kind that is not written yet, then make all of it durable, by `upload` too."""
         for kind, waiting in self.waiting.items():
             if waiting:
                 rows = {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
                 self.segments.append(writer.write(kind, rows))
                 self.waiting[kind] = []
         writer.sync()
-        if copy is not None:
-            copy.upload_segments(self.segments)
+        if upload is not None:
+            upload(self.segments)
 
 
 class SegmentLog(Generic[Batch]):
@@ -59,12 +59,12 @@ class SegmentLog(Generic[Batch]):
     Args:
         root: of the archive.
         shard: name of the service.
-        copy: of the archive; with one, durable means in both places.
+        upload: makes segments durable in a second place; with one, a batch is settled when it is in both places.
         epoch: smallest epoch, from the lease.
     """
 
-    def __init__(self, root: Path, shard: str, copy: BucketReplica | None = None, epoch: int = 0) -> None:
-        self._writer, self._copy = Writer(root, shard, epoch), copy
+    def __init__(self, root: Path, shard: str, upload: Upload | None = None, epoch: int = 0) -> None:
+        self._writer, self._upload = Writer(root, shard, epoch), upload
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
@@ -108,7 +108,7 @@ class SegmentLog(Generic[Batch]):
             self._load.take(self._next)
             self._next = _Load()
             self._begun = time.monotonic()
-            self._written = self._thread.submit(self._load.write, self._writer, self._copy)
+            self._written = self._thread.submit(self._load.write, self._writer, self._upload)
 
     def end(self) -> list[Batch]:
         """Wait for the current write; return the batches that it made durable, each once.

@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.archive import layout, terms
+from fleet_service.archive import layout
 from fleet_service.archive.pseudonyms import load_or_create_key
 from schemas.numeric import IntArray
 from schemas.runtime.durable import open_durably, sync_directory
@@ -43,7 +43,7 @@ class VehicleIds:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._term = folder, terms.read_epoch(folder.parent)
+        self._folder, self._term = folder, layout.read_epoch(folder.parent)
         self._key: bytes | None = None
         self._known: set[int] | None = None
         self._unsynced: set[Path] = set()

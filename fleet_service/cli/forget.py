@@ -97,8 +97,8 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     Raises:
         InputError: its settings are unknown, and nothing was done; or it was not reached.
     """
-    from fleet_service.archive.copied import last_copy_url
-    from fleet_service.archive.copies import BucketReplica
+    from fleet_service.replication.replica import BucketReplica
+    from fleet_service.replication.upload_journal import last_copy_url
     from schemas.config import ServiceConfig, load
 
     config = load(path, ServiceConfig)

@@ -20,7 +20,7 @@ from schemas.runtime.process import force_exit, line_logger, log_as
 
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
-    from fleet_service.shards.holding import Ownership
+    from fleet_service.replication.ownership import Ownership
     from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
@@ -96,7 +96,7 @@ def _open_archive(
 ) -> Ownership | None:  # fmt: skip
     """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
     from fleet_service.app.metrics import standby_metrics
-    from fleet_service.shards.holding import acquire
+    from fleet_service.replication.ownership import acquire
     from fleet_service.shards.serving import standby_signs
     from schemas.runtime import watchdog
     from schemas.runtime.metrics import serve_metrics

@@ -23,9 +23,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import terms
 from fleet_service.archive.files import SEGMENT, write_table
-from fleet_service.archive.layout import DAY_NS, with_term
+from fleet_service.archive.layout import DAY_NS, read_epoch, with_term
 from fleet_service.archive.load import Damaged, load, skip_damaged
 from fleet_service.archive.segments import nanoseconds
 from fleet_service.fusion import Fusion
@@ -64,7 +63,7 @@ class WeatherInbox:
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
         self._folder, self.fusion, self._counts = root / FOLDER, fusion, counts
-        self._name = with_term(name, terms.read_epoch(root))
+        self._name = with_term(name, read_epoch(root))
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
@@ -181,7 +180,7 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
         OSError: a file cannot be read or written; nothing is lost.
     """
     days: dict[int, list[Path]] = {}
-    term = terms.read_epoch(root)
+    term = read_epoch(root)
     for path in files(root):
         days.setdefault(_day(path), []).append(path)
     saved = 0

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from fleet_service.app import beside, jobs
-from fleet_service.archive.copies import BucketReplica
 from fleet_service.cli import main
+from fleet_service.replication.replica import BucketReplica
 
 COMPACTING, COPYING = "compacting", "copying"
 BEGINS, ENDS = "begins", "ends"

@@ -18,11 +18,11 @@ import zenoh
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive import reading, segments
-from fleet_service.archive.copies import OWNER
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
+from fleet_service.replication.replica import OWNER
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Batch, Kind

@@ -12,16 +12,16 @@ import pytest
 import zenoh
 
 from fleet_service.app.service import Service
-from fleet_service.archive.bucket import ObjectBucket
 from fleet_service.cli import main
-from fleet_service.shards.holding import acquire
-from fleet_service.shards.lease import Lease
+from fleet_service.replication.bucket import ObjectBucket
+from fleet_service.replication.lease import Lease
+from fleet_service.replication.ownership import acquire
 from fleet_service.shards.serving import standby_signs
 from schemas.config import ServiceConfig, ZenohSettings
 from tests.buckets import BucketServer
 from tests.fleet_service.app.test_copy import BATCHES, known, reports
 from tests.fleet_service.app.test_service import Fleet
-from tests.fleet_service.shards.test_successor import driven
+from tests.fleet_service.replication.test_lease import driven
 from tests.waiting import until
 
 PATIENCE_S = 120.0

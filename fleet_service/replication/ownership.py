@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from fleet_service.archive import compaction, terms
-from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copies import FOLDERS, BucketReplica, open_replica
+from fleet_service.archive import compaction, layout
 from fleet_service.archive.files import lock_archive
-from fleet_service.shards.lease import Lease, Standby, forget_holder, holder_of
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.lease import Lease, Standby, forget_holder, holder_of
+from fleet_service.replication.replica import FOLDERS, BucketReplica, open_replica
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
@@ -150,7 +150,7 @@ def _leased(
                 raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
             copy.attach_lease(partial(_fresh, lease), lease.assert_not_superseded)
             if _sync_folder(config, root, copy, lease, stop, say):
-                terms.write_epoch(root, lease.term.epoch)
+                layout.write_epoch(root, lease.term.epoch)
                 return Ownership(lock_file, copy, lease)
             lease.release()
             if not lease.lost:

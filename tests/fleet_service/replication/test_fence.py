@@ -13,7 +13,7 @@ from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, join_dail
 from fleet_service.ingest.weather import archived_reports as archived_weather
 from schemas import keys, weather, wire
 from tests.buckets import BucketServer
-from tests.fleet_service.shards.test_successor import Machine
+from tests.fleet_service.replication.test_lease import Machine
 from tests.standbys import restored
 
 

@@ -11,15 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.archive import copies, layout, segments
-from fleet_service.archive.bucket import CopyError, ObjectBucket
+from fleet_service.archive import layout, segments
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.copied import last_copy_url
-from fleet_service.archive.copies import OWNER, BucketReplica
 from fleet_service.archive.load import set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.retention import retire_rows
+from fleet_service.replication import replica
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.replica import OWNER, BucketReplica
+from fleet_service.replication.upload_journal import last_copy_url
 from schemas.config import ServiceConfig, load
 from schemas.errors import InputError
 from schemas.wire import Kind
@@ -53,7 +54,7 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 def filled(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
     """A log with segments of both kinds, which are settled."""
-    log: SegmentLog[int] = SegmentLog(root, NAME, copy)
+    log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)
     for seed in seeds:
         for kind in Kind:
@@ -194,7 +195,7 @@ def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: 
 def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(copies, "SLOW_S", 1.0)
+    monkeypatch.setattr(replica, "SLOW_S", 1.0)
     bucket.away(kind)
     with closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy, pytest.raises(InputError) as told:
         copy.begin(NAME)

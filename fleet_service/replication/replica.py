@@ -18,12 +18,12 @@ from threading import Lock
 from typing import Final
 
 from fleet_service.archive import layout
-from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copied import Stamp, UploadJournal, stamp_of
 from fleet_service.archive.files import sync_tree
 from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.load import BAD
-from fleet_service.archive.terms import Fence, Term, fence_of, largest_epoch, put_fence
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.fence import Fence, Term, fence_of, largest_epoch, put_fence
+from fleet_service.replication.upload_journal import Stamp, UploadJournal, stamp_of
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably

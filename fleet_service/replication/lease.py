@@ -39,9 +39,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from fleet_service.archive import terms
-from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.terms import Term
+from fleet_service.archive import layout
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.fence import Term
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably
 
@@ -308,7 +308,7 @@ def forget_holder(root: Path) -> None:
         OSError: the identity cannot be removed.
     """
     (root / HOLDER).unlink(missing_ok=True)
-    (root / terms.NAME).unlink(missing_ok=True)
+    (root / layout.EPOCH_FILE).unlink(missing_ok=True)
 
 
 def _read(name: str, content: bytes) -> LeaseRecord:

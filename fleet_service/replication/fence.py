@@ -14,16 +14,12 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Iterable
-from contextlib import suppress
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from fleet_service.archive import layout
-from fleet_service.archive.bucket import ObjectBucket
-from schemas.runtime.durable import open_durably
+from fleet_service.replication.bucket import ObjectBucket
 
 FOLDER: Final = "fence"
-NAME: Final = "term"
 
 
 class Term(NamedTuple):
@@ -72,20 +68,3 @@ def fence_of(bucket: ObjectBucket) -> Fence:
 def largest_epoch(names: Iterable[str]) -> int:
     """Return the largest epoch in names, or 0."""
     return max((layout.term_of(name) or 0 for name in names), default=0)
-
-
-def read_epoch(root: Path) -> int:
-    """Return the epoch of the service that has a folder; 0 without terms."""
-    with suppress(OSError, ValueError):
-        return int((root / NAME).read_text())
-    return 0
-
-
-def write_epoch(root: Path, epoch: int) -> None:
-    """Write this epoch into the names of files compacted from now on.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    with open_durably(root / NAME) as file:
-        file.write(f"{epoch}\n".encode())

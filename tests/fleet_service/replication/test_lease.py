@@ -15,12 +15,12 @@ import pytest
 import zenoh
 
 from fleet_service.archive import compaction, segments
-from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.log import SegmentLog
-from fleet_service.shards.holding import Ownership, acquire, open_exclusive
-from fleet_service.shards.lease import Lease, holder_of
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.lease import Lease, holder_of
+from fleet_service.replication.ownership import Ownership, acquire, open_exclusive
+from fleet_service.replication.replica import BucketReplica
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
 from schemas.wire import Batch, Kind
@@ -146,7 +146,8 @@ class Machine:
         held = acquire(self.config, root, threading.Event(), say, signs)
         assert held is not None
         self.holding: Ownership = held
-        self.log: SegmentLog[int] = SegmentLog(root, self.config.name, held.copy, held.epoch)
+        upload = None if held.copy is None else held.copy.upload_segments
+        self.log: SegmentLog[int] = SegmentLog(root, self.config.name, upload, held.epoch)
 
     @property
     def copy(self) -> BucketReplica:
@@ -339,7 +340,7 @@ def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     now = [100.0]
     # The clock that stands still while a machine is suspended is not asked.
     clock = SimpleNamespace(monotonic=lambda: 0.0, clock_gettime=lambda _: now[0], time=time.time)
-    monkeypatch.setattr("fleet_service.shards.lease.time", clock)
+    monkeypatch.setattr("fleet_service.replication.lease.time", clock)
     lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)
     fresh = [lease.fresh]
     assert lease.wait(threading.Event(), print, lambda: 0, None)

@@ -1,0 +1,1 @@
+"""Ownership of an archive: lease, bucket replica and fencing of former owners."""
