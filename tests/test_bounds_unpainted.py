@@ -24,8 +24,9 @@ import pytest
 from fleet_service.analytics import output, synthetic
 from fleet_service.analytics.plots import paint
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.archive import readme, rollup, snapshots
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import readme, snapshots
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main
 from fleet_service.fusion import Fusion
 from fleet_service.serve.encode import cell_table, encode

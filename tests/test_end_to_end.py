@@ -13,7 +13,7 @@ import zenoh
 from deploy.router import open_router
 from edge_agent.cli import main as edge_agent
 from fleet_service.app.service import Service
-from fleet_service.archive import reading
+from fleet_service.archive.format import reading
 from schemas import mugrid
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session

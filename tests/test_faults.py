@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import pseudonyms
-from fleet_service.archive.segments import Writer
+from fleet_service.archive.format.segments import Writer
+from fleet_service.archive.identity import pseudonyms
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from deploy.demo import compare, page, picture, processes, screenshot
 from deploy.demo.listener import Listener
 from edge_agent.lab.simulation.scenarios import scenario_named
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli.common import stop_on_signals
 from schemas.config import ZenohSettings
 from schemas.runtime import figures

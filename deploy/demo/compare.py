@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from edge_agent.lab.simulation.listeners import warned_ones
-from fleet_service.archive import reading
+from fleet_service.archive.format import reading
 from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray

@@ -10,8 +10,8 @@ from typing import Any, Final, TypeAlias
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, snapshots
-from fleet_service.archive.export import Extract
+from fleet_service.archive.export.extract import Extract
+from fleet_service.archive.format import layout, snapshots
 from schemas.errors import InputError
 from schemas.runtime import spark
 from schemas.thresholds import EXCITED_SHARE, NS

@@ -17,9 +17,9 @@ from fleet_service.analytics import output, synthetic
 from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.archive import layout
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.export import Extract
+from fleet_service.archive.export.extract import Extract
+from fleet_service.archive.format import layout
+from fleet_service.archive.maintenance.compaction import compact
 from schemas.wire import Kind
 
 WORLD = synthetic.SyntheticFleet(rows=60_000, days=3, vehicles=60, roads=16, length=80, icy=4)

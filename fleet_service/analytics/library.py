@@ -12,8 +12,8 @@ from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import map_at
 from fleet_service.analytics.questions import question_of
-from fleet_service.archive.export import Box, Extract
-from fleet_service.archive.layout import require_archive
+from fleet_service.archive.export.extract import Box, Extract
+from fleet_service.archive.format.layout import require_archive
 from schemas.config import moment
 
 

@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 
 from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, Scale, Value, render
 from fleet_service.analytics.questions import Question
-from fleet_service.archive import export, geo
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import geo
 from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import commandline
@@ -91,9 +92,9 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
             with open_durably(path) as file:
                 file.write(page(table, question).encode())
         elif path.name.endswith(".geo.parquet") or path.suffix == ".geojson":
-            export.write(add_geometry(table, question), path)
+            extract.write(add_geometry(table, question), path)
         else:
-            export.write(table, path)
+            extract.write(table, path)
 
 
 def add_geometry(table: pa.Table, question: Question) -> pa.Table:

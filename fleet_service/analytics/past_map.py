@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import geo
-from fleet_service.archive.export import Box, Extract
+from fleet_service.archive.export.extract import Box, Extract
+from fleet_service.archive.format import geo
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import past_fusion
 from fleet_service.serve.encode import cell_table

@@ -18,9 +18,10 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 
 from fleet_service.analytics.past_map import LATENESS_S, snapshot_table, visited_cells
-from fleet_service.archive import layout, rollup, snapshots
-from fleet_service.archive.files import MAP, ROLLUP, Encoding, sync_tree, write_table
-from fleet_service.archive.load import skip_damaged
+from fleet_service.archive.format import layout, snapshots
+from fleet_service.archive.format.files import MAP, ROLLUP, Encoding, sync_tree, write_table
+from fleet_service.archive.format.load import skip_damaged
+from fleet_service.archive.maintenance import rollup
 from fleet_service.replay.rebuild import past_fusion
 from schemas import grid
 from schemas.errors import InputError

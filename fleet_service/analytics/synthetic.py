@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.archive.segments import Rows, Writer, round_to_steps
+from fleet_service.archive.format.segments import Rows, Writer, round_to_steps
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray, IntArray
 from schemas.thresholds import NS, Z_95

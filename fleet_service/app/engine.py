@@ -23,12 +23,12 @@ from fleet_service.app.memory import SLOTS, ServiceState, load_state, visitor_ta
 from fleet_service.app.past import HistoricalMaps, PastQuery
 from fleet_service.app.precompile import warm_up
 from fleet_service.app.tasks import Tasks
-from fleet_service.archive.layout import Cut
-from fleet_service.archive.load import count_set_aside, set_aside
-from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.segments import Rows
-from fleet_service.archive.witnesses import remove_damaged_lines
+from fleet_service.archive.format.layout import Cut
+from fleet_service.archive.format.load import count_set_aside, set_aside
+from fleet_service.archive.format.segments import Rows
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.identity.vehicle_ids import remove_damaged_lines
+from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import UNCORRECTED
 from fleet_service.fusion.weather import Reports

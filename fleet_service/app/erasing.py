@@ -22,10 +22,10 @@ from typing import Any
 from fleet_service.app import beside
 from fleet_service.app.engine import Engine
 from fleet_service.app.memory import load_state
-from fleet_service.archive import requests
-from fleet_service.archive.layout import Cut
-from fleet_service.archive.requests import Erasure
-from fleet_service.archive.retention import destroy_key, erase_files, forget_witness, key_of
+from fleet_service.archive.format.layout import Cut
+from fleet_service.archive.identity import erasure_requests
+from fleet_service.archive.identity.erasure_requests import Erasure
+from fleet_service.archive.maintenance.retention import destroy_key, erase_files, forget_witness, key_of
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from fleet_service.replication.replica import BucketReplica
@@ -36,17 +36,17 @@ from schemas.errors import InputError
 def handle_requests(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
     """Handle waiting requests; return a line for the operator."""
     rows = answered = 0
-    for question in requests.open_requests(root):
+    for question in erasure_requests.open_requests(root):
         try:
-            outcome = _erase(engine, config, root, requests.read(question), stop)
+            outcome = _erase(engine, config, root, erasure_requests.read(question), stop)
         except InputError as error:
-            requests.settle(question, error)
+            erasure_requests.settle(question, error)
             continue
         if outcome is None:  # the service stops; the next one does it
             break
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
-        requests.settle(question, outcome)
+        erasure_requests.settle(question, outcome)
         rows, answered = rows + outcome["rows"], answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
 

@@ -16,9 +16,10 @@ from typing import Final, NamedTuple
 from fleet_service.app import beside, erasing
 from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
-from fleet_service.archive import layout, reserve, segments, snapshots
-from fleet_service.archive.load import count_set_aside
-from fleet_service.archive.retention import retire_rows
+from fleet_service.archive.format import layout, segments, snapshots
+from fleet_service.archive.format.load import count_set_aside
+from fleet_service.archive.maintenance import disk_reserve
+from fleet_service.archive.maintenance.retention import retire_rows
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
@@ -52,7 +53,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
     def compaction(stop: threading.Event) -> str | None:
         if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
             return "compaction waits for the copy"
-        reserve.allocate(root)
+        disk_reserve.allocate(root)
         weather.join_daily_files(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
@@ -97,7 +98,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
             try:
                 return work(stop)
             except (OSError, InputError):
-                if not reserve.release(root):
+                if not disk_reserve.release(root):
                     raise
                 return work(stop)
 

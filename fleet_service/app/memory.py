@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive.layout import DAY_NS, Cut
-from fleet_service.archive.load import skip_damaged
+from fleet_service.archive.format.layout import DAY_NS, Cut
+from fleet_service.archive.format.load import skip_damaged
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.dedup import SequenceTrackers

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import segments
+from fleet_service.archive.format import segments
 from schemas.config import ServiceConfig
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind

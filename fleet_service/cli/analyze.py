@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     question = _checked_question(arguments)
     progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output
-    from fleet_service.archive.export import Extract
+    from fleet_service.archive.export.extract import Extract
     from schemas import query
 
     if arguments.engine not in engines.ENGINES:

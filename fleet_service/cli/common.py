@@ -115,7 +115,7 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     Raises:
         InputError: there is no such archive, or it cannot be read or written.
     """
-    from fleet_service.archive.layout import require_archive
+    from fleet_service.archive.format.layout import require_archive
 
     require_archive(arguments.archive)
     try:
@@ -132,8 +132,8 @@ def compact_first(root: Path) -> None:
     Raises:
         InputError: the folder is no archive.
     """
-    from fleet_service.archive import layout, segments
-    from fleet_service.archive.compaction import compact
+    from fleet_service.archive.format import layout, segments
+    from fleet_service.archive.maintenance.compaction import compact
     from schemas.wire import Kind
 
     layout.require_archive(root)

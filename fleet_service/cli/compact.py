@@ -25,8 +25,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _compact(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive import mirror, rollup
-    from fleet_service.archive.compaction import ROUND_ROWS, compact
+    from fleet_service.archive.export import mirror
+    from fleet_service.archive.maintenance import rollup
+    from fleet_service.archive.maintenance.compaction import ROUND_ROWS, compact
 
     rows = ROUND_ROWS if arguments.round_rows is None else arguments.round_rows
     if rows < 1:

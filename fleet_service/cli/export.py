@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive.iceberg import NAMESPACE, Place, register
+    from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register
 
     root = arguments.archive.resolve()
     place = Place(arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri())
@@ -113,14 +113,14 @@ def _datex(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive import export
+    from fleet_service.archive.export import extract
     from schemas import query
 
     commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
     if arguments.min_vehicles < 1:
         raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
-    part = export.Extract(*span(arguments), bbox)
+    part = extract.Extract(*span(arguments), bbox)
     as_of = ""
     if arguments.what == "map" and not arguments.snapshot:
         from fleet_service.analytics.past_map import map_at
@@ -129,12 +129,12 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
         table = map_at(arguments.archive, part)
         as_of = _text(part.until)
     else:
-        table = export.WHAT[arguments.what](arguments.archive, part)
+        table = extract.WHAT[arguments.what](arguments.archive, part)
         if arguments.what == "map":
-            as_of = _text(export.snapshot_time(arguments.archive, part))
+            as_of = _text(extract.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
-        table = export.with_vehicles(table, arguments.min_vehicles)
-    export.write(table, arguments.out)
+        table = extract.with_vehicles(table, arguments.min_vehicles)
+    extract.write(table, arguments.out)
     line = f"{table.num_rows} rows in {arguments.out}" + (f": the map as of {as_of}" if as_of else "")
     return ArchiveReport(
         line, {"rows": table.num_rows, "out": str(arguments.out), **({"as_of": as_of} if as_of else {})}

@@ -13,8 +13,8 @@ from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, co
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
-    from fleet_service.archive.requests import Erasure
-    from fleet_service.archive.retention import ErasureResult
+    from fleet_service.archive.identity.erasure_requests import Erasure
+    from fleet_service.archive.maintenance.retention import ErasureResult
 
 ASK_S: Final = 0.5  # between two looks whether the service has answered
 LOOK_S: Final = 5.0  # ... and whether it is still there
@@ -36,9 +36,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _forget(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive import mirror
-    from fleet_service.archive.requests import Erasure
-    from fleet_service.archive.retention import key_of, rows_of_vehicle
+    from fleet_service.archive.export import mirror
+    from fleet_service.archive.identity.erasure_requests import Erasure
+    from fleet_service.archive.maintenance.retention import key_of, rows_of_vehicle
 
     root, month, vehicle = arguments.archive, arguments.period, arguments.vehicle
     key_of(root, month)
@@ -68,14 +68,14 @@ def _erase(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
         InputError: there is no such month, a file is damaged, or the copy is not reached.
         OSError: a file cannot be read or written.
     """
-    from fleet_service.archive import requests
-    from fleet_service.archive.files import is_served
-    from fleet_service.archive.retention import ErasureResult, forget_period, forget_vehicle
+    from fleet_service.archive.format.files import is_served
+    from fleet_service.archive.identity import erasure_requests
+    from fleet_service.archive.maintenance.retention import ErasureResult, forget_period, forget_vehicle
 
-    question = requests.write_request(root, wanted) if is_served(root) else None
+    question = erasure_requests.write_request(root, wanted) if is_served(root) else None
     looked = time.monotonic()
     while question is not None:  # a service that ends meanwhile leaves it to us
-        if (answer := requests.answer_to(question)) is not None:
+        if (answer := erasure_requests.answer_to(question)) is not None:
             return ErasureResult(answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy"))
         time.sleep(ASK_S)
         if time.monotonic() - looked > LOOK_S:

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         fix = "pip install 'gripmap[page]'"
         raise InputError("page", f"the package {error.name} is missing", fix) from error
     if arguments.archive is not None:
-        from fleet_service.archive.layout import require_archive
+        from fleet_service.archive.format.layout import require_archive
 
         require_archive(arguments.archive)
     settings = server.PageSettings(

@@ -44,9 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         print(map_client.text(answer))
     elif answer.table is not None and arguments.out.suffix in (".parquet", ".csv"):
-        from fleet_service.archive import export, geo
+        from fleet_service.archive.export import extract
+        from fleet_service.archive.format import geo
 
-        export.write(geo.with_cells(answer.table), arguments.out)
+        extract.write(geo.with_cells(answer.table), arguments.out)
     else:
         map_client.write(answer, arguments.out)
     if answer.gap is not None:

@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _retention(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive.retention import due_folders, retire_rows
+    from fleet_service.archive.maintenance.retention import due_folders, retire_rows
 
     today = datetime.now(UTC).date()
     folders = due_folders(arguments.archive, arguments.raw_days, today)

@@ -18,11 +18,11 @@ from typing import Final, NamedTuple
 import numpy as np
 import zenoh
 
-from fleet_service.archive import erasures
-from fleet_service.archive.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
-from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
-from fleet_service.archive.segments import Rows, round_to_steps
-from fleet_service.archive.witnesses import VehicleIds
+from fleet_service.archive.format.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
+from fleet_service.archive.format.segments import Rows, round_to_steps
+from fleet_service.archive.identity import erasures
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number, texts
+from fleet_service.archive.identity.vehicle_ids import VehicleIds
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket

@@ -23,10 +23,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.files import SEGMENT, write_table
-from fleet_service.archive.layout import DAY_NS, read_epoch, with_term
-from fleet_service.archive.load import Damaged, load, skip_damaged
-from fleet_service.archive.segments import nanoseconds
+from fleet_service.archive.format.files import SEGMENT, write_table
+from fleet_service.archive.format.layout import DAY_NS, read_epoch, with_term
+from fleet_service.archive.format.load import Damaged, load, skip_damaged
+from fleet_service.archive.format.segments import nanoseconds
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather

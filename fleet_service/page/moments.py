@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, snapshots
+from fleet_service.archive.format import layout, snapshots
 from fleet_service.page import records, world
 from fleet_service.page.records import Records
 from schemas import grid

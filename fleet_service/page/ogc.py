@@ -14,7 +14,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 
-from fleet_service.archive import export, geo
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import geo
 from fleet_service.client import map_client
 from fleet_service.page import asked, features
 from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
@@ -87,7 +88,7 @@ class FeatureRoutes:
         given = {name: value for name, value in request.query_params.items() if name != "after"}
         stamp = datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC).isoformat().replace("+00:00", "Z")
         answer = features.page_of(
-            features.with_identity(export.features(geo.with_cells(table))), more, str(request.url),
+            features.with_identity(extract.features(geo.with_cells(table))), more, str(request.url),
             f"{address}?{urlencode(given | {'after': last})}", stamp,
         )  # fmt: skip
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
@@ -98,7 +99,7 @@ class FeatureRoutes:
         table = await run_in_threadpool(self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1))
         cell, sector = divmod(place, grid.SECTORS)
         table = table.filter((pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector))
-        for found in features.with_identity(export.features(geo.with_cells(table))):
+        for found in features.with_identity(extract.features(geo.with_cells(table))):
             links = [{"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}]
             return JSONResponse({**found, "links": links}, media_type=GEOJSON)
         return PlainTextResponse("nobody was there: nothing is known\n", 404)

@@ -21,8 +21,8 @@ from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.archive.layout import CHECKPOINTS, Cut
-from fleet_service.archive.version import KEY, VERSION
+from fleet_service.archive.format.layout import CHECKPOINTS, Cut
+from fleet_service.archive.format.version import KEY, VERSION
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory
 

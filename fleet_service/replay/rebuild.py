@@ -13,10 +13,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, reading, segments, witnesses
-from fleet_service.archive.between import ValueRange, filter_table, matching_row_groups
-from fleet_service.archive.load import Damaged, skip_damaged
-from fleet_service.archive.pseudonyms import number
+from fleet_service.archive.format import layout, reading, segments
+from fleet_service.archive.format.load import Damaged, skip_damaged
+from fleet_service.archive.format.row_filter import ValueRange, filter_table, matching_row_groups
+from fleet_service.archive.identity import vehicle_ids
+from fleet_service.archive.identity.pseudonyms import number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
@@ -189,7 +190,7 @@ def replay(
     days = (since.begin.day, last)
     wanted = reading.Wanted(columns, where, days, since.begin.after, since.begin.until, since.near())
     waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
-    known = witnesses.read(root / "keys")
+    known = vehicle_ids.read(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
         rows = segments.rows_of(table)
         if since.known is not None:
@@ -197,7 +198,7 @@ def replay(
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
             rows = {name: column[new] for name, column in rows.items()}
-        o, before = observations_of(rows, witnesses.numbers_of(known, rows["vehicle"])), _before(rows)
+        o, before = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"])), _before(rows)
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
         o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.archive.layout import Cut
+from fleet_service.archive.format.layout import Cut
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay import checkpoints

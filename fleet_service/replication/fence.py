@@ -16,7 +16,7 @@ import json
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
-from fleet_service.archive import layout
+from fleet_service.archive.format import layout
 from fleet_service.replication.bucket import ObjectBucket
 
 FOLDER: Final = "fence"

@@ -39,7 +39,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from fleet_service.archive import layout
+from fleet_service.archive.format import layout
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Term
 from schemas.errors import InputError

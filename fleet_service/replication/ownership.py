@@ -10,8 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from fleet_service.archive import compaction, layout
-from fleet_service.archive.files import lock_archive
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.files import lock_archive
+from fleet_service.archive.maintenance import compaction
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.lease import Lease, Standby, forget_holder, holder_of
 from fleet_service.replication.replica import FOLDERS, BucketReplica, open_replica

@@ -17,10 +17,10 @@ from pathlib import Path
 from threading import Lock
 from typing import Final
 
-from fleet_service.archive import layout
-from fleet_service.archive.files import sync_tree
-from fleet_service.archive.layout import CHECKPOINTS
-from fleet_service.archive.load import BAD
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.files import sync_tree
+from fleet_service.archive.format.layout import CHECKPOINTS
+from fleet_service.archive.format.load import BAD
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Fence, Term, fence_of, largest_epoch, put_fence
 from fleet_service.replication.upload_journal import Stamp, UploadJournal, stamp_of

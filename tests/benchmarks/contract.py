@@ -9,8 +9,8 @@ from typing import Final
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import SyntheticFleet
-from fleet_service.archive import segments
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import segments
+from fleet_service.archive.maintenance.compaction import compact
 from schemas import wire
 from schemas.runtime.batch_decoder import decode_many
 from schemas.runtime.figures import Figure

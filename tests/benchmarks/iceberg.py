@@ -10,8 +10,9 @@ from typing import Any, Final, TypeAlias
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import iceberg, layout, retention
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import layout
+from fleet_service.archive.maintenance import iceberg, retention
+from fleet_service.archive.maintenance.compaction import compact
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill
 

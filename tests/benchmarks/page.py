@@ -28,7 +28,8 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import export, geo
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import geo
 from fleet_service.page.colours import FOUR, GROUND, LITTLE, TWO
 from schemas import keys
 from schemas.runtime import figures
@@ -168,7 +169,7 @@ def maplibre(on: Stage) -> Iterator[str | None]:
             assert file is not None
             (Path(folder) / file.name).write_bytes(file.read_bytes())
         town = pa.Table.from_batches([on.town.table(tile) for tile in on.town.tiles]).select(["cell", "mu"])
-        export.write(geo.with_cells(town), Path(folder) / "town.geojson")
+        extract.write(geo.with_cells(town), Path(folder) / "town.geojson")
         x, y = on.town.corner
         longitude = 360.0 * x / 2**14 - 180.0
         latitude = math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y / 2**14))))

@@ -18,7 +18,7 @@ from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
 from fleet_service.app.engine import Engine
 from fleet_service.app.service import Service
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.maintenance.compaction import compact
 from schemas import grid, keys
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.numeric import FloatArray, IntArray

@@ -17,7 +17,7 @@ from typing import Final
 
 from deploy.router import open_router
 from fleet_service.app.engine import Engine
-from fleet_service.archive.layout import Cut
+from fleet_service.archive.format.layout import Cut
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints

@@ -9,7 +9,7 @@ import pytest
 
 import edge_agent.cli
 from fleet_service.analytics import synthetic
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.maintenance.compaction import compact
 from schemas import grid, tables
 from tests import results
 from tests.house import ROOT

@@ -18,7 +18,7 @@ import zenoh
 from deploy.examples import archive_questions, be_warned, first_estimate, own_estimator, query_map
 from deploy.router import open_router
 from fleet_service.analytics import synthetic
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.maintenance.compaction import compact
 from schemas.config import ZenohSettings
 from schemas.runtime.palette import GRIP_RANGE, shade
 from schemas.runtime.zenoh_session import open_session

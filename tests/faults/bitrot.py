@@ -18,7 +18,7 @@ import numpy as np
 from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading
+from fleet_service.archive.format import reading
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure

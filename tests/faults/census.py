@@ -11,8 +11,8 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, reading
-from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.format import layout, reading
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from schemas.wire import Kind
 
 HOUR_NS = 3_600_000_000_000

@@ -21,8 +21,8 @@ from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import archive_jobs
 from fleet_service.app.service import ingest_messages
-from fleet_service.archive import reading
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import reading
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig

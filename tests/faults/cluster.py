@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from deploy.router import open_router
-from fleet_service.archive import reading
+from fleet_service.archive.format import reading
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure

@@ -23,9 +23,9 @@ import pyarrow as pa
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.layout import CHECKPOINTS
-from fleet_service.archive.segments import Writer
+from fleet_service.archive.format.layout import CHECKPOINTS
+from fleet_service.archive.format.segments import Writer
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.client import map_client
 from fleet_service.replay import checkpoints
 from fleet_service.shards import moving

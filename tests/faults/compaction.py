@@ -18,9 +18,9 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, reading
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.log import SegmentLog
+from fleet_service.archive.format import layout, reading
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.segment_log import SegmentLog
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure

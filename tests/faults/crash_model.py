@@ -24,10 +24,10 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, load, reading, segments
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.segments import Rows
+from fleet_service.archive.format import layout, load, reading, segments
+from fleet_service.archive.format.segments import Rows
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay import restart
 from fleet_service.replay.rebuild import restore_streams

@@ -23,12 +23,12 @@ import numpy as np
 
 from fleet_service.app.engine import Engine
 from fleet_service.app.memory import ServiceState, load_state
-from fleet_service.archive import layout, reading, snapshots
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import load
-from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.retention import LEAST_DAYS, forget_period, forget_vehicle, retire_rows
-from fleet_service.archive.segments import nanoseconds
+from fleet_service.archive.format import layout, reading, snapshots
+from fleet_service.archive.format.load import load
+from fleet_service.archive.format.segments import nanoseconds
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import LEAST_DAYS, forget_period, forget_vehicle, retire_rows
 from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints

@@ -25,8 +25,9 @@ from edge_agent.publish.outbox import Outbox
 from fleet_service.app.clock import SteadyClock, TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, archive_jobs
-from fleet_service.archive import reading, reserve
-from fleet_service.archive.retention import LEAST_DAYS
+from fleet_service.archive.format import reading
+from fleet_service.archive.maintenance import disk_reserve
+from fleet_service.archive.maintenance.retention import LEAST_DAYS
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
@@ -182,9 +183,9 @@ def _room_made(engine: Engine, folder: Path) -> int:
     """Days that retention removes from a disk that is full."""
     root = folder / "archive"
     begin_with_old_rows(root)
-    with patch.multiple(reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):
-        reserve.allocate(root)
-        assert (root / reserve.NAME).exists()
+    with patch.multiple(disk_reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):
+        disk_reserve.allocate(root)
+        assert (root / disk_reserve.NAME).exists()
         jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
         retention, before = next(job for job in jobs if job.name == "retention"), len(old_days(root))
         with full(folder, mounted=True):

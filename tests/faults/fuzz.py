@@ -173,7 +173,7 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
 
 
 def _pseudonyms(root: Path, now: int) -> set[str]:
-    from fleet_service.archive.pseudonyms import Pseudonyms
+    from fleet_service.archive.identity.pseudonyms import Pseudonyms
 
     known = Pseudonyms(root / "keys")
     return {known.of(name, now) for name in HONEST}

@@ -20,9 +20,9 @@ import numpy as np
 
 from fleet_service.analytics import synthetic
 from fleet_service.app.engine import Engine
-from fleet_service.archive import layout
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due_folders
+from fleet_service.archive.format import layout
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import LEAST_DAYS, drop_checkpoints, due_folders
 from fleet_service.serve.encode import cell_table
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

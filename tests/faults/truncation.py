@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import load, reading, segments
-from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.format import load, reading, segments
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import restore_streams

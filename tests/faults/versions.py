@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import count_set_aside
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.format import reading
+from fleet_service.archive.format.load import count_set_aside
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind

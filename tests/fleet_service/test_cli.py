@@ -18,7 +18,7 @@ import zenoh
 from deploy.router import open_router
 from fleet_service import cli
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.archive import reading
+from fleet_service.archive.format import reading
 from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings

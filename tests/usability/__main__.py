@@ -27,7 +27,7 @@ from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.doctor.report import page as doctors_page
 from edge_agent.lab.evaluation.planted import drives
 from fleet_service.analytics import synthetic
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.maintenance.compaction import compact
 from schemas.config import ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure

@@ -11,7 +11,7 @@ import pyarrow as pa
 from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import visited_cells
-from fleet_service.archive import layout
+from fleet_service.archive.format import layout
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, fusion_with_weather, replay
 from schemas import tables

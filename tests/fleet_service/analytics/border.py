@@ -12,8 +12,9 @@ import pyarrow.parquet as pq
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
-from fleet_service.archive import rollup, segments
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import segments
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
 from schemas import grid
 from schemas.thresholds import NS
 from schemas.wire import Kind

@@ -18,9 +18,10 @@ from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
-from fleet_service.archive import reading, rollup, snapshots
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.export import Extract
+from fleet_service.archive.export.extract import Extract
+from fleet_service.archive.format import reading, snapshots
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.encode import cell_table

@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.archive import export, geo
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import geo
 from fleet_service.cli import main
 from schemas import tables
 from tests.fleet_service.examples import CELL
@@ -131,6 +132,6 @@ def test_a_file_that_could_not_be_finished_is_none(tmp_path: Path) -> None:
     path.write_text("as it was")
     broken = table.set_column(table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01"]))
     with pytest.raises((ValueError, struct.error)):
-        export.write(broken, path)
+        extract.write(broken, path)
     assert path.read_text() == "as it was"
     assert [one.name for one in tmp_path.iterdir()] == ["a.geojson"]

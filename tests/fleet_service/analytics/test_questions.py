@@ -14,7 +14,7 @@ import pytest
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.questions.worst import stretches, wilson
 from fleet_service.analytics.synthetic import START_NS
-from fleet_service.archive.export import Extract
+from fleet_service.archive.export.extract import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.encode import cell_table

@@ -11,9 +11,10 @@ import pytest
 from fleet_service.analytics.past_map import map_at
 from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuild_zone, require_empty, zones_of
 from fleet_service.analytics.synthetic import SyntheticFleet
-from fleet_service.archive import layout, rollup
-from fleet_service.archive.export import Extract
-from fleet_service.archive.reading import files_near
+from fleet_service.archive.export.extract import Extract
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.reading import files_near
+from fleet_service.archive.maintenance import rollup
 from fleet_service.cli import main
 from schemas import grid
 from schemas.errors import InputError

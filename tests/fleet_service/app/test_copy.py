@@ -17,8 +17,8 @@ import pytest
 import zenoh
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading, segments
-from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.format import reading, segments
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints

@@ -19,10 +19,11 @@ import zenoh
 
 from fleet_service.app import erasing
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading, requests
-from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.requests import Erasure
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.format import reading
+from fleet_service.archive.identity import erasure_requests
+from fleet_service.archive.identity.erasure_requests import Erasure
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
@@ -96,7 +97,7 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         sent += [sent_by(vehicle, seq + 1) for vehicle in OTHERS]
         until(settled, PATIENCE_S)
         at_last = shown(session)
-        assert not requests.open_requests(root)
+        assert not erasure_requests.open_requests(root)
         process.terminate()
         assert process.wait(PATIENCE_S) == 0
     names = Pseudonyms(root / "keys")
@@ -137,9 +138,9 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
         engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
         engine.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
-        question = requests.write_request(tmp_path, Erasure(MONTH))
+        question = erasure_requests.write_request(tmp_path, Erasure(MONTH))
         answered(engine, tmp_path)
-        assert requests.answer_to(question) == {"rows": 0, "files": []}
+        assert erasure_requests.answer_to(question) == {"rows": 0, "files": []}
         assert engine.fusion.size
         assert not any(stream.vehicle for stream in engine._streams)
         assert Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns()) != before
@@ -150,27 +151,27 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
 
 def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:
     with closing(filled(tmp_path, *OTHERS)) as engine:
-        none = requests.write_request(tmp_path, Erasure("1999-01", GONE))
-        (tmp_path / requests.FOLDER / "other.json").write_text("[]")
+        none = erasure_requests.write_request(tmp_path, Erasure("1999-01", GONE))
+        (tmp_path / erasure_requests.FOLDER / "other.json").write_text("[]")
         answered(engine, tmp_path)
         with pytest.raises(InputError, match="no key of 1999-01"):
-            requests.answer_to(none)
+            erasure_requests.answer_to(none)
         with pytest.raises(InputError, match="other.json is none"):
-            requests.answer_to(tmp_path / requests.FOLDER / "other.json")
-        assert not requests.open_requests(tmp_path)
+            erasure_requests.answer_to(tmp_path / erasure_requests.FOLDER / "other.json")
+        assert not erasure_requests.open_requests(tmp_path)
 
 
 def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Path) -> None:
     engine = filled(tmp_path, GONE, *OTHERS)
     stopped = threading.Event()
     stopped.set()
-    question = requests.write_request(tmp_path, Erasure(MONTH, GONE))
+    question = erasure_requests.write_request(tmp_path, Erasure(MONTH, GONE))
     assert erasing.handle_requests(engine, ServiceConfig(), tmp_path, stopped) is None
-    assert requests.open_requests(tmp_path) == [question]
+    assert erasure_requests.open_requests(tmp_path) == [question]
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         answered(again, tmp_path)
-        told = requests.answer_to(question)
+        told = erasure_requests.answer_to(question)
         assert told is not None
         assert told["rows"] == 2
         slots = again.fusion.slots_of(np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0]))

@@ -17,8 +17,9 @@ from fleet_service.app import tasks
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, Job, archive_jobs
-from fleet_service.archive import layout, reserve
-from fleet_service.archive.compaction import hold_compaction_lock
+from fleet_service.archive.format import layout
+from fleet_service.archive.maintenance import disk_reserve
+from fleet_service.archive.maintenance.compaction import hold_compaction_lock
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from schemas import wire
@@ -108,14 +109,14 @@ def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
 def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reserve, "SIZE", 1 << 16)
-    reserve.allocate(tmp_path)
+    monkeypatch.setattr(disk_reserve, "SIZE", 1 << 16)
+    disk_reserve.allocate(tmp_path)
     assert (tmp_path / "reserve").stat().st_size == 1 << 16
-    assert not reserve.release(tmp_path), "there is room"
+    assert not disk_reserve.release(tmp_path), "there is room"
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
-    assert reserve.release(tmp_path)
+    assert disk_reserve.release(tmp_path)
     assert not (tmp_path / "reserve").exists()
-    reserve.allocate(tmp_path)
+    disk_reserve.allocate(tmp_path)
     assert not (tmp_path / "reserve").exists()
 
 

@@ -15,8 +15,8 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from fleet_service.archive import reading
-from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.format import reading
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from schemas.config import ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.app.test_service import Fleet

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from fleet_service.app import past
 from fleet_service.app.engine import Engine
-from fleet_service.archive import files, layout, segments
-from fleet_service.archive.between import ValueRange
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import load, load_groups
+from fleet_service.archive.format import files, layout, segments
+from fleet_service.archive.format.load import load, load_groups
+from fleet_service.archive.format.row_filter import ValueRange
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import rows_near
 from schemas import query, wire

@@ -24,8 +24,9 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import rollup, snapshots
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import snapshots
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.replay import checkpoints

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_service.archive import reading
-from fleet_service.archive.segments import SCHEMAS, Rows, Writer, round_to_steps
+from fleet_service.archive.format import reading
+from fleet_service.archive.format.segments import SCHEMAS, Rows, Writer, round_to_steps
 from fleet_service.fusion.standing import UNCORRECTED
 from schemas import grid, mugrid, tables
 from schemas.wire import Kind

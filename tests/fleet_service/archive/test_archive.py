@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading, segments
-from fleet_service.archive.files import lock_archive
-from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
+from fleet_service.archive.format import reading, segments
+from fleet_service.archive.format.files import lock_archive
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number, texts
 from fleet_service.ingest.inbox import Message
 from schemas import tables, wire
 from schemas.config import ServiceConfig

@@ -18,10 +18,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import compaction, files, layout, reading, segments
-from fleet_service.archive import load as loading
-from fleet_service.archive.compaction import compact, hold_compaction_lock
-from fleet_service.archive.segments import Writer
+from fleet_service.archive.format import files, layout, reading, segments
+from fleet_service.archive.format import load as loading
+from fleet_service.archive.format.segments import Writer
+from fleet_service.archive.maintenance import compaction
+from fleet_service.archive.maintenance.compaction import compact, hold_compaction_lock
 from schemas import grid, tables
 from schemas.config import ServiceConfig
 from schemas.errors import InputError

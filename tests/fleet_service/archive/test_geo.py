@@ -12,8 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 from shapely.geometry import box
 
-from fleet_service.archive import export, geo, snapshots
-from fleet_service.archive.files import MAP, write_table
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import geo, snapshots
+from fleet_service.archive.format.files import MAP, write_table
 from fleet_service.fusion import Fusion
 from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
@@ -69,7 +70,7 @@ def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: P
 
 def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> None:
     table = geo.with_cells(pa.table({"cell": [CELL] * 4, "sector": pa.array(range(4), pa.int8())}))
-    export.write(table, tmp_path / "a.geojson")
+    extract.write(table, tmp_path / "a.geojson")
     quarters = geopandas.read_file(tmp_path / "a.geojson").geometry.set_crs(None, allow_override=True)
     west, south, east, north = (float(side) for side in grid.bounds(CELL))
     whole = box(west, south, east, north)
@@ -105,7 +106,7 @@ def test_the_validator_refuses_a_file_whose_geometry_is_broken(tmp_path: Path) -
 def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
     table = geo.with_cells(a_map(3))
     for ending in (".geojson", ".csv"):
-        export.write(table, tmp_path / f"map{ending}")
+        extract.write(table, tmp_path / f"map{ending}")
     frame = geopandas.read_file(tmp_path / "map.geojson")
     assert frame["cell"].tolist() == table["cell"].to_pylist()
     np.testing.assert_allclose(frame["mu"], table["mu"].to_numpy(), atol=1e-6)

@@ -12,10 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_service.archive import iceberg, layout, retention
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.segments import Writer
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.segments import Writer
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.maintenance import iceberg, retention
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main
 from schemas.errors import InputError
 from schemas.wire import Kind

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.archive import layout, segments
-from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.pseudonyms import load_or_create_key
+from fleet_service.archive.format import layout, segments
+from fleet_service.archive.identity.pseudonyms import load_or_create_key
+from fleet_service.archive.segment_log import SegmentLog
 from schemas.wire import Kind
 from tests.faults.crash_disk import CrashDisk
 from tests.fleet_service.archive.rows import identities, rows_of

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_service.archive import reading, readme
-from fleet_service.archive.compaction import compact
+from fleet_service.archive.format import reading, readme
+from fleet_service.archive.maintenance.compaction import compact
 from schemas.wire import Kind
 from tests.fleet_service.archive.readers import READERS, Seen
 from tests.fleet_service.archive.rows import fill

@@ -14,11 +14,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import export, layout, mirror, reading, retention, rollup, segments, snapshots
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import BAD
-from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.segments import Writer
+from fleet_service.archive.export import extract, mirror
+from fleet_service.archive.format import layout, reading, segments, snapshots
+from fleet_service.archive.format.load import BAD
+from fleet_service.archive.format.segments import Writer
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.maintenance import retention, rollup
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from schemas import grid, wire
@@ -262,10 +264,10 @@ def test_a_wrong_export_is_one_line(
 
 
 def test_an_export_of_the_map_is_the_newest_snapshot_before_a_time(tmp_path: Path) -> None:
-    from fleet_service.archive import snapshots
+    from fleet_service.archive.format import snapshots
     from tests.fleet_service.archive.test_geo import a_map
 
     for k, cells in enumerate((5, 9)):
         snapshots.write(tmp_path, a_map(cells), START + k * 3600 * 10**9)
-    assert export.map_then(tmp_path, export.Extract(0, START + 1800 * 10**9)).num_rows == 5
-    assert export.map_then(tmp_path, export.Extract(0, START + 3600 * 10**9)).num_rows == 9
+    assert extract.map_then(tmp_path, extract.Extract(0, START + 1800 * 10**9)).num_rows == 5
+    assert extract.map_then(tmp_path, extract.Extract(0, START + 3600 * 10**9)).num_rows == 9

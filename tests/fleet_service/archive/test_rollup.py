@@ -11,9 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import reading, rollup
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.segments import nanoseconds
+from fleet_service.archive.format import reading
+from fleet_service.archive.format.segments import nanoseconds
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
 from schemas import mugrid, tables
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill

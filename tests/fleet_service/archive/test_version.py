@@ -17,11 +17,13 @@ import pytest
 
 from fleet_service import cli
 from fleet_service.app.engine import Engine
-from fleet_service.archive import export, layout, reading, rollup, segments, version
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_table
-from fleet_service.archive.load import content
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.export import extract
+from fleet_service.archive.format import layout, reading, segments, version
+from fleet_service.archive.format.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_table
+from fleet_service.archive.format.load import content
+from fleet_service.archive.maintenance import rollup
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.replay import checkpoints
 from schemas import query, tables
 from schemas.config import ServiceConfig
@@ -32,7 +34,7 @@ from tests.fleet_service.archive.rows import fill, rows_of
 
 OLD = DATA / "v1.0"
 MADE: dict[str, Any] = json.loads((OLD / "map.json").read_text())
-EVERYTHING = export.Extract(0, 2**62)
+EVERYTHING = extract.Extract(0, 2**62)
 
 
 @pytest.fixture
@@ -99,14 +101,14 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:
         assert map_of(engine, now_of(ROUNDS + 2)) == before, "bit for bit"
-    assert export.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 224
+    assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 224
     assert not list(old.rglob("*.bad"))
 
 
 def test_export_reads_the_kept_files(old: Path) -> None:
-    assert export.observations(old, EVERYTHING).num_rows == MADE["rows"]["obs"]
-    assert export.map_then(old, EVERYTHING).num_rows == len(MADE["cells"])
-    assert export.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 8 * 2 * ROUNDS // 2
+    assert extract.observations(old, EVERYTHING).num_rows == MADE["rows"]["obs"]
+    assert extract.map_then(old, EVERYTHING).num_rows == len(MADE["cells"])
+    assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 8 * 2 * ROUNDS // 2
 
 
 def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
@@ -283,8 +285,8 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
         for path in harmed:
             path.write_bytes(path.read_bytes()[:-30])
         whole = 8 * 2 * ROUNDS
-        assert export.observations(old, EVERYTHING).num_rows < whole
-        assert export.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
+        assert extract.observations(old, EVERYTHING).num_rows < whole
+        assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
         assert list(engine.answer(past, lambda _: True, now_of(ROUNDS)))
         heard = caplog.text + capfd.readouterr().err  # the past is read by a process of its own

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading
-from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.retention import drop_checkpoints, forget_period
-from fleet_service.archive.witnesses import VehicleIds, read
+from fleet_service.archive.format import reading
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.identity.vehicle_ids import VehicleIds, read
+from fleet_service.archive.maintenance.retention import drop_checkpoints, forget_period
 from fleet_service.ingest.budgets import FASTEST, STREAMS_AT_ONCE, Bucket, NewCells, Tracks
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.ingest.acks import Acks, ranges
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import BatchIntake, Inbox, Message

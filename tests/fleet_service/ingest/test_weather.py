@@ -17,8 +17,8 @@ import pytest
 import zenoh
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive.layout import DAY_NS
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.format.layout import DAY_NS
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import (

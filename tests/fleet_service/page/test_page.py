@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import pytest
 
-from fleet_service.archive import snapshots
+from fleet_service.archive.format import snapshots
 from fleet_service.page import colours
 from schemas import grid
 from tests.browser import Opened, opened

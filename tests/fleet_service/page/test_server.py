@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 import zenoh
 
-from fleet_service.archive import snapshots
+from fleet_service.archive.format import snapshots
 from fleet_service.fusion import Fusion
 from fleet_service.page.files import Files
 from fleet_service.page.health import values

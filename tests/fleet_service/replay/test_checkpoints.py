@@ -16,9 +16,9 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.format import reading
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion.store.records import CELL
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints, rebuild

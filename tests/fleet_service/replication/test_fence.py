@@ -6,8 +6,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from fleet_service.archive import witnesses
-from fleet_service.archive.witnesses import VehicleIds
+from fleet_service.archive.identity import vehicle_ids
+from fleet_service.archive.identity.vehicle_ids import VehicleIds
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, join_daily_files
 from fleet_service.ingest.weather import archived_reports as archived_weather
@@ -53,7 +53,7 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: Bucke
     one.copy._may, one.copy._alone = lambda: True, None  # as if it had been frozen right behind its looks
     one.copy.sync()
     found = restored(tmp_path / "new", bucket)
-    held = witnesses.read(found / "keys")
+    held = vehicle_ids.read(found / "keys")
     assert {name: held.get(name) for name in known_there} == known_there
     assert set(archived_weather(found).region.tolist()) == {1, 2, 3, 4}
     two.close()

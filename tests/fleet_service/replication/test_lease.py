@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from fleet_service.archive import compaction, segments
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.log import SegmentLog
+from fleet_service.archive.format import segments
+from fleet_service.archive.maintenance import compaction
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.lease import Lease, holder_of
 from fleet_service.replication.ownership import Ownership, acquire, open_exclusive

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.archive import layout, segments
-from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import set_aside
-from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.retention import retire_rows
+from fleet_service.archive.format import layout, segments
+from fleet_service.archive.format.load import set_aside
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import retire_rows
+from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.replication import replica
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.replica import OWNER, BucketReplica

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints

@@ -17,15 +17,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import erasures, iceberg, layout, reading, rollup, snapshots, witnesses
-from fleet_service.archive.between import ValueRange, Where
-from fleet_service.archive.compaction import compact, hold_compaction_lock
-from fleet_service.archive.files import COMPACTED, MAP, lock_archive, put_in_place
-from fleet_service.archive.layout import TABLES
-from fleet_service.archive.load import BAD, content, load
-from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.segments import SCHEMAS, nanoseconds
-from fleet_service.archive.version import KEY
+from fleet_service.archive.format import layout, reading, snapshots
+from fleet_service.archive.format.files import COMPACTED, MAP, lock_archive, put_in_place
+from fleet_service.archive.format.layout import TABLES
+from fleet_service.archive.format.load import BAD, content, load
+from fleet_service.archive.format.row_filter import ValueRange, Where
+from fleet_service.archive.format.segments import SCHEMAS, nanoseconds
+from fleet_service.archive.format.version import KEY
+from fleet_service.archive.identity import erasures, vehicle_ids
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.maintenance import iceberg, rollup
+from fleet_service.archive.maintenance.compaction import compact, hold_compaction_lock
 from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
@@ -105,7 +107,7 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
     """
     key = key_of(root, month)
     erasures.record_erasure(key.parent, month, newest)
-    witnesses.forget(key.parent, month)
+    vehicle_ids.forget(key.parent, month)
     key.unlink()
     sync_directory(key.parent)
 
@@ -184,7 +186,7 @@ def forget_witness(root: Path, vehicle: str, month: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    witnesses.forget(root / _KEYS, month, number(_pseudonym(root, vehicle, month)))
+    vehicle_ids.forget(root / _KEYS, month, number(_pseudonym(root, vehicle, month)))
 
 
 def _pseudonym(root: Path, vehicle: str, month: str) -> str:

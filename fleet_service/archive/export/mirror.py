@@ -9,7 +9,7 @@ from typing import Final
 import pyarrow as pa
 from pyarrow import fs
 
-from fleet_service.archive.layout import TABLES
+from fleet_service.archive.format.layout import TABLES
 from schemas.errors import InputError
 
 FOLDERS: Final = (*TABLES.values(), "map", "rollup")

@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, segments
-from fleet_service.archive.between import Where
-from fleet_service.archive.layout import Partition
-from fleet_service.archive.load import Damaged, load, load_groups, skip_damaged
-from fleet_service.archive.version import DamagedError, entries_of, judge
+from fleet_service.archive.format import layout, segments
+from fleet_service.archive.format.layout import Partition
+from fleet_service.archive.format.load import Damaged, load, load_groups, skip_damaged
+from fleet_service.archive.format.row_filter import Where
+from fleet_service.archive.format.version import DamagedError, entries_of, judge
 from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.wire import Kind

@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.between import Where, filter_table, matching_row_groups
-from fleet_service.archive.segments import is_value
-from fleet_service.archive.version import DamagedError, Version, entries_of, is_newer, judge
+from fleet_service.archive.format.row_filter import Where, filter_table, matching_row_groups
+from fleet_service.archive.format.segments import is_value
+from fleet_service.archive.format.version import DamagedError, Version, entries_of, is_newer, judge
 from schemas import tables
 from schemas.errors import InputError
 

@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, segments
-from fleet_service.archive.files import ROLLUP, put_in_place
-from fleet_service.archive.load import Damaged, load, set_aside
+from fleet_service.archive.format import layout, segments
+from fleet_service.archive.format.files import ROLLUP, put_in_place
+from fleet_service.archive.format.load import Damaged, load, set_aside
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
 from schemas.wire import Kind

@@ -18,8 +18,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.archive.layout import DAY_NS
-from fleet_service.archive.pseudonyms import number
+from fleet_service.archive.format.layout import DAY_NS
+from fleet_service.archive.identity.pseudonyms import number
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.durable import sync_directory

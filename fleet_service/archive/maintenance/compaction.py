@@ -21,10 +21,10 @@ from typing import BinaryIO, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, reading, readme, segments
-from fleet_service.archive.files import COMPACTED, lock_file, sync_tree, write_table
-from fleet_service.archive.load import conform_columns, content, set_aside
-from fleet_service.archive.version import KEY, VERSION
+from fleet_service.archive.format import layout, reading, readme, segments
+from fleet_service.archive.format.files import COMPACTED, lock_file, sync_tree, write_table
+from fleet_service.archive.format.load import conform_columns, content, set_aside
+from fleet_service.archive.format.version import KEY, VERSION
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 

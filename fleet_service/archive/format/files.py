@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive import version
+from fleet_service.archive.format import version
 from schemas import tables
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory

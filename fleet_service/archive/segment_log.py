@@ -14,8 +14,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fleet_service.archive.layout import Cut
-from fleet_service.archive.segments import Rows, Writer
+from fleet_service.archive.format.layout import Cut
+from fleet_service.archive.format.segments import Rows, Writer
 from schemas.wire import Kind
 
 Batch = TypeVar("Batch")

@@ -23,8 +23,8 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.archive import layout
-from fleet_service.archive.pseudonyms import load_or_create_key
+from fleet_service.archive.format import layout
+from fleet_service.archive.identity.pseudonyms import load_or_create_key
 from schemas.numeric import IntArray
 from schemas.runtime.durable import open_durably, sync_directory
 

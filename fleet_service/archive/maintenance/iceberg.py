@@ -14,9 +14,9 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
-from fleet_service.archive import layout
-from fleet_service.archive.compaction import hold_compaction_lock
-from fleet_service.archive.segments import SCHEMAS
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.segments import SCHEMAS
+from fleet_service.archive.maintenance.compaction import hold_compaction_lock
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably
 from schemas.wire import Kind

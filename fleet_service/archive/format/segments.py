@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_service.archive import layout
-from fleet_service.archive.files import SEGMENT, write_table
+from fleet_service.archive.format import layout
+from fleet_service.archive.format.files import SEGMENT, write_table
 from schemas import mugrid, tables
 from schemas.numeric import BoolArray, Float32Array, IntArray
 from schemas.runtime.durable import ENDING, sync_directory

@@ -14,10 +14,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
-from fleet_service.archive import geo, layout, reading, rollup, snapshots
-from fleet_service.archive.between import ValueRange
-from fleet_service.archive.files import MAP, write_table
-from fleet_service.archive.load import load
+from fleet_service.archive.format import geo, layout, reading, snapshots
+from fleet_service.archive.format.files import MAP, write_table
+from fleet_service.archive.format.load import load
+from fleet_service.archive.format.row_filter import ValueRange
+from fleet_service.archive.maintenance import rollup
 from schemas import grid, tables
 from schemas.errors import InputError
 from schemas.numeric import BoolArray

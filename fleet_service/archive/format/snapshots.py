@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import geo, layout
-from fleet_service.archive.files import MAP, put_in_place
+from fleet_service.archive.format import geo, layout
+from fleet_service.archive.format.files import MAP, put_in_place
 from schemas import tables
 from schemas.thresholds import NS
 

@@ -1,0 +1,1 @@
+"""File format of an archive: names, versions, segments, reading, snapshots."""

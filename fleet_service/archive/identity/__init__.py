@@ -1,0 +1,1 @@
+"""Vehicle identities of an archive: pseudonyms, numbers, erasure."""

@@ -1,0 +1,1 @@
+"""Work on the files of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk space."""
