@@ -56,9 +56,10 @@ docs: setup  ## build the documentation site in .docs; warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -q -c deploy/docs . .docs
 	cp deploy/docs/landing.html .docs/index.html
 
-lint: setup  #- ruff
+lint: setup  #- ruff, and figures of the structure
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python -m tests.structure
 
 types: setup  #- mypy
 	$(BIN)/mypy

@@ -14,7 +14,7 @@ from edge_agent.cli import main as edge_agent
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.test_end_to_end import VEHICLES, System
 
 Cells: TypeAlias = list[dict[str, object]]

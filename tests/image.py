@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Final
 
 from schemas.runtime.progress_messages import COMPILING
-from tests.house import ROOT
 from tests.packaging import candidates
+from tests.structure import ROOT
 from tests.waiting import until
 
 DOCKERFILE: Final = ROOT / "deploy" / "Dockerfile"

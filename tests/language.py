@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tests.house import ROOT, parse, sources
 from tests.results import pages
+from tests.structure import ROOT, parse, sources
 
 PACKAGES: Final = ("schemas", "edge_agent", "fleet_service", "deploy", "tests")
 CEILINGS: Final = ROOT / "tests" / "language_ceilings.json"

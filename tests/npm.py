@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FOLDER: Final = ROOT / ".page" / "tools"
 

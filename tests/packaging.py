@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FIRST_USE = """
 import gripmap

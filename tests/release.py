@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.errors import InputError
-from tests.house import ROOT
+from tests.structure import ROOT
 
 VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
 

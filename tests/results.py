@@ -24,7 +24,7 @@ from edge_agent.lab.evaluation import printed, report
 from edge_agent.lab.tuning import study_report
 from fleet_service.lab import fading
 from schemas.runtime.figures import Figure
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FOLDER: Final = ROOT / "deploy" / "figures"
 PAGE: Final = ROOT / "deploy" / "docs" / "results.md"

@@ -11,8 +11,8 @@ import pytest
 
 from schemas.runtime import commandline
 from tests import reference_pages
-from tests.house import ROOT
 from tests.results import pages
+from tests.structure import ROOT
 from tests.test_commands import LINES
 from tests.usability import mistakes, readme
 

@@ -20,7 +20,7 @@ import gripmap
 from edge_agent.cli import main
 from schemas.errors import InputError
 from schemas.tables import ESTIMATES_SCHEMA
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FACES = (edge_agent, fleet_service)
 

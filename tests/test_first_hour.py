@@ -20,7 +20,7 @@ from schemas import keys, wire
 from schemas.config import AgentConfig, ZenohSettings, load
 from schemas.runtime.zenoh_session import open_session
 from tests.fleet_service.conftest import running
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.usability.wrong_logs import unnoticed
 from tests.waiting import until
 

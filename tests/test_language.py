@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from tests import language
-from tests.house import ROOT
+from tests.structure import ROOT
 
 PACKAGES = pytest.mark.parametrize("package", language.PACKAGES)
 MOST_WORDS = 25_000

@@ -9,7 +9,7 @@ import pytest
 
 from schemas.errors import InputError
 from tests import release
-from tests.house import ROOT
+from tests.structure import ROOT
 
 
 def test_changelog_section_ends_at_the_next_heading() -> None:

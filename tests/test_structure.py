@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests import house
-from tests.house import MOST_PARAMETERS, PACKAGES, ROOT, imported, parse
+from tests import structure
+from tests.structure import MOST_PARAMETERS, PACKAGES, ROOT, imported, parse
 
 LONGEST_FILE = 400  # lines; beyond that a file does more than one thing
 
@@ -104,7 +104,9 @@ TRIED = "try"  # where the README's commands write; git ignores it
 
 def sources(*folders: str) -> list[Path]:
     """Every Python file below the folders that a person wrote."""
-    return [path for name in folders for path in ([ROOT / name] if name.endswith(".py") else house.sources(ROOT, name))]
+    return [
+        path for name in folders for path in ([ROOT / name] if name.endswith(".py") else structure.sources(ROOT, name))
+    ]
 
 
 def where(path: Path, line: int) -> str:
@@ -149,9 +151,30 @@ def _is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) ->
     return any(ast.unparse(decorator).endswith("overload") for decorator in node.decorator_list)
 
 
+@pytest.mark.parametrize("figure", structure.FIGURES, ids=lambda figure: figure.name)
+def test_figure_of_structure_stays_under_its_ceiling(figure: structure.Figure) -> None:
+    value = figure.measure(ROOT)
+    assert value <= figure.ceiling, "\n".join(figure.places(ROOT)[:200])
+
+
+def test_figures_count_planted_faults(tmp_path: Path) -> None:
+    room = tmp_path / "schemas"
+    room.mkdir()
+    (room / "a.py").write_text(
+        "from schemas import b\n\ndef many(a, b, c, d, e, f, g):\n    x, y = a, b\n    return x\n"
+    )
+    (room / "b.py").write_text("def later():\n    from schemas import a\n    return a\n")
+    assert structure.import_circles(tmp_path) == ["schemas.a <-> schemas.b"]
+    assert structure.functions_with_many_parameters(tmp_path) == ["schemas/a.py:3 many (7)"]
+    assert structure.packed_assignments(tmp_path) == ["schemas/a.py:4"]
+    structure.parse.cache_clear()
+    (room / "b.py").write_text("def later():\n    return 1\n")
+    assert not structure.import_circles(tmp_path)
+
+
 @pytest.mark.parametrize("package", ROOMS)
 def test_rooms_import_along_the_way_of_the_data(package: str) -> None:
-    found = house.arrows(ROOT, package)
+    found = structure.arrows(ROOT, package)
     assert {room for arrow in found for room in arrow} <= set(ROOMS[package]), "a room that the table does not know"
     astray = [f"{a} -> {b}: {place}" for (a, b), place in found.items() if b not in ROOMS[package][a]]
     assert not astray, "\n".join(astray)
@@ -170,22 +193,22 @@ def test_the_table_of_rooms_has_no_circle_and_keeps_the_judge_apart(package: str
 
 @pytest.mark.parametrize("package", ROOMS)
 def test_rooms_stand_at_the_top_of_a_package_and_no_loose_modules(package: str) -> None:
-    assert len(house.loose_modules(ROOT, package)) <= 3
+    assert len(structure.loose_modules(ROOT, package)) <= 3
 
 
 def test_contract_imports_no_compiler_session_or_science_library() -> None:
-    _, modules, heavy = house.light_import(ROOT)
+    _, modules, heavy = structure.light_import(ROOT)
     assert modules > 50, "nothing was imported"
     assert not heavy
 
 
 def test_no_function_takes_more_than_a_reader_holds_in_mind() -> None:
-    found = house.too_wide(ROOT)
+    found = structure.too_wide(ROOT)
     assert not found, f"more than {MOST_PARAMETERS} positional parameters:\n" + "\n".join(found)
 
 
 def test_a_name_of_a_class_stands_for_one_thing() -> None:
-    found = house.ambiguous_classes(ROOT)
+    found = structure.ambiguous_classes(ROOT)
     assert not found, "\n".join(f"{name}: {', '.join(places)}" for name, places in found.items())
 
 

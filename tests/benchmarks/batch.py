@@ -10,7 +10,7 @@ from typing import Final
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from tests.benchmarks import iceberg, spread
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FOLDER: Final = ROOT / ".batch"
 

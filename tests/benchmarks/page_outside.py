@@ -36,7 +36,7 @@ from schemas.wire import Alert
 from tests.benchmarks import roads
 from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.waiting import until
 
 SCHEMA: Final = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"

@@ -34,7 +34,7 @@ from fleet_service.cli import main as fleet_service
 from schemas.runtime.figures import Figure, markdown, write
 from schemas.runtime.jit import cache_root
 from tests.buckets import BucketServer, bucket_server
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.waiting import until
 
 FOLDER: Final = ROOT / "deploy" / "kubernetes"

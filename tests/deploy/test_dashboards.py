@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from tests import reference_pages
-from tests.house import ROOT
 from tests.reference_pages import Shown
+from tests.structure import ROOT
 
 FOLDER = ROOT / "deploy" / "dashboards"
 RULES: list[dict[str, Any]] = [

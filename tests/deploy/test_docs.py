@@ -12,7 +12,7 @@ from fleet_service.analytics import synthetic
 from fleet_service.archive.maintenance.compaction import compact
 from schemas import grid, tables
 from tests import results
-from tests.house import ROOT
+from tests.structure import ROOT
 
 DOCS = ROOT / "deploy" / "docs"
 

@@ -25,7 +25,7 @@ from schemas.runtime.zenoh_session import open_session
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
-from tests.house import ROOT
+from tests.structure import ROOT
 
 FOLDER = ROOT / "deploy" / "examples"
 Output = pytest.CaptureFixture[str]

@@ -19,7 +19,7 @@ from schemas.runtime import tokens
 from schemas.runtime.zenoh_session import open_session
 from tests.deploy import kubernetes
 from tests.deploy.kubernetes import OVERLAYS, Cluster, Manifest, built, of_kind
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(

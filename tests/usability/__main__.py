@@ -39,8 +39,8 @@ from tests.first_drive import commands, mapped
 from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
-from tests.house import ROOT
 from tests.sight import SIGHTS, difference, lab
+from tests.structure import ROOT
 from tests.usability import mistakes, waiting
 from tests.usability.wrong_logs import WRONG, unnoticed
 from tests.waiting import until

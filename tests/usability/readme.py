@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from tests.house import ROOT
+from tests.structure import ROOT
 
 PAGES: Final = tuple(
     ROOT / "deploy" / "docs" / name

@@ -19,7 +19,7 @@ from fleet_service.archive.format import geo
 from fleet_service.cli import main
 from schemas import tables
 from tests.fleet_service.examples import CELL
-from tests.house import ROOT
+from tests.structure import ROOT
 
 DAYS = ("--from", "2026-01-27", "--to", "2026-01-29")
 

@@ -29,7 +29,7 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
 from tests.fleet_service.test_alerts import alert
-from tests.house import ROOT
+from tests.structure import ROOT
 
 SCHEMA = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
 OURS = Supplier("se", "GripMap test")

@@ -17,7 +17,7 @@ from schemas import grid
 from tests.browser import Opened, opened
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage
-from tests.house import ROOT
+from tests.structure import ROOT
 from tests.waiting import until
 
 PICTURES: Final = ROOT / ".page"

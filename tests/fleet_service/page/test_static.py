@@ -11,7 +11,7 @@ import pytest
 
 from fleet_service.page.files import SCRIPT
 from fleet_service.page.joined import bundle_modules
-from tests.house import ROOT
+from tests.structure import ROOT
 
 
 def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:

@@ -1,0 +1,381 @@
+"""Figures of the code's structure, counted from its source.
+
+    python -m tests.structure [CHECKOUT]          print the table: figure, value, bar, ceiling
+    python -m tests.structure --places [FIGURE]   print where a figure comes from
+
+Rooms are the entries of a package's folder. An arrow means that one of them imports another. `tests/test_structure.py`
+compares each figure with its ceiling. A ceiling above its bar is a bar not reached yet; ceilings only fall.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from tests.import_circles import circles_of
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+PACKAGES: Final = ("schemas", "edge_agent", "fleet_service", "deploy")
+MOST_PARAMETERS: Final = 7
+LIGHT: Final = "import schemas.keys, schemas.grid, schemas.wire, schemas.tables, schemas.query"
+HEAVY: Final = ("numba", "llvmlite", "scipy", "zenoh")
+
+
+def sources(root: Path, *folders: str) -> list[Path]:
+    """Every Python file below the folders that a person wrote."""
+    found = (path for folder in folders for path in sorted((root / folder).rglob("*.py")))
+    return [path for path in found if not path.name.endswith("_pb2.py")]
+
+
+@cache
+def parse(path: Path) -> ast.Module:
+    """Return the syntax tree of a file, read once."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and full name of everything imported in a syntax tree, also inside functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            yield from ((node.lineno, f"{module}.{name.name}") for name in node.names)
+
+
+def room_of(name: str) -> tuple[str, str]:
+    """Package and room of a dotted name."""
+    package, room, *_ = [*name.split("."), "", ""]
+    return package, room
+
+
+def arrows(root: Path, package: str) -> dict[tuple[str, str], str]:
+    """Which room of a package imports which, each with one place where it does."""
+    found: dict[tuple[str, str], str] = {}
+    for path in sources(root, package):
+        parts = path.relative_to(root / package).with_suffix("").parts
+        for line, name in imported(parse(path)):
+            other, room = room_of(name)
+            if other == package and room and parts[0] not in (room, "__init__"):
+                found.setdefault((parts[0], room), f"{path.relative_to(root)}:{line}")
+    return found
+
+
+def loose_modules(root: Path, package: str) -> list[str]:
+    """Modules that stand outside every room."""
+    return sorted(path.stem for path in (root / package).glob("*.py") if path.name != "__init__.py")
+
+
+def too_wide(root: Path) -> list[str]:
+    """Functions with more positional parameters than a reader holds in mind."""
+    found = []
+    for path in sources(root, *PACKAGES):
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
+                count = len([name for name in names if name not in ("self", "cls")])
+                if count > MOST_PARAMETERS:
+                    found.append(f"{path.relative_to(root)}:{node.lineno} {node.name} ({count})")
+    return found
+
+
+def ambiguous_classes(root: Path) -> dict[str, list[str]]:
+    """Names of classes, public or not, that stand for several things, with their places."""
+    places: dict[str, list[str]] = {}
+    for path in sources(root, *PACKAGES):
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(f"{path.relative_to(root)}:{node.lineno}")
+    return {name: found for name, found in places.items() if len(found) > 1}
+
+
+def light_import(root: Path) -> tuple[float, int, list[str]]:
+    """Milliseconds and modules of importing the contract, and what of the heavy libraries came along."""
+    words = (
+        f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "
+        f"print(1e3 * (time.perf_counter() - begun), len(set(sys.modules) - before), "
+        f"*[name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", words], cwd=root, capture_output=True, text=True, check=True)
+    milliseconds, modules, *heavy = done.stdout.split()
+    return float(milliseconds), int(modules), heavy
+
+
+FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
+Places = list[str]
+CONSTANT_ROOMS: Final = (
+    "edge_agent/adaptation",
+    "edge_agent/estimators/common",
+    "edge_agent/estimators/friction_mixture",
+    "edge_agent/observe",
+    "fleet_service/fusion",
+)
+PRODUCT: Final = ("schemas", "edge_agent", "fleet_service")
+
+
+def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
+    """Yield place and node of every function."""
+    for path in sources(root, *packages):
+        for node in ast.walk(parse(path)):
+            if isinstance(node, FunctionNode):
+                yield f"{path.relative_to(root)}:{node.lineno} {node.name}", node
+
+
+def room_arrows(root: Path, folder: str) -> Places:
+    """Return the pairs of sub-packages (or modules) of a folder of which one imports the other."""
+    base = folder.replace("/", ".")
+    found: dict[tuple[str, str], str] = {}
+    for path in sources(root, folder):
+        own = path.relative_to(root / folder).with_suffix("").parts[0]
+        for line, name in imported(parse(path)):
+            if name.startswith(f"{base}."):
+                other = name.removeprefix(f"{base}.").split(".")[0]
+                exists = (root / folder / other).is_dir() or (root / folder / f"{other}.py").exists()
+                if exists and other != own and own != "__init__":
+                    found.setdefault((own, other), f"{path.relative_to(root)}:{line}")
+    return [f"{a} -> {b}: {place}" for (a, b), place in sorted(found.items())]
+
+
+def import_circles(root: Path) -> Places:
+    """Return the circles of modules that import each other, imports inside functions included."""
+    return circles_of({path.relative_to(root): parse(path) for path in sources(root, *PACKAGES)})
+
+
+def methods_of_largest_class(root: Path) -> Places:
+    """Return every class with its number of methods and properties, largest first, one entry per method."""
+    largest: Places = []
+    for path in sources(root, *PACKAGES):
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.ClassDef):
+                methods = [item for item in node.body if isinstance(item, FunctionNode)]
+                if len(methods) > len(largest):
+                    largest = [f"{path.relative_to(root)}:{item.lineno} {node.name}.{item.name}" for item in methods]
+    return largest
+
+
+def most_parameters(root: Path) -> Places:
+    """Return the parameters of the function that has most, keywords counted, `self` and `cls` not."""
+    most: Places = []
+    for place, node in functions(root, *PACKAGES):
+        arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+        names = [argument.arg for argument in arguments if argument.arg not in ("self", "cls")]
+        if len(names) > len(most):
+            most = [f"{place}: {name}" for name in names]
+    return most
+
+
+def functions_with_many_parameters(root: Path) -> Places:
+    """Return the functions with more than six parameters, keywords counted."""
+    found = []
+    for place, node in functions(root, *PACKAGES):
+        arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+        count = len([argument for argument in arguments if argument.arg not in ("self", "cls")])
+        if count > 6:
+            found.append(f"{place} ({count})")
+    return found
+
+
+def packed_assignments(root: Path) -> Places:
+    """Return the assignments of a tuple that is written out to several names: `a, b = x, y`."""
+    found = []
+    for path in sources(root, *PACKAGES):
+        for node in ast.walk(parse(path)):
+            match node:
+                case ast.Assign(targets=[*_, ast.Tuple()], value=ast.Tuple()):
+                    found.append(f"{path.relative_to(root)}:{node.lineno}")
+    return found
+
+
+def fmt_skips(root: Path) -> Places:
+    """Return the lines that the formatter must not touch, tests included."""
+    marker = "# fmt: " + "skip"
+    return [
+        f"{path.relative_to(root)}:{line}"
+        for path in sources(root, *PACKAGES, "tests")
+        for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if marker in text
+    ]
+
+
+def long_lines(root: Path) -> Places:
+    """Return the lines of more than 100 columns, tests included."""
+    return [
+        f"{path.relative_to(root)}:{line}"
+        for path in sources(root, *PACKAGES, "tests")
+        for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if len(text) > 100
+    ]
+
+
+_NESTING: Final = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.AsyncFor, ast.AsyncWith)
+
+
+def _depth(node: ast.AST) -> int:
+    """Return how many blocks are nested in a function; `elif` does not count, inner functions count for themselves."""
+    deepest = 0
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            continue
+        is_elif = isinstance(node, ast.If) and isinstance(child, ast.If) and node.orelse == [child]
+        deepest = max(deepest, _depth(child) + (isinstance(child, _NESTING) and not is_elif))
+    return deepest
+
+
+def deep_nesting(root: Path) -> Places:
+    """Return the functions with more than four nested blocks."""
+    found = ((place, _depth(node)) for place, node in functions(root, *PACKAGES))
+    return [f"{place} ({depth})" for place, depth in found if depth > 4]
+
+
+def many_locals(root: Path) -> Places:
+    """Return the functions with more than forty local names, parameters counted."""
+    found = []
+    for place, node in functions(root, *PACKAGES):
+        names = {item.arg for item in ast.walk(node.args) if isinstance(item, ast.arg)}
+        for item in ast.walk(node):
+            if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store):
+                names.add(item.id)
+        if len(names) > 40:
+            found.append(f"{place} ({len(names)})")
+    return found
+
+
+def named_constants(root: Path) -> Places:
+    """Return the numbers with a name between sensor and map.
+
+    Counted are module constants (capital letters) and fields of classes called …Constants whose value is a number or an
+    expression of numbers, in `CONSTANT_ROOMS`.
+    """
+    found = []
+    for path in sources(root, *CONSTANT_ROOMS):
+        tree = parse(path)
+        bodies = [("", tree.body)]
+        bodies += [
+            (f"{node.name}.", node.body)
+            for node in tree.body
+            if isinstance(node, ast.ClassDef) and node.name.endswith("Constants")
+        ]
+        for owner, body in bodies:
+            for node in body:
+                value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+                target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+                if value is None or not isinstance(target, ast.Name) or not _is_number(value):
+                    continue
+                if owner or target.id.isupper():
+                    found.append(f"{path.relative_to(root)}:{node.lineno} {owner}{target.id}")
+    return found
+
+
+def _is_number(node: ast.AST) -> bool:
+    """Return True for a number or arithmetic of numbers; a bool or a text is none."""
+    parts = list(ast.walk(node))
+    constants = [part.value for part in parts if isinstance(part, ast.Constant)]
+    plain = all(isinstance(part, ast.Constant | ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop) for part in parts)
+    return plain and bool(constants) and all(type(value) in (int, float) for value in constants)
+
+
+def only_tests_use(root: Path) -> Places:
+    """Return the product lines of functions and classes that only tests mention.
+
+    A name counts as used if any other line of product, deployment, Makefile, pages or examples contains it. Functions
+    with a decorator other than `property` are left out, because the decorator may register them.
+    """
+    texts = {path: path.read_text(encoding="utf-8") for path in sources(root, *PACKAGES)}
+    others = [root / "Makefile", root / "pyproject.toml", *root.rglob("deploy/**/*.md"), *root.glob("*/**/README.md")]
+    others += [*root.glob("*.md"), *root.rglob("deploy/**/*.ipynb"), *root.rglob("*/static/**/*.js")]
+    words = Counter(re.findall(r"\w+", "\n".join([*texts.values(), *(path.read_text("utf-8") for path in others)])))
+    tests = set(re.findall(r"\w+", "\n".join(path.read_text("utf-8") for path in sources(root, "tests"))))
+    found = []
+    for path in texts:
+        for node in ast.walk(parse(path)):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) and not node.name.startswith(
+                "_"
+            ):
+                exposed = bool(getattr(node, "decorator_list", [])) and not isinstance(node, ast.ClassDef)
+                exposed = exposed and "property" not in ast.unparse(node.decorator_list[0])
+                if words[node.name] == 1 and node.name in tests and not exposed and not node.name.startswith("visit_"):
+                    lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
+                    found += [f"{path.relative_to(root)}:{line} {node.name}" for line in lines]
+    return found
+
+
+def _per_1000_lines(count: int, root: Path) -> float:
+    lines = sum(path.read_text(encoding="utf-8").count("\n") for path in sources(root, *PACKAGES))
+    return round(1000.0 * count / lines, 2)
+
+
+class Figure(NamedTuple):
+    """One row of the table.
+
+    Attributes:
+        name: of the figure.
+        bar: value that is the aim.
+        ceiling: value that must not be exceeded; at most what was measured last.
+        places: returns one entry per counted thing.
+        per_1000: True if the value is per 1,000 lines of the packages.
+    """
+
+    name: str
+    bar: float
+    ceiling: float
+    places: Callable[[Path], Places]
+    per_1000: bool = False
+
+    def measure(self, root: Path) -> float:
+        """Return the value."""
+        count = len(self.places(root))
+        return _per_1000_lines(count, root) if self.per_1000 else float(count)
+
+
+FIGURES: Final = (
+    Figure("arrows inside archive/", 10, 6, lambda root: room_arrows(root, "fleet_service/archive")),
+    Figure(
+        "arrows inside friction_mixture/",
+        22,
+        130,
+        lambda root: room_arrows(root, "edge_agent/estimators/friction_mixture"),
+    ),
+    Figure("import circles", 0, 1, import_circles),
+    Figure("methods of the largest class", 15, 35, methods_of_largest_class),
+    Figure("most parameters", 6, 12, most_parameters),
+    Figure("functions with more than 6 parameters", 0, 45, functions_with_many_parameters),
+    Figure("packed assignments per 1,000 lines", 2, 20.5, packed_assignments, per_1000=True),
+    Figure("fmt: skip", 40, 470, fmt_skips),
+    Figure("lines over 100 columns", 0, 8300, long_lines),
+    Figure("functions with nesting over 4", 0, 8, deep_nesting),
+    Figure("functions with more than 40 local names", 0, 3, many_locals),
+    Figure("named constants between sensor and map", 230, 390, named_constants),
+    Figure("product lines that only tests use", 0, 150, only_tests_use),
+)
+
+
+def main(arguments: list[str]) -> None:
+    """Print the table of a checkout, or the places of figures."""
+    if arguments[:1] == ["--places"]:
+        for figure in FIGURES:
+            if not arguments[1:] or arguments[1] in figure.name:
+                print(f"{figure.name}:", *figure.places(ROOT), sep="\n  ")
+        return
+    root = Path(arguments[0]).resolve() if arguments else ROOT
+    print(f"{'figure':<44}{'value':>9}{'bar':>9}{'ceiling':>9}")
+    for figure in FIGURES:
+        value = figure.measure(root)
+        mark = "" if value <= figure.bar else "  ✗"
+        print(f"{figure.name:<44}{value:>9g}{figure.bar:>9g}{figure.ceiling:>9g}{mark}")
+    for package in PACKAGES[:3]:
+        loose = len(loose_modules(root, package))
+        print(f"{package}: {loose} loose modules, {len(arrows(root, package))} arrows between rooms")
+    print(f"class names used more than once: {len(ambiguous_classes(root))}")
+    milliseconds, modules, heavy = light_import(root)
+    print(f"{LIGHT}: {milliseconds:.0f} ms, {modules} modules, {', '.join(heavy) or 'nothing heavy'}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
