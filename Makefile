@@ -27,7 +27,7 @@ setup: $(STAMP)  ## install everything into .venv, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,iceberg,inputs,metrics,objects,page]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,iceberg,inputs,metrics,objects,page,webhook]'
 	$(BIN)/python -m deploy.precompile
 	touch $@
 

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fleet_service.cli.common import add_connection, stop_on_signals
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from fleet_service.client.stretches import StretchAlert
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,26 +21,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alerts", action="store_true", help="only alerts: one per stretch, with length and direction")
     parser.add_argument("--json", action="store_true", help="print one JSON object per line")
     parser.add_argument("--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format")
+    parser.add_argument(
+        "--webhook-queue", metavar="FILE", type=Path,
+        help="file for alerts that wait for the receiver (default: in the user's state folder)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--health-port", metavar="PORT", type=int, help="serve /healthz and /metrics of the webhook on loopback"
+    )
     add_connection(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Watch until a signal."""
     from fleet_service.client import map_client, watching
-    from fleet_service.client.webhook import Webhook
 
     stop = stop_on_signals()
     wishes = watching.WatchOptions(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
     settings = map_client.settings(arguments.connect, arguments.config)
     if arguments.webhook is None:
+        for name in ("webhook_queue", "health_port"):
+            if getattr(arguments, name) is not None:
+                raise InputError(name, "has no meaning without a webhook", "add --webhook URL")
         watching.watch(settings, wishes, stop, _say)
         return 0
-    hook = Webhook(arguments.webhook, lambda line: print(line, file=sys.stderr, flush=True))
+    return _watch_with_webhook(arguments, lambda hear: watching.watch(settings, wishes, stop, _say, hear))
+
+
+def _watch_with_webhook(arguments: argparse.Namespace, watch: Callable[[Callable[[StretchAlert], None]], None]) -> int:
+    """Watch and send alerts; return 1 if any was lost or could not be delivered."""
+    from fleet_service.client.alert_queue import AlertQueue
+    from fleet_service.client.webhook import Webhook, check_url, queue_path
+    from schemas.runtime.metrics import serve_metrics
+
+    check_url(arguments.webhook)
+    queue = AlertQueue(arguments.webhook_queue or queue_path(arguments.webhook))
+    hook = Webhook(arguments.webhook, lambda line: print(line, file=sys.stderr, flush=True), queue)
     try:
-        watching.watch(settings, wishes, stop, _say, hook.send)
+        with serve_metrics("127.0.0.1", arguments.health_port, hook.metrics, hook.troubles):
+            watch(hook.send)
     finally:
         hook.close()
-    return 0
+    return 1 if hook.lost or hook.waiting else 0
 
 
 def _say(line: str) -> None:

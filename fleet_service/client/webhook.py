@@ -1,27 +1,38 @@
 """Webhook for alerts of stretches, in the format of Alertmanager's webhook receivers (version 4).
 
-Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts. If the receiver is away,
-delivery is repeated at growing intervals. Missed alerts are sent in order, up to MOST_WAITING.
+Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts. Delivery is at least once
+and in order. A message leaves the queue only after a 2xx answer within TIMEOUT_S. Redirects are not followed, because
+a POST would become an empty GET. Whatever is not delivered is counted and reported.
 """
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
 import json
+import os
+import sqlite3
 import threading
-import urllib.error
-import urllib.request
-from collections import deque
+from collections import Counter
 from collections.abc import Callable
-from typing import Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
+from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import StretchAlert, iso
 from schemas.errors import InputError
+from schemas.runtime.metrics import Metric, gauge
 from schemas.thresholds import SLIPPERY_MU
 
-MOST_WAITING: Final = 1000
-TIMEOUT_S: Final = 5.0
+if TYPE_CHECKING:
+    import httpx
+
+TIMEOUT_S: Final = 5.0  # of a whole request, so that a receiver that drips bytes does not block the queue
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 60.0
+# Answers by which a receiver refuses this message for good; repeating it would block the queue.
+REFUSALS: Final = frozenset({400, 413, 415, 422})
+LOSSES: Final = ("dropped", "refused", "unstored")
 _OPEN: Final = "0001-01-01T00:00:00Z"  # Alertmanager's end of what has not ended
 
 
@@ -49,67 +60,168 @@ def body(alert: StretchAlert) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def queue_path(url: str) -> Path:
+    """Return the default file of the queue for a receiver."""
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return state / "gripmap" / f"webhook-{hashlib.sha256(url.encode()).hexdigest()[:16]}.sqlite"
+
+
 class Webhook:
     """Sender of alerts with a thread of its own; `close` sends the rest once.
 
     Args:
         url: of the receiver, http or https.
-        say: called with a line when the receiver goes away or returns.
+        say: called with a line when the receiver goes away or returns, and for every loss.
+        queue: of messages that wait; messages of an earlier process are sent first.
+        timeout_s: of a whole request [s].
 
     Raises:
-        InputError: the URL is not valid.
+        InputError: the URL is not valid, or the package for HTTP is missing.
     """
 
-    def __init__(self, url: str, say: Callable[[str], None]) -> None:
-        if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).netloc:
-            raise InputError("webhook", f"{url!r} is no URL", "give http://HOST/PATH or https://HOST/PATH")
-        self._url, self._say = url, say
-        self._waiting: deque[StretchAlert] = deque(maxlen=MOST_WAITING)
+    def __init__(self, url: str, say: Callable[[str], None], queue: AlertQueue, timeout_s: float = TIMEOUT_S) -> None:
+        check_url(url)
+        self._url, self._say, self._queue, self._timeout_s = url, say, queue, timeout_s
+        self._name = f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"  # a path may hold a secret
+        self.counts: Counter[str] = Counter()
+        self._failure, self._undelivered, self._is_closed = "", 0, False
         self._more, self._stop = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._more.set()
+        self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
         self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Number of alerts that will never be delivered."""
+        return sum(self.counts[name] for name in LOSSES)
+
+    @property
+    def waiting(self) -> int:
+        """Number of alerts in the queue; after `close`, of those that stayed in it."""
+        return self._undelivered if self._is_closed else len(self._queue)
+
+    def troubles(self) -> list[str]:
+        """Return one message per problem; empty if every alert is delivered or under way."""
+        out = [f"webhook: {self._failure}; {self.waiting} alerts wait"] if self._failure else []
+        return [*out, f"webhook: {self.lost} alerts were lost"] if self.lost else out
+
+    def metrics(self) -> list[Metric]:
+        """Return counters of alerts and the length of the queue."""
+        alerts = {name: float(self.counts[name]) for name in ("delivered", *LOSSES)}
+        return [
+            Metric("webhook_alerts", "counter", "Alerts by outcome", alerts, "outcome"),
+            Metric("webhook_failures", "counter", "Failed deliveries", {"": float(self.counts["failures"])}),
+            gauge("webhook_waiting", "Alerts in the queue", float(self.waiting)),
+        ]
 
     def send(self, alert: StretchAlert) -> None:
         """Queue an alert."""
-        self._waiting.append(alert)
+        try:
+            dropped = self._queue.append(json.dumps(body(alert)))
+        except sqlite3.Error as error:
+            self._lose("unstored", 1, f"the queue cannot be written ({error})")
+            return
+        if dropped:
+            self._lose("dropped", dropped, "the queue is full")
         self._more.set()
 
     def close(self) -> None:
-        """Try to send the rest once, and stop."""
+        """Try to send the rest once, and stop; undelivered alerts stay in the file."""
         self._stop.set()
         self._more.set()
-        self._thread.join(2 * TIMEOUT_S)
+        self._thread.join(2 * self._timeout_s)
+        self._undelivered = len(self._queue)
+        self._is_closed = True
+        if self._undelivered:
+            self._say(f"webhook: {self._undelivered} alerts wait in the queue for the next watch")
+        if self.lost:
+            self._say(f"webhook: {self.lost} alerts were lost")
+        if not self._thread.is_alive():
+            self._queue.close()
+
+    def _lose(self, kind: str, number: int, reason: str) -> None:
+        self.counts[kind] += number
+        self._say(f"webhook: {number} alerts lost, {reason}")
 
     def _run(self) -> None:
-        wait = FIRST_WAIT_S
-        while True:
-            self._more.wait()
-            self._more.clear()
-            while self._waiting:
-                alert = self._waiting[0]
-                if self._posted(alert):
-                    if wait > FIRST_WAIT_S:
-                        self._say("webhook: the receiver answers again")
-                    wait = FIRST_WAIT_S
-                    if self._waiting and self._waiting[0] is alert:
-                        self._waiting.popleft()
-                elif self._stop.is_set():
-                    self._say(f"webhook: {len(self._waiting)} alerts were not delivered")
-                    return
-                else:
-                    if wait == FIRST_WAIT_S:
-                        self._say(f"webhook: {self._url} does not take alerts; they wait")
+        import httpx
+
+        with asyncio.Runner() as runner:
+            client = httpx.AsyncClient(follow_redirects=False, timeout=self._timeout_s)
+            wait = FIRST_WAIT_S
+            while True:
+                self._more.wait()
+                self._more.clear()
+                while (failure := self._send_first(runner, client)) is not None:
+                    if not failure:
+                        wait = FIRST_WAIT_S
+                        continue
+                    if self._stop.is_set():
+                        break
                     self._stop.wait(wait)
                     wait = min(2 * wait, LONGEST_WAIT_S)
-            if self._stop.is_set():
-                return
+                if self._stop.is_set():
+                    break
+            runner.run(client.aclose())
 
-    def _posted(self, alert: StretchAlert) -> bool:
-        request = urllib.request.Request(
-            self._url, json.dumps(body(alert)).encode(), {"Content-Type": "application/json"}, method="POST"
-        )
+    def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
+        """Send the oldest message; return None if there is none, "" if it is settled, else the reason of failure."""
         try:
-            with urllib.request.urlopen(request, timeout=TIMEOUT_S) as reply:
-                return 200 <= int(reply.status) < 300
-        except (urllib.error.URLError, OSError):
-            return False
+            first = self._queue.first()
+            if first is None:
+                return None
+            number, text = first
+            status = runner.run(self._post(client, text))
+            failure = _failure_of(status)
+            if failure is None:
+                self._settle(number, status)
+                return ""
+        except Exception as error:  # noqa: BLE001 any answer may come, and the thread must outlive it
+            failure = f"{type(error).__name__} {error}".strip()
+        self.counts["failures"] += 1
+        if not self._failure:
+            self._say(f"webhook: {self._name} does not take alerts ({failure}); they wait")
+        self._failure = failure
+        return failure
+
+    def _settle(self, number: int, status: int) -> None:
+        is_delivered = 200 <= status < 300
+        self._queue.remove(number)
+        if is_delivered:
+            self.counts["delivered"] += 1
+        else:
+            self._lose("refused", 1, f"{self._name} answered {status}")
+        if self._failure:
+            self._say("webhook: the receiver answers again")
+            self._failure = ""
+
+    async def _post(self, client: httpx.AsyncClient, text: str) -> int:
+        """Return the status of the answer; its body is not read."""
+        async with asyncio.timeout(self._timeout_s):
+            headers = {"Content-Type": "application/json"}
+            async with client.stream("POST", self._url, content=text.encode(), headers=headers) as answer:
+                return answer.status_code
+
+
+def check_url(url: str) -> None:
+    """Raise InputError if a URL is not valid, or the package for HTTP is missing."""
+    try:
+        parts = urlsplit(url)
+        is_valid = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
+    except ValueError:
+        is_valid = False
+    if not is_valid:
+        raise InputError("webhook", f"{url!r} is no URL", "give http://HOST/PATH or https://HOST/PATH")
+    try:
+        import httpx  # noqa: F401
+    except ImportError as error:
+        raise InputError("webhook", "the package httpx is missing", "pip install 'gripmap[webhook]'") from error
+
+
+def _failure_of(status: int) -> str | None:
+    """Return the reason for which a message must be sent again; None if it is settled."""
+    if 200 <= status < 300 or status in REFUSALS:
+        return None
+    if 300 <= status < 400:
+        return f"it redirects with {status}; give the URL of the receiver itself"
+    return f"it answers {status}"

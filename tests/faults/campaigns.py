@@ -24,6 +24,7 @@ from tests.faults import (
     soak,
     truncation,
     versions,
+    webhook,
 )
 from tests.faults.frame import Campaign
 
@@ -145,6 +146,14 @@ CAMPAIGNS: Final = (
         (
             *("faults.insider.alerts_alone", "faults.insider.mb_per_hour", "faults.insider.honest_delay_s"),
             *("faults.insider.messages", "faults.insider.honest_lost", "faults.insider.replayed"),
+        ),
+    ),
+    Campaign(
+        "webhook",
+        webhook.run,
+        (
+            *("faults.webhook.lost_silently", "faults.webhook.late"),
+            *("faults.webhook.kinds", "faults.webhook.arrived"),
         ),
     ),
     Campaign(

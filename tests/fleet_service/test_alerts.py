@@ -7,9 +7,11 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,15 @@ import pytest
 import zenoh
 
 from fleet_service.cli import main
+from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import LINK_CELLS, Stretches
-from fleet_service.client.webhook import Webhook, body
+from fleet_service.client.webhook import Webhook, body, check_url
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.wire import Alert
+from tests.deploy.kubernetes import free_ports
+from tests.faults.webhook import ALERTS, run_kind
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
@@ -119,10 +124,10 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
         thread.join()
 
 
-def test_webhook_has_alertmanagers_format_and_order_after_a_refusal() -> None:
+def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Path) -> None:
     road, said = Stretches(), list[str]()
     with receiver(refuse=1) as (url, heard):
-        hook = Webhook(url, said.append)
+        hook = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
         for one in (*told(road, alert(0)), *told(road, alert(0, raised=False, at=5))):
             hook.send(one)
         until(lambda: len(heard) == 2)
@@ -138,24 +143,65 @@ def test_webhook_has_alertmanagers_format_and_order_after_a_refusal() -> None:
     assert "answers again" in said[1]
 
 
-def test_a_receiver_that_never_comes_is_said_at_the_end() -> None:
+def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
     said: list[str] = []
-    hook = Webhook("http://127.0.0.1:9/none", said.append)
+    hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue"))
     hook.send(told(Stretches(), alert(0))[0])
-    until(lambda: said)
+    until(lambda: bool(hook.troubles()))
     hook.close()
-    assert said[-1] == "webhook: 1 alerts were not delivered"
-    with pytest.raises(InputError, match="webhook: 'ftp://x' is no URL"):
-        Webhook("ftp://x", said.append)
+    assert said[-1] == "webhook: 1 alerts wait in the queue for the next watch"
+    assert (hook.waiting, hook.lost) == (1, 0)
+    with receiver() as (url, heard):
+        again = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
+        until(lambda: again.counts["delivered"] == 1)
+        again.close()
+    assert (len(heard), again.waiting, again.troubles()) == (1, 0, [])
     assert set(body(told(Stretches(), alert(0))[0])) >= {"receiver", "status", "alerts", "groupLabels", "externalURL"}
+
+
+def test_full_queue_drops_the_oldest_and_reports_it(tmp_path: Path) -> None:
+    said: list[str] = []
+    hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue", 2))
+    for one in told(Stretches(), *(alert(10 * x) for x in range(5))):
+        hook.send(one)
+    assert hook.counts["dropped"] == 3
+    assert "webhook: 3 alerts were lost" in hook.troubles()
+    assert {m.name: dict(m.values) for m in hook.metrics()}["webhook_waiting"] == {"": 2.0}
+    hook.close()
+    assert said[-1] == "webhook: 3 alerts were lost"
+
+
+@pytest.mark.parametrize("kind", ["not-http", "redirect-302", "drips", "refuses"])
+def test_broken_receiver_loses_no_alert_silently(tmp_path: Path, kind: str) -> None:
+    arrived, lost = run_kind(tmp_path, kind)
+    assert lost == 0
+    assert arrived == (0 if kind == "refuses" else ALERTS)
+
+
+@pytest.mark.parametrize("url", ["ftp://x", "x", "http://", "http://[", "http://a:99999999/"])
+def test_webhook_refuses_what_is_no_url(url: str) -> None:
+    with pytest.raises(InputError, match="is no URL"):
+        check_url(url)
+
+
+def test_queue_belongs_to_one_watch(tmp_path: Path) -> None:
+    first = AlertQueue(tmp_path / "queue")
+    with pytest.raises(InputError, match="webhook_queue: .*queue cannot be used"):
+        AlertQueue(tmp_path / "queue")
+    first.close()
+    (tmp_path / "bad").write_bytes(b"no database" * 100)
+    with pytest.raises(InputError, match="webhook_queue"):
+        AlertQueue(tmp_path / "bad")
 
 
 @pytest.mark.usefixtures("service")
 def test_watch_says_stretches_as_json_and_sends_them(
-    router: ZenohSettings, session: zenoh.Session, service: Running
+    router: ZenohSettings, session: zenoh.Session, service: Running, tmp_path: Path
 ) -> None:
     with receiver() as (url, heard):
+        (port,) = free_ports(1)
         words = ["watch", "--alerts", "--json", "--webhook", url, "--connect", router.connect[0]]
+        words += ["--webhook-queue", str(tmp_path / "queue"), "--health-port", str(port)]
         command = [sys.executable, "-m", "fleet_service.cli", *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as watching:
             assert watching.stdout is not None
@@ -164,6 +210,8 @@ def test_watch_says_stretches_as_json_and_sends_them(
             fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
             line = json.loads(watching.stdout.readline())
             until(lambda: heard)
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
+                assert json.load(answer)["status"] == "ok"
             watching.terminate()
             assert watching.wait(20) == 0
     assert (line["event"], line["state"], line["cells"]) == ("alert", "raised", 1)
@@ -173,3 +221,5 @@ def test_watch_says_stretches_as_json_and_sends_them(
 def test_a_webhook_that_is_no_url_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["watch", "--webhook", "x"]) == 2
     assert capsys.readouterr().err.startswith("error: webhook: 'x' is no URL")
+    assert main(["watch", "--health-port", "1"]) == 2
+    assert capsys.readouterr().err.startswith("error: health_port: has no meaning without a webhook")

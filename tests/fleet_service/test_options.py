@@ -122,7 +122,7 @@ SHOWN_BELOW: Final = {
         "--config",
     },
     "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_moving.py
-    "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
+    "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook", "--webhook-queue", "--health-port"},
 }
 # command -> the modules in which these options are given, beside this one
 GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {

@@ -1,0 +1,166 @@
+"""Broken receivers of a webhook: every alert arrives, waits in the queue, or is counted as lost.
+
+Each kind of receiver is broken for its first connections and then sound. Two kinds never recover. A receiver keeps the
+ids of the alerts that it confirmed, which is the oracle; the sender's own counters only tell what it admits.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from fleet_service.client.alert_queue import AlertQueue
+from fleet_service.client.stretches import StretchAlert
+from fleet_service.client.webhook import Webhook
+from schemas.runtime.figures import Figure
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+
+ALERTS: Final = 5
+BROKEN: Final = 2  # connections, before the receiver is sound
+TIMEOUT_S: Final = 0.5
+PATIENCE_S: Final = 30.0  # for all alerts to settle
+FEW: Final = 3  # places in the queue of the receiver that is away too long
+OK: Final = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+FOREVER: Final = frozenset({"absent", "overflow", "refuses"})
+
+
+def _status(code: int, more: str = "") -> bytes:
+    return f"HTTP/1.1 {code} X\r\n{more}Content-Length: 0\r\nConnection: close\r\n\r\n".encode()
+
+
+def _repeat(part: bytes, pause_s: float = 0.0) -> Callable[[socket.socket], None]:
+    def send(client: socket.socket) -> None:
+        client.sendall(b"HTTP/1.1 200 OK\r\n")
+        end = time.monotonic() + 4 * TIMEOUT_S
+        while time.monotonic() < end:
+            client.sendall(part)
+            time.sleep(pause_s)
+
+    return send
+
+
+def _silent(client: socket.socket) -> None:
+    client.settimeout(4 * TIMEOUT_S)
+    client.recv(1)
+
+
+def _sends(answer: bytes) -> Callable[[socket.socket], None]:
+    return lambda client: client.sendall(answer)
+
+
+BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
+    "not-http": _sends(b"220 mail.example ready\r\n\r\n"),
+    "redirect-301": _sends(_status(301, "Location: /login\r\n")),
+    "redirect-302": _sends(_status(302, "Location: /login\r\n")),
+    "redirect-303": _sends(_status(303, "Location: /login\r\n")),
+    "redirect-308": _sends(_status(308, "Location: /login\r\n")),
+    "drips": _repeat(b"x", 0.05),
+    "closes": lambda _: None,
+    "half-head": _sends(b"HTTP/1.1 200 OK\r\nContent-Le"),
+    "silent": _silent,
+    "huge-head": _repeat(b"x-a: " + b"y" * 60_000),
+    "error-500": _sends(_status(500)),
+    "error-429": _sends(_status(429)),
+    "not-found": _sends(_status(404)),
+    "bad-number": _sends(b"HTTP/1.1 two-hundred OK\r\n\r\n"),
+    "refuses": _sends(_status(400)),
+    "absent": _silent,
+    "overflow": _silent,
+}
+
+
+class Receiver:
+    """Server on loopback that is broken in one way for its first connections."""
+
+    def __init__(self, kind: str) -> None:
+        self.heard: set[str] = set()
+        self._break, self._left = BREAKS[kind], 10**9 if kind in FOREVER else BROKEN
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._server.getsockname()[1]}/hook"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop accepting."""
+        self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        self._thread.join()
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while True:
+                client, _ = self._server.accept()
+                threading.Thread(target=self._answer, args=(client,), daemon=True).start()
+
+    def _answer(self, client: socket.socket) -> None:
+        with client, suppress(OSError, ValueError, IndexError):
+            client.settimeout(4 * TIMEOUT_S)
+            head, text = _request(client)
+            if self._left > 0:
+                self._left -= 1
+                self._break(client)
+            elif head.startswith(b"POST /hook "):
+                client.sendall(OK)
+                self.heard.add(json.loads(text)["alerts"][0]["fingerprint"])
+            else:
+                client.sendall(OK)  # a login page answers every GET
+
+
+def _request(client: socket.socket) -> tuple[bytes, bytes]:
+    data = b""
+    while b"\r\n\r\n" not in data:
+        data += client.recv(65536) or b"\r\n\r\n"
+    head, _, text = data.partition(b"\r\n\r\n")
+    lengths = [line for line in head.split(b"\r\n") if line.lower().startswith(b"content-length:")]
+    while len(text) < int(lengths[0].split(b":")[1]):
+        text += client.recv(65536)
+    return head, text
+
+
+def stretch(number: int) -> StretchAlert:
+    """Return an alert with a number as its id."""
+    return StretchAlert(
+        id=f"id-{number}", state="raised", since=0, time=0, length_m=12.0, direction="north-south", headings=("north",),
+        latitude=57.7, longitude=11.97, bbox=(11.9, 57.6, 12.0, 57.8), cells=1, mu=0.2, mu_lower=0.1, mu_upper=0.3,
+        p_slippery=0.95, vehicles=3, reason="P(mu < 0.4) = 0.95 > 0.9", points=((57.7, 11.97),),
+    )  # fmt: skip
+
+
+def run_kind(folder: Path, kind: str) -> tuple[int, int]:
+    """Send alerts to one kind of receiver; return how many arrived, and how many were lost without a word."""
+    receiver, said = Receiver(kind), list[str]()
+    queue = AlertQueue(folder / f"{kind}.sqlite", FEW if kind == "overflow" else 1000)
+    hook = Webhook(receiver.url, said.append, queue, TIMEOUT_S)
+    for number in range(ALERTS):
+        hook.send(stretch(number))
+    end = time.monotonic() + (1.0 if kind in FOREVER else PATIENCE_S)
+    while time.monotonic() < end and len(receiver.heard) + hook.lost < ALERTS:
+        time.sleep(0.02)
+    hook.close()
+    receiver.close()
+    missing = ALERTS - len(receiver.heard)
+    admitted = hook.lost + hook.waiting if said else 0
+    return len(receiver.heard), max(missing - admitted, 0)
+
+
+def run(site: Site) -> list[Figure]:
+    """All kinds at once; seconds."""
+    with ThreadPoolExecutor(len(BREAKS)) as pool:
+        found = dict(zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True))
+    for kind, (arrived, lost) in found.items():
+        site.say(f"{kind}: {arrived} of {ALERTS} arrived, {lost} lost silently")
+    short = [kind for kind, (arrived, _) in found.items() if kind not in FOREVER and arrived < ALERTS]
+    return [
+        figure("faults.webhook.lost_silently", sum(lost for _, lost in found.values())),
+        figure("faults.webhook.late", len(short)),
+        figure("faults.webhook.kinds", len(found)),
+        figure("faults.webhook.arrived", sum(arrived for arrived, _ in found.values())),
+    ]
