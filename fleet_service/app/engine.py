@@ -33,9 +33,10 @@ from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import UNCORRECTED
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.budgets import NewCells, Tracks
+from fleet_service.ingest.budgets import NewCells
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
+from fleet_service.ingest.paths import VehiclePaths
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherInbox
 from fleet_service.ingest.weather import files as weather_files
@@ -92,7 +93,7 @@ class Engine:
         """Load the state from the archive."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
-        self._tracks, self._places = Tracks(), NewCells()
+        self._paths, self._places = VehiclePaths(), NewCells()
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
         self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
@@ -131,7 +132,7 @@ class Engine:
         before()
         memory = load_state(self._root, self._config, set_aside)
         with self._guard:
-            self._tracks, self._places = Tracks(), NewCells()
+            self._paths, self._places = VehiclePaths(), NewCells()
             self._adopt(memory)
             still = {(alert.cell, alert.sector) for alert in self._alerts.standing_alerts}
             ended = [alert for alert in stood if (alert.cell, alert.sector) not in still]
@@ -278,7 +279,7 @@ class Engine:
         """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
         places."""
         witness = rows["witness"]
-        beyond = self._tracks.impossible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
+        beyond = self._paths.find_implausible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
         self.counts["implausible_moves"] += int(beyond.sum())
         new = np.flatnonzero((self.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64)) < 0) & ~beyond)
         over = self._places.beyond(witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS)

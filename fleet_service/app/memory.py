@@ -22,6 +22,7 @@ from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.rebuild import Begin, Since, first_day, nobody, replay, restore_streams
 from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
+from fleet_service.serve.idle_roads import IdleRoads
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
@@ -97,7 +98,7 @@ def load_state(
     if config.public_vehicles > 1:  # after a checkpoint that does not have them nothing is shown until so many came
         kept = begin.beside.get(VISITORS)
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
-    shown, alerts = MapState(fusion), Alerts(fusion)
+    shown, alerts = MapState(fusion), Alerts(fusion, IdleRoads())
     alerts.resume(begin.standing)
     used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
     fusion.update_weather(archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used)

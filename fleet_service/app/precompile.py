@@ -15,8 +15,8 @@ from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.likelihoods import at_least, levelled, supported
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import shares
-from fleet_service.ingest.budgets import Tracks
 from fleet_service.ingest.grouping import group_rows, largest_of
+from fleet_service.ingest.paths import VehiclePaths
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from schemas import mugrid
@@ -53,7 +53,7 @@ def live() -> None:
     column.flags.writeable = False
     group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
-    Tracks().impossible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
+    VehiclePaths().find_implausible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
 

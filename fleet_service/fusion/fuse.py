@@ -220,12 +220,22 @@ class Fusion:
         A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At most SOURCES are
         remembered; 0 stands for none.
         """
+        _, when = self._sources(slots, side, since)
+        return -np.sort(-when, axis=1)
+
+    def witnesses(self, slot: int, side: int, since: int) -> list[int]:
+        """Return the numbers of the corroborating sources of one slot; see `sources`."""
+        who, when = self._sources(np.array([slot]), side, since)
+        return [int(self.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
+
+    def _sources(self, slots: IntArray, side: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
+        """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does not count."""
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
         trusted = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
         counted = (who != NOBODY) & trusted & (when > np.reshape(since, (-1, 1)))
-        return -np.sort(-np.where(counted, when, 0), axis=1)
+        return who, np.where(counted, when, 0)
 
     def _standing(self, epoch: int) -> Standing:
         return next(found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0)

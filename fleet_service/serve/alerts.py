@@ -11,6 +11,7 @@ import numpy as np
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE
+from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
 from fleet_service.serve.view import LOWER, UPPER
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
@@ -38,10 +39,11 @@ class Alerts:
 
     Args:
         fusion: owner of the cells.
+        idle_roads: limit on alerts where nobody but the witnesses drives; None for no limit, in simulations.
     """
 
-    def __init__(self, fusion: Fusion) -> None:
-        self._fusion = fusion
+    def __init__(self, fusion: Fusion, idle_roads: IdleRoads | None = None) -> None:
+        self._fusion, self._idle_roads = fusion, idle_roads
         self._standing: dict[int, Alert] = {}
 
     @property
@@ -76,8 +78,8 @@ class Alerts:
         believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
         out = []
         for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
-            if probability > RAISE_ABOVE:
-                slot, when = int(slots[k]), int(time[k])
+            slot, when = int(slots[k]), int(time[k])
+            if probability > RAISE_ABOVE and self._is_admitted(slot, when):
                 reason = f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
                 self._standing[slot] = self._alert(slot, when, True, reason)
                 out.append(self._standing[slot])
@@ -85,6 +87,14 @@ class Alerts:
         gripping = gripping[self._have_witnesses(slots[gripping], GRIP, time[gripping])]
         reason = "later visits found grip"
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
+
+    def _is_admitted(self, slot: int, time: int) -> bool:
+        """Return False on an idle road if its witnesses have supported alerts in too many other places lately."""
+        live = self._fusion.live
+        if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
+            return True
+        witnesses = self._fusion.witnesses(slot, ICE, time - SOURCE_NS)
+        return self._idle_roads.admit(int(live.key[slot]) // grid.SECTORS, witnesses, time, LEAST_SOURCES)
 
     def _have_witnesses(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
         """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,) [ns].

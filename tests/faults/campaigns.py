@@ -19,6 +19,7 @@ from tests.faults import (
     insider,
     kill,
     outages,
+    path,
     queries,
     security,
     soak,
@@ -154,6 +155,14 @@ CAMPAIGNS: Final = (
         (
             *("faults.webhook.lost_silently", "faults.webhook.late"),
             *("faults.webhook.kinds", "faults.webhook.arrived"),
+        ),
+    ),
+    Campaign(
+        "path",
+        path.run,
+        (
+            *("faults.path.implausible_accepted", "faults.path.honest_excluded", "faults.path.teleports"),
+            *("faults.path.two_car_alerts", "faults.path.pair_alerts", "faults.path.honest_alerts"),
         ),
     ),
     Campaign(

@@ -19,11 +19,10 @@ from fleet_service.archive.format import reading
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
 from fleet_service.archive.identity.vehicle_ids import VehicleIds, read
 from fleet_service.archive.maintenance.retention import drop_checkpoints, forget_period
-from fleet_service.ingest.budgets import FASTEST, STREAMS_AT_ONCE, Bucket, NewCells, Tracks
+from fleet_service.ingest.budgets import STREAMS_AT_ONCE, Bucket, NewCells
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
-from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
 from tests.fleet_service.examples import SECOND, batch
 
@@ -191,36 +190,6 @@ def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
         engine.ingest([message(one)], now)
     assert engine.counts[Kind.OBSERVATION] == STREAMS_AT_ONCE
     assert engine.counts["too_many_streams"] == 999 - STREAMS_AT_ONCE
-
-
-def place(east_m: float) -> tuple[FloatArray, FloatArray]:
-    return np.array([0.0]), np.array([east_m / 111_320.0])
-
-
-def test_a_car_is_not_in_two_towns_at_once() -> None:
-    tracks, who, start = Tracks(), np.array([7]), time.time_ns()
-
-    def wrong(seconds: float, east_m: float) -> bool:
-        return bool(tracks.impossible(who, np.array([start + int(seconds * SECOND)]), *place(east_m))[0])
-
-    assert [wrong(0, 0.0), wrong(10, 400.0), wrong(20, 8e6), wrong(30, 1_200.0)] == [False, False, True, False]
-    assert not wrong(-3600, -200_000.0), "of a backlog: there was time to come from there"
-    assert wrong(31, 5_000.0 + FASTEST * 31)
-
-
-def test_within_a_batch_a_leap_is_seen_too() -> None:
-    tracks, time_ns = Tracks(), np.arange(4) * SECOND
-    longitude = np.array([0.0, 1e-4, 50.0, 2e-4])
-    assert tracks.impossible(np.full(4, 7), time_ns, np.zeros(4), longitude).tolist() == [False, False, True, False]
-
-
-def test_of_many_cars_each_is_held_against_itself() -> None:
-    tracks, cars, far = Tracks(), np.arange(1000, 0, -1), 10.0
-    longitude = cars / 1000.0
-    for step in range(3):
-        time_ns = np.full(1000, (step + 1) * SECOND)
-        wrong = tracks.impossible(cars, time_ns, np.zeros(1000), longitude + far * ((cars == 500 + step) & (step > 0)))
-        assert cars[wrong].tolist() == ([500 + step] if step else [])
 
 
 def test_new_cells_are_counted_once_and_by_vehicle() -> None:

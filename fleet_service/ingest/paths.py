@@ -1,0 +1,150 @@
+"""Plausible path of each vehicle: check that it can have been at all the places that it reports. Pure.
+
+A vehicle's path is a list of at most ANCHORS (time, place), over all its batches, boots and regions. A report must be
+reachable from the anchor before it, and must leave time to reach the anchor after it, at FASTEST. Positions leap when
+they return after a tunnel or a ferry. All leaps of a vehicle take from one budget of LEAP_M, which fills again slowly,
+so that a vehicle cannot leap with every row.
+
+Reports may come in any order, for example a backlog between live reports. When a path is full, one anchor is dropped;
+old anchors are then farther apart than new ones. A later report into such a gap must be near the straight way between
+its ends, because the vehicle's own way in between is no longer known.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import METRES_PER_DEGREE, NS
+
+FASTEST: Final = 70.0  # m/s; no road vehicle, and no error of a clock
+LEAP_M: Final = 2_000.0  # of positions that come back after a tunnel or a ferry's hold
+LEAP_M_PER_S: Final = 0.5  # by which this budget fills
+ANCHORS: Final = 16  # 280 bytes a vehicle
+VEHICLES: Final = 200_000  # that are remembered
+_RECENT_NS: Final = 10 * NS  # is added to an anchor's age, so that the newest are not treated as infinitely dense
+_DETOUR_M: Final = 2_000.0  # of a way through a gap, compared with the straight one
+_START: Final = 64  # vehicles for which there is room at first
+
+
+class VehiclePaths:
+    """Paths of the vehicles since the service started."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, int] = {}  # row in the arrays, by vehicle
+        self._make_room(_START)
+
+    def _make_room(self, rows: int) -> None:
+        self._time: IntArray = np.zeros((rows, ANCHORS), np.int64)
+        self._place: Float32Array = np.zeros((rows, ANCHORS, 2), np.float32)
+        self._is_gap: BoolArray = np.zeros((rows, ANCHORS), np.bool_)  # an anchor after this one was dropped
+        self._count: IntArray = np.zeros(rows, np.int64)
+        self._leap: FloatArray = np.full(rows, LEAP_M)
+
+    def find_implausible(
+        self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray
+    ) -> BoolArray:
+        """Return the rows (n,) at which their vehicle cannot have been; time [ns], places [deg]. Others extend paths.
+
+        The rows of a vehicle must lie next to each other, in the order of their arrival.
+        """
+        names, inverse = np.unique(vehicle, return_inverse=True)
+        if len(self._rows) + len(names) > max(VEHICLES, len(names)):
+            self._rows.clear()
+            self._make_room(_START)
+        row = np.array([self._rows.setdefault(name, len(self._rows)) for name in names.tolist()], np.int64)
+        while len(self._rows) > len(self._count):
+            self._grow()
+        place = np.column_stack([latitude, longitude]).astype(np.float64)
+        return _find_implausible(
+            row[inverse], np.asarray(time, np.int64), place,
+            (self._time, self._place, self._is_gap, self._count, self._leap),
+        )  # fmt: skip
+
+    def _grow(self) -> None:
+        time, place, is_gap, count, leap = self._time, self._place, self._is_gap, self._count, self._leap
+        rows = len(count)
+        self._make_room(2 * rows)
+        self._time[:rows] = time
+        self._place[:rows] = place
+        self._is_gap[:rows] = is_gap
+        self._count[:rows] = count
+        self._leap[:rows] = leap
+
+
+Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
+
+
+@compiled
+def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
+    """Compute `VehiclePaths.find_implausible`; `row` (n,) is the vehicle's row in the paths, which are updated."""
+    anchors, places, is_gap, count, leap = paths
+    out = np.zeros(len(row), np.bool_)
+    for n in range(len(row)):
+        v, t = row[n], time[n]
+        held = count[v]
+        after = held
+        while after > 0 and anchors[v, after - 1] > t:
+            after -= 1
+        excess = 0.0
+        if after > 0:
+            excess = _excess(t - anchors[v, after - 1], places[v, after - 1], place[n])
+        if after < held:
+            excess = max(excess, _excess(anchors[v, after] - t, places[v, after], place[n]))
+        if 0 < after < held and is_gap[v, after - 1]:
+            there, back = places[v, after - 1], places[v, after]
+            detour = _metres(there, place[n]) + _metres(place[n], back) - _metres(there, back)
+            if detour > _DETOUR_M:
+                excess = np.inf
+        if after == held and held > 0:
+            leap[v] = min(LEAP_M, leap[v] + LEAP_M_PER_S * (t - anchors[v, held - 1]) / NS)
+        if excess > leap[v]:
+            out[n] = True
+            continue
+        leap[v] -= excess
+        if held == ANCHORS:
+            dropped = _least_needed(anchors[v])
+            is_gap[v, dropped - 1] = True
+            for k in range(dropped, ANCHORS - 1):
+                anchors[v, k] = anchors[v, k + 1]
+                places[v, k] = places[v, k + 1]
+                is_gap[v, k] = is_gap[v, k + 1]
+            held -= 1
+            after -= after > dropped
+        for k in range(held, after, -1):
+            anchors[v, k] = anchors[v, k - 1]
+            places[v, k] = places[v, k - 1]
+            is_gap[v, k] = is_gap[v, k - 1]
+        anchors[v, after] = t
+        places[v, after, 0] = place[n, 0]
+        places[v, after, 1] = place[n, 1]
+        is_gap[v, after] = after > 0 and after < held and is_gap[v, after - 1]
+        count[v] = held + 1
+    return out
+
+
+@compiled
+def _least_needed(anchors: IntArray) -> int:
+    """Return the inner anchor (of (ANCHORS,) times) whose gap is the smallest compared with its age."""
+    newest, best, least = anchors[-1], 1, np.inf
+    for k in range(1, len(anchors) - 1):
+        gap = (anchors[k + 1] - anchors[k - 1]) / float(newest - anchors[k] + _RECENT_NS)
+        if gap < least:
+            best, least = k, gap
+    return best
+
+
+@compiled
+def _excess(apart: int, there: Float32Array, here: FloatArray) -> float:
+    """Return the distance between two places (2,) [deg] beyond what FASTEST covers in the time between them [ns]."""
+    return max(_metres(there, here) - FASTEST * apart / NS, 0.0)
+
+
+@compiled
+def _metres(there: Float32Array, here: FloatArray | Float32Array) -> float:
+    """Return the distance between two places (2,) [deg], the short way around the date line."""
+    north, east = here[0] - there[0], (here[1] - there[1] + 180.0) % 360.0 - 180.0
+    return float(np.hypot(north, east * np.cos(np.radians(here[0])))) * METRES_PER_DEGREE

@@ -1,0 +1,66 @@
+"""Limit on alerts that two vehicles raise alone on roads where nobody else drives. Pure.
+
+Two enrolled vehicles that agree can report ice anywhere, on a path that is plausible. On a road with other traffic the
+others contradict them. On a road that no third vehicle ever reported nobody does. Each vehicle may therefore support
+such alerts in at most MOST_AREAS areas of AREA_M within AREA_NS. Farther along, their paths are not distinct enough
+from one vehicle's, and a third vehicle is needed; until then the map shows the ice, without an alert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from schemas import grid
+from schemas.numeric import FloatArray
+from schemas.thresholds import METRES_PER_DEGREE, NS
+
+OTHERS_NEEDED: Final = 3  # distinct vehicles ever heard on a road that is not idle
+MOST_AREAS: Final = 2
+AREA_M: Final = 1_000.0  # around the first alert of an area
+AREA_NS: Final = 3 * 3600 * NS  # while roads change seldom; see fusion.constants.CHANGE_S
+VEHICLES: Final = 100_000  # that are remembered
+
+
+class IdleRoads:
+    """Areas in which each vehicle supported alerts on idle roads lately."""
+
+    def __init__(self) -> None:
+        self._areas: dict[int, list[tuple[int, FloatArray]]] = {}
+
+    def admit(self, cell: int, witnesses: Sequence[int], time: int, needed: int) -> bool:
+        """Return True if an alert may be raised, and charge its witnesses.
+
+        Args:
+            cell: of the alert.
+            witnesses: numbers of the vehicles that support it.
+            time: of the alert [ns].
+            needed: minimum number of witnesses with an area left.
+        """
+        place = np.array(grid.centre(cell), float)
+        able = [vehicle for vehicle in witnesses if self._has_area(vehicle, place, time)]
+        if len(able) < needed:
+            return False
+        if len(self._areas) > VEHICLES:
+            self._areas.clear()
+        for vehicle in able:
+            areas = self._areas.setdefault(vehicle, [])
+            if not _is_within(areas, place):
+                areas.append((time, place))
+        return True
+
+    def _has_area(self, vehicle: int, place: FloatArray, time: int) -> bool:
+        areas = [area for area in self._areas.get(vehicle, []) if abs(time - area[0]) < AREA_NS]
+        if vehicle in self._areas:
+            self._areas[vehicle] = areas
+        return len(areas) < MOST_AREAS or _is_within(areas, place)
+
+
+def _is_within(areas: Sequence[tuple[int, FloatArray]], place: FloatArray) -> bool:
+    for _, centre in areas:
+        north, east = place[0] - centre[0], (place[1] - centre[1] + 180.0) % 360.0 - 180.0
+        if np.hypot(north, east * np.cos(np.radians(place[0]))) * METRES_PER_DEGREE <= AREA_M:
+            return True
+    return False

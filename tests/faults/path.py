@@ -1,0 +1,158 @@
+"""Vehicles at places where they cannot be, and two vehicles that report ice on roads where nobody drives.
+
+Teleports: cars that drive honestly also report one far place, in the same batch, in another batch, boot or region,
+before or after their other reports, or in short leaps. The oracle is the distance from their own way. Two cars: they
+report ice at 210 places along 400 km by leaps, as a backlog, or live, with a path at 65 m/s that is plausible.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.figures import Figure
+from schemas.wire import Batch
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
+
+Numbers = NDArray[np.floating[Any]]
+KINDS: Final = ("row", "batch", "boot", "region", "before", "between", "walk")
+FAR_M: Final = 6_000.0  # at the least, from the car's way; LEAP_M and 20 s at FASTEST are 3.4 km
+STEP_M, SPEED = 1_900.0, 65.0  # between two places, and of two cars whose path is plausible
+PLACES: Final = 210
+ICY_PLACES: Final = 20  # of three honest cars
+METRES_PER_DEGREE: Final = 111_195.0
+
+
+def run(site: Site) -> list[Figure]:
+    """A thousand teleports and three ways of two cars, or a few hundred."""
+    teleports = site.of(1_000, 140)
+    accepted, honest_lost = _teleport(site, teleports)
+    alerts = {way: _two_cars(site, way) for way in ("leaps", "backlog", "live")}
+    site.say(f"alerts of two cars at {PLACES} places: {alerts}")
+    return [
+        figure("faults.path.implausible_accepted", accepted),
+        figure("faults.path.honest_excluded", honest_lost),
+        figure("faults.path.teleports", teleports),
+        figure("faults.path.two_car_alerts", max(alerts.values())),
+        figure("faults.path.pair_alerts", _honest(site, 2)),
+        figure("faults.path.honest_alerts", _honest(site, 3)),
+    ]
+
+
+def _at(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, FloatArray]:
+    latitude = np.asarray(LATITUDE + north_m / METRES_PER_DEGREE, np.float64)
+    longitude = LONGITUDE + east_m / METRES_PER_DEGREE / np.cos(np.radians(latitude))
+    return latitude, np.asarray(longitude, np.float64)
+
+
+def _visits(name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float) -> list[Batch]:
+    """Return one batch per region of visits at these times [ns] and places."""
+    cell = grid.cell_of(*place)
+    regions = grid.region_of(cell)
+    out = []
+    for region in np.unique(regions).tolist():
+        mine = regions == region
+        columns = {
+            "latitude": place[0][mine], "longitude": place[1][mine], "cell": cell[mine], "leave_time": when[mine],
+            "enter_time": when[mine] - SECOND,
+        }  # fmt: skip
+        one = batch(name, seq, int(when[-1]), [mu] * int(mine.sum()))
+        out.append(replace(one, region=int(region), columns=one.columns | columns))
+    return out
+
+
+def _messages(batches: Sequence[Batch]) -> list[Message]:
+    return [
+        Message(b.kind, keys.observation_key(b.region, b.vehicle), wire.encode(b), wire.ENCODING[b.kind])
+        for b in batches
+    ]
+
+
+def _teleport(site: Site, count: int) -> tuple[int, int]:
+    """Return how many of the teleports were fused, and how many honest rows were not."""
+    rng, start = np.random.default_rng(site.seed), time.time_ns() - 7200 * SECOND
+    fused = excluded = 0
+    with closing(Engine(ServiceConfig(), site.folder / "teleports")) as engine:
+        for number in range(count):
+            name, kind = f"car-{number:04}", KINDS[number % len(KINDS)]
+            north = np.arange(30) * 15.0
+            when = start + np.arange(30) * SECOND
+            way = _visits(name, 1, when, _at(north, np.zeros(30)), 0.8)
+            wrong, before = _far_away(kind, name, start, rng), engine.counts["implausible_moves"]
+            if kind == "row":
+                one, (other,) = way[0], wrong
+                columns = {k: np.concatenate([v, other.columns[k]]) for k, v in one.columns.items()}
+                engine.ingest(_messages([replace(one, columns=columns)]), start + 100 * SECOND)
+            elif kind == "between":  # the first half of the way, the far place, the second half
+                half = _visits(name, 1, when[:15], _at(north[:15], np.zeros(15)), 0.8)
+                rest = _visits(name, 2, when[15:], _at(north[15:], np.zeros(15)), 0.8)
+                later = [replace(one, seq=3) for one in wrong]
+                engine.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
+            else:
+                engine.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
+            found, most = engine.counts["implausible_moves"] - before, sum(len(b.columns["mu"]) for b in wrong)
+            if found < most:
+                site.say(f"{kind}: {most - found} of {most} accepted")
+            fused += max(most - found, 0)
+            excluded += max(found - most, 0)
+            excluded += sum(n for name, n in engine.counts.items() if name.startswith("refused."))
+    return fused, excluded
+
+
+def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
+    """Return reports of a place far from the car's way, at about the same time."""
+    far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
+    second = {"before": -5, "between": 14.5}.get(kind, 31.0)
+    if kind == "walk":  # in leaps that the row before would allow; the first two may be what the budget allows
+        steps = np.arange(2, 50)
+        when = start + 31 * SECOND + steps * (SECOND // 1000)
+        return _visits(name, 2, when, _at(450.0 + np.zeros(len(steps)), steps * 2 * STEP_M), 0.2)
+    if kind == "row":  # the batch is of one region, and so is the place
+        home = grid.region_of(grid.cell_of(LATITUDE, LONGITUDE))
+        sides = [FAR_M * 1j**turn for turn in range(4)]
+        far = next(s for s in sides if grid.region_of(grid.cell_of(*_at(np.array(s.real), np.array(s.imag)))) == home)
+    place = _at(np.array([float(np.real(far))]), np.array([float(np.imag(far))]))
+    found = _visits(name, 1 if kind == "boot" else 2, start + np.array([int(second * SECOND)]), place, 0.2)
+    return [replace(one, boot=one.boot + 1) for one in found] if kind == "boot" else found
+
+
+def _two_cars(site: Site, way: str) -> int:
+    """Return at how many places two cars raise an alert where nobody else drives."""
+    start, raised = time.time_ns() - 9000 * SECOND, set[int]()
+    apart = SECOND // 1000 if way == "leaps" else int(STEP_M / SPEED * SECOND)
+    end = start + PLACES * apart
+    with closing(Engine(ServiceConfig(), site.folder / way)) as engine:
+        for place in range(PLACES):
+            when = np.array([start + place * apart])
+            for car in range(2):
+                visits = _visits(
+                    f"insider-{car}", place + 1, when + car, _at(np.zeros(1), np.array([place * STEP_M])), 0.15
+                )
+                alerts = engine.ingest(_messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end)
+                raised |= {alert.cell for alert in alerts if alert.raised}
+    return len(raised)
+
+
+def _honest(site: Site, cars: int) -> int:
+    """Return at how many icy places of a lonely road this many honest cars raise an alert."""
+    start, raised = time.time_ns() - 3600 * SECOND, set[int]()
+    with closing(Engine(ServiceConfig(), site.folder / f"honest-{cars}")) as engine:
+        for place in range(ICY_PLACES):
+            for car in range(cars):
+                when = np.array([start + (place * 90 + car * 60) * SECOND])
+                visits = _visits(f"car-{car}", place + 1, when, _at(np.zeros(1), np.array([place * 1_500.0])), 0.15)
+                raised |= {a.cell for a in engine.ingest(_messages(visits), int(when[0]) + SECOND) if a.raised}
+    return len(raised)
