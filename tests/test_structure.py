@@ -68,9 +68,11 @@ PURE = (
     *(f"edge_agent/ahead/{name}.py" for name in ("path", "known", "horizon", "roads", "warnings", "asking", "prior")),
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
-    "fleet_service/ingest/dedup.py",
-    "fleet_service/ingest/grouping.py",
-    *(f"fleet_service/serve/{name}.py" for name in ("alerts", "map_state", "neighbour_fill", "view", "visitors")),
+    *(f"fleet_service/ingest/{name}.py" for name in ("dedup", "grouping", "paths")),
+    *(
+        f"fleet_service/serve/{name}.py"
+        for name in ("alerts", "idle_roads", "map_state", "neighbour_fill", "view", "visitors")
+    ),
 )
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (
