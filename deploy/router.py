@@ -17,6 +17,8 @@ from pathlib import Path
 import zenoh
 
 from schemas.errors import InputError
+from schemas.runtime.link_watch import router_metrics
+from schemas.runtime.metrics import serve_metrics
 from schemas.runtime.process import force_exit
 
 CLOSE_S = 2.0
@@ -24,8 +26,8 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 CONFIG = Path(__file__).with_name("router.json5")
 
 
-def configuration(config: Path = CONFIG, listen: str | None = None) -> zenoh.Config:
-    """Return the router's configuration from a file, with another endpoint if one is given.
+def configuration(config: Path = CONFIG, listen: str | Sequence[str] | None = None) -> zenoh.Config:
+    """Return the router's configuration from a file, with other endpoints if some are given.
 
     Raises:
         InputError: the file is not a Zenoh configuration, or the endpoint is not valid.
@@ -35,12 +37,12 @@ def configuration(config: Path = CONFIG, listen: str | None = None) -> zenoh.Con
     except zenoh.ZError as error:
         raise InputError("config", f"cannot use {config} ({error})", "give a Zenoh configuration file") from error
     if listen is not None:
-        settings.insert_json5("listen/endpoints", json.dumps([listen]))
+        settings.insert_json5("listen/endpoints", json.dumps([listen] if isinstance(listen, str) else list(listen)))
         settings.insert_json5("adminspace/enabled", "true")  # tells the port that port 0 became
     return settings
 
 
-def open_router(config: Path = CONFIG, listen: str | None = None) -> tuple[zenoh.Session, list[str]]:
+def open_router(config: Path = CONFIG, listen: str | Sequence[str] | None = None) -> tuple[zenoh.Session, list[str]]:
     """Start a router in this process; return its session and the endpoints that it listens on.
 
     Raises:
@@ -63,14 +65,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a router until a signal ends it."""
     parser = argparse.ArgumentParser(prog="deploy.router", description="A Zenoh router for GripMap.")
     parser.add_argument("--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)")
-    parser.add_argument("--listen", help="endpoint instead of the file's, e.g. tcp/127.0.0.1:0 for a free port")
+    parser.add_argument(
+        "--listen", nargs="+", help="endpoints instead of the file's, e.g. tcp/127.0.0.1:0 for a free port"
+    )
+    parser.add_argument("--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port")
+    parser.add_argument("--metrics-host", default="127.0.0.1", help="listen address of it (default 127.0.0.1)")
     args = parser.parse_args(argv)
     # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's main thread.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         session, endpoints = open_router(args.config, args.listen)
-        print(f"router: {' '.join(endpoints)}", flush=True)
-        signal.sigwait(ENDING)
+        with serve_metrics(
+            args.metrics_host, args.metrics_port, lambda: router_metrics(session), lambda: ()
+        ) as address:
+            print(f"router: {' '.join(endpoints)}", flush=True)
+            if address:
+                print(f"metrics: {address}/metrics", flush=True)
+            signal.sigwait(ENDING)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

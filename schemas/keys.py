@@ -17,6 +17,7 @@ ROOT: Final = "gripmap/v1"
 SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `ServiceToken`
 CLAIMS: Final = f"{ROOT}/claims"  # likewise of who has it for itself, from before it answers until it does no more
 WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
+PRIVATE: Final = ("ahead", "vss")  # topics of one vehicle, for itself and its owner
 _ALL: Final = "all"
 _CHUNKS: Final = (4, 3, 3, 4)
 
@@ -30,6 +31,7 @@ class Topic(NamedTuple):
         message: payload; None for a liveliness token.
         priority: Zenoh priority by name.
         block: congestion control: block (True) or drop (False).
+        express: sent at once, not held back for a millisecond to share a frame with others.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Topic(NamedTuple):
     message: str | None
     priority: str
     block: bool
+    express: bool = False
 
 
 TOPICS: Final = {
@@ -47,8 +50,8 @@ TOPICS: Final = {
         Topic("state", grid.REGION_ZOOM, True, "gripmap.v1.StateBatch", "DATA_LOW", True),
         Topic("ack", None, True, "gripmap.v1.Ack", "DATA_HIGH", True),
         Topic("map", grid.TILE_ZOOM, False, "Arrow stream", "DATA_LOW", False),
-        Topic("alert", grid.TILE_ZOOM, False, "gripmap.v1.Alert", "REAL_TIME", True),
-        Topic("ahead", None, True, "gripmap.v1.Ahead", "DATA_HIGH", False),
+        Topic("alert", grid.TILE_ZOOM, False, "gripmap.v1.Alert", "REAL_TIME", True, express=True),
+        Topic("ahead", None, True, "gripmap.v1.Ahead", "DATA_HIGH", False, express=True),
         Topic("vss", None, True, "JSON of VSS signals", "DATA_HIGH", False),
         Topic("weather", grid.REGION_ZOOM, False, "gripmap.v1.Weather", "DATA", True),
         Topic("alive", None, True, None, "DATA", True),

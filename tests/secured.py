@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -26,7 +26,7 @@ SERVICE, READER, WEATHER, VEHICLES = "shard-0", "reader-0", "weather-0", ("sim-0
 ROUTERS = ("router-a", "router-b")
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = f"{keys.ROOT}/shard/probe"
-FREE = "tls/127.0.0.1:0"
+FREE = {"quic": "quic/127.0.0.1:0", "tls": "tls/127.0.0.1:0"}
 RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}
 
 
@@ -57,14 +57,19 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
 class Network:
     """Two routers, each a process of its own; the second is connected to the first.
 
-    Unguarded they check nobody: a control. They are no part of the test's process because Zenoh may abort one in which
+    `protocol` is the transport of sessions; routers reach each other over TLS. Without
+    caps, an attack that gets through is not hidden by one that was sent just before. Unguarded they check nobody: a
+    control. They are no part of the test's process because Zenoh may abort one in which
     one of two connected routers is closed.
     """
 
     folder: Path
     guarded: bool = True
+    protocol: str = "tls"
+    capped: bool = False
     routers: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
     endpoints: dict[str, str] = field(default_factory=dict)
+    between: dict[str, str] = field(default_factory=dict)
 
     def session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
         """A session under a name of the folder.
@@ -74,18 +79,28 @@ class Network:
         """
         return zenoh.open(configuration(settings(self.endpoints[router], self.folder, **changed), name))
 
+    def session_at(self, name: str, endpoints: Sequence[str]) -> zenoh.Session:
+        """A session under a name of the folder that tries these endpoints in turn."""
+        where = settings(endpoints[0], self.folder).model_copy(update={"connect": list(endpoints)})
+        return zenoh.open(configuration(where, name))
+
     def start(self, router: str) -> None:
         """Start a router from its file in the folder, at its old place if it had one."""
         file = self.folder / f"{router}.json5"
         config = json.loads(file.read_text())
         if router != ROUTERS[0]:  # the file names fixed ports; here they are free ones
-            config["connect"] = {"endpoints": [self.endpoints[ROUTERS[0]]], "retry": RETRY}
+            config["connect"] = {"endpoints": [self.between[ROUTERS[0]]], "retry": RETRY}
+        if not self.capped:
+            del config["downsampling"]
         if not self.guarded:
             config["transport"]["link"]["tls"]["enable_mtls"] = False
             del config["access_control"], config["low_pass_filter"]
         running = file.with_suffix(".running.json5")
         running.write_text(json.dumps(config))
-        command = ["--config", str(running), "--listen", self.endpoints.get(router, FREE)]
+        protocols = dict.fromkeys((self.protocol, "tls"))
+        places = {"tls": self.between.get(router), self.protocol: self.endpoints.get(router)}
+        listen = [places[protocol] or FREE[protocol] for protocol in protocols]
+        command = ["--config", str(running), "--listen", *listen]
         process = subprocess.Popen(
             [sys.executable, "-m", "deploy.router", *command], stdout=subprocess.PIPE, text=True, cwd=ROOT
         )
@@ -93,7 +108,9 @@ class Network:
         assert process.stdout is not None
         said = process.stdout.readline()
         assert said.startswith("router: "), f"{router} does not start"
-        self.endpoints[router] = said.split()[1]
+        heard = {place.partition("/")[0]: place for place in said.split()[1:]}
+        self.endpoints[router] = heard[self.protocol]
+        self.between[router] = heard["tls"]
 
     def stop(self, router: str) -> None:
         """Stop a router."""
@@ -126,10 +143,12 @@ def _heard(there: zenoh.Session, arrived: threading.Event) -> bool:
 
 
 @contextmanager
-def network(folder: Path, *, guarded: bool = True, fleet: Enrolment | None = None) -> Iterator[Network]:
+def network(
+    folder: Path, *, guarded: bool = True, fleet: Enrolment | None = None, protocol: str = "tls", capped: bool = False
+) -> Iterator[Network]:
     """Certificates in a folder, and both routers."""
     registry(folder).enrol(fleet or enrolment())
-    running = Network(folder, guarded)
+    running = Network(folder, guarded, protocol, capped)
     with ExitStack() as stack:
         stack.callback(running.close)
         for router in ROUTERS:

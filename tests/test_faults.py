@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import subprocess
 import sys
 import time
@@ -27,6 +28,7 @@ from tests.faults.crash_model import history
 from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
 from tests.faults.frame import RAISED, Campaign, Site, conduct
+from tests.faults.link_relay import UDP, Direction, LinkTerms
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
 
@@ -138,3 +140,22 @@ def test_forgetful_disk_catches_a_service_that_does_not_sync_its_keys(
 ) -> None:
     monkeypatch.setattr(pseudonyms, "sync_directory", lambda folder: None)
     assert any("key is lost" in problem for number in range(6) for problem in served(number, tmp_path))
+
+
+def test_link_relay_follows_loss_delay_rate_and_blocking() -> None:
+    draw, packet = random.Random(1), bytes(9) + bytes([6]) + bytes(90)
+    blocked = LinkTerms(drop_udp=True)
+    slow = LinkTerms(delay_s=1.0, bytes_per_s=100.0, queue_bytes=200)
+    read, write = os.pipe()
+    way = Direction(write)
+    way.take(packet[:9] + bytes([UDP]) + packet[10:], 0.0, blocked, draw)
+    assert not way.flying
+    for _ in range(5):
+        way.take(packet, 0.0, slow, draw)
+    assert [at for at, _, _ in way.flying] == [2.0, 3.0, 4.0], "two wait, a third is on its way, others find no room"
+    way.deliver(3.0)
+    assert os.read(read, 1000) == 2 * packet
+    lossy = Direction(write)
+    for _ in range(1000):
+        lossy.take(packet, 0.0, LinkTerms(loss=0.1), draw)
+    assert 860 < len(lossy.flying) < 940

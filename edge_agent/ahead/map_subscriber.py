@@ -20,6 +20,7 @@ from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import Path, Pose
 from schemas import grid, keys
 from schemas.errors import WireError
+from schemas.runtime.zenoh_session import quality_of
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING
 
@@ -52,9 +53,8 @@ class MapSubscriber:
         self._routers: frozenset[str] = frozenset()
         self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
         self._publisher = session.declare_publisher(
-            keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
-            congestion_control=zenoh.CongestionControl.DROP,
-        )  # fmt: skip
+            keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, **quality_of(_TOPIC)
+        )
         self.counts: Counter[str] = Counter()
 
     def looking(self) -> threading.Lock:

@@ -7,6 +7,7 @@ from typing import Final
 
 from edge_agent.app.live_loop import Progress
 from edge_agent.publish.publisher import CLOCK_OFF_S, Publisher
+from schemas.runtime.link_watch import link_metrics
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
@@ -41,6 +42,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
         gauge("unsettled_records", "records neither acknowledged nor rejected yet", publisher.unsettled()),
         gauge("sessions", "open sessions", publisher.links),
+        *link_metrics(publisher.link_watches),
         gauge("blocks_behind", "blocks that were processed too late", progress.behind),
         gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
         gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),

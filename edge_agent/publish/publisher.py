@@ -25,6 +25,7 @@ from edge_agent.publish.spool_file import is_damage
 from edge_agent.publish.zenoh_link import Link
 from schemas.config import AgentConfig
 from schemas.errors import WireError
+from schemas.runtime.link_watch import LinkWatch
 from schemas.thresholds import NS
 from schemas.wire import Kind, decode_ack
 
@@ -32,7 +33,7 @@ TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing 
 QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that does not answer
 WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
-CHECK_S: Final = 0.5  # between two looks whether a lost router is back
+RESEND_PER_VEHICLE: Final = 4  # of these on average; a link waits between two messages of one kind
 CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
 CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
 
@@ -79,7 +80,7 @@ class Publisher:
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         self._links: dict[str, Link] = {}
         self._connected: dict[str, bool] = {}
-        self._checked_at = -float("inf")
+        self._epochs: dict[str, int] = {}
         self._waiting: list[Draft] = []
         self._closing, self._stopped = threading.Event(), threading.Event()
         self._deadline = float("inf")
@@ -96,6 +97,11 @@ class Publisher:
     def links(self) -> int:
         """Number of open sessions."""
         return len(self._links)
+
+    @property
+    def link_watches(self) -> list[LinkWatch]:
+        """The state of each session's link."""
+        return [link.watch for link in list(self._links.values())]
 
     @property
     def cut_off(self) -> bool:
@@ -278,7 +284,8 @@ class Publisher:
 
     def _resend(self) -> None:
         there = {name for name, connected in self._connected.items() if connected}
-        for batch in self._outbox.due(self._clock(), RESEND_LIMIT, there) if there else ():
+        limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(there))
+        for batch in self._outbox.due(self._clock(), limit, there) if there else ():
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
     def _compare_clocks(self, reported: int) -> None:
@@ -291,16 +298,14 @@ class Publisher:
         self.clock_behind_s = behind
 
     def _check_connections(self) -> None:
-        """Check for each vehicle whether it has a router. Batches sent without one are lost and are sent again when one
-        is found."""
-        if self._clock() - self._checked_at < CHECK_S and len(self._connected) == len(self._links):
-            return
-        self._checked_at = self._clock()
+        """Note for each vehicle whether it has a router. Batches in flight when a link breaks are lost; they are sent
+        again on the next link."""
         for name, link in list(self._links.items()):
-            connected = link.connected
-            if connected and not self._connected.get(name, False):
+            epoch = link.watch.epoch
+            if epoch != self._epochs.get(name, 0):
+                self._epochs[name] = epoch
                 self._outbox.reoffer(name, self._clock())
-            self._connected[name] = connected
+            self._connected[name] = link.connected
 
     def _settle(self) -> None:
         while not self._acks.empty():

@@ -17,6 +17,7 @@ import zenoh
 
 from edge_agent.observe.pipeline import Grip
 from schemas import keys
+from schemas.runtime.zenoh_session import quality_of
 from schemas.thresholds import EXCITED_SHARE, NS
 
 BRANCH: Final = "Vehicle.ADAS.ESC.RoadFriction"
@@ -58,10 +59,7 @@ class RoadFrictionOutput:
 
     def attach(self, name: str, session: zenoh.Session) -> None:
         """Use a vehicle's session, which is open now."""
-        self.publishers[name] = session.declare_publisher(
-            keys.vss_key(name), encoding=ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
-            congestion_control=zenoh.CongestionControl.DROP,
-        )  # fmt: skip
+        self.publishers[name] = session.declare_publisher(keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC))
 
     def tell(self, grip: Grip | None) -> None:
         """Report the current belief. Never waits: a message that finds no room is dropped."""

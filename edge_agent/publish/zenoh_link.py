@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -12,31 +13,39 @@ import zenoh
 from edge_agent.publish.outbox import StoredBatch
 from schemas import keys
 from schemas.config import ZenohSettings
-from schemas.runtime.zenoh_session import open_session
-from schemas.wire import ENCODING, Kind
+from schemas.runtime.link_watch import LinkWatch
+from schemas.runtime.zenoh_session import open_session, quality_of
+from schemas.wire import ENCODING, MESSAGES_PER_S, Kind
+
+GAP_S: Final = 2.0 / MESSAGES_PER_S  # twice what a router asks for, because networks move messages together
 
 log = logging.getLogger(__name__)
 _TOPIC: Final = {Kind.OBSERVATION: keys.TOPICS["obs"], Kind.STATE: keys.TOPICS["state"]}
 _KEY: Final = {Kind.OBSERVATION: keys.observation_key, Kind.STATE: keys.state_key}
 _QUALITY: Final = {
-    kind: (
-        zenoh.Encoding(ENCODING[kind]),
-        getattr(zenoh.Priority, topic.priority),
-        zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP,
-    )
-    for kind, topic in _TOPIC.items()
+    kind: {"encoding": zenoh.Encoding(ENCODING[kind]), **quality_of(topic)} for kind, topic in _TOPIC.items()
 }
 
 
 class Link:
     """Open `session` of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
 
-    def __init__(self, session: zenoh.Session, vehicle: str, on_ack: Callable[[str, bytes], None]) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        vehicle: str,
+        on_ack: Callable[[str, bytes], None],
+        clock: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
         self.session = session
+        self._clock, self._pause = clock, pause
+        self._free_at = dict.fromkeys(Kind, 0.0)  # when the next message of a kind may be sent
 
         def heard(sample: zenoh.Sample) -> None:
             on_ack(vehicle, sample.payload.to_bytes())
 
+        self.watch = LinkWatch(session, vehicle)
         self._acks = session.declare_subscriber(keys.ack_key(vehicle), heard)
         self._alive = session.liveliness().declare_token(keys.alive_key(vehicle))
 
@@ -51,15 +60,21 @@ class Link:
     @property
     def connected(self) -> bool:
         """True if a router is connected now."""
-        return bool(self.session.info.routers_zid())
+        return self.watch.is_connected
 
     def put(self, batch: StoredBatch) -> bool:
-        """Send a batch; False if the session refuses. Only the acknowledgement proves that it arrived."""
+        """Send a batch; False if the session refuses. Only the acknowledgement proves that it arrived.
+
+        Waits until GAP_S after the last message of its kind, because a router drops messages that follow too soon.
+        """
         stream = batch.stream
-        encoding, priority, congestion = _QUALITY[stream.kind]
+        early = self._free_at[stream.kind] - self._clock()
+        if early > 0.0:
+            self._pause(early)
+        self._free_at[stream.kind] = self._clock() + GAP_S
         key = _KEY[stream.kind](stream.region, stream.vehicle)
         try:
-            self.session.put(key, batch.payload, encoding=encoding, priority=priority, congestion_control=congestion)
+            self.session.put(key, batch.payload, **_QUALITY[stream.kind])
         except zenoh.ZError as error:
             log.warning("%s cannot put: %s", stream.vehicle, error)
             return False

@@ -305,8 +305,4 @@ def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message])
 
 def publish(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
     """Publish with the quality of service of the key's topic."""
-    topic = keys.parse(key).topic
-    congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
-    session.put(
-        key, payload, encoding=encoding, priority=getattr(zenoh.Priority, topic.priority), congestion_control=congestion
-    )
+    session.put(key, payload, encoding=encoding, **zenoh_session.quality_of(keys.parse(key).topic))

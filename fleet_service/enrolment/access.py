@@ -47,14 +47,14 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
     certificate, key = (str(certificates / f"{name}.{ending}") for ending in ("pem", "key"))
     return {
         "mode": "router",
-        "listen": {"endpoints": [router.listens]},
-        "connect": {"endpoints": [fleet.routers[other].endpoint for other in before]},
+        "listen": {"endpoints": router.listens},
+        "connect": {"endpoints": [fleet.routers[other].router_endpoint for other in before]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
         "transport": {
             "shared_memory": {"enabled": False},  # drops samples silently when a receiver stalls
             "unicast": {"max_sessions": MAX_SESSIONS},
             "link": {
-                "protocols": ["tls"],
+                "protocols": router.protocols,
                 "tx": {"lease": LEASE_MS},
                 "rx": {"max_message_size": MAX_MESSAGE},
                 "tls": {
@@ -71,8 +71,32 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
         },
         "access_control": access_control(fleet),
         "low_pass_filter": [_no_larger(), _no_payload()],
+        "downsampling": rate_caps(fleet, name),
         "qos": {"network": [_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
     }
+
+
+def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
+    """Return the caps on messages of one session at router `name`, so that a flooding vehicle slows down nobody else.
+
+    Zenoh counts per session and rule, and cannot tell a vehicle from a router. A session of another router carries many
+    vehicles and must not be capped. Routers reach each other over TLS only, so QUIC is capped everywhere, and TLS where
+    no other router arrives: on the interfaces named for vehicles, and where there is one router.
+    """
+    router = fleet.routers[name]
+    caps = [_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []
+    if len(fleet.routers) == 1:
+        return [*caps, _cap("tls", {"link_protocols": ["tls"]})]
+    if router.vehicle_interfaces:
+        where = {"interfaces": router.vehicle_interfaces, "link_protocols": ["tls"]}
+        return [*caps, _cap("tls", where)]
+    return caps
+
+
+def _cap(name: str, where: Section) -> Section:
+    capped = (*wire.Kind, *keys.PRIVATE)
+    rules = [{"key_expr": f"{keys.ROOT}/{kind}/**", "freq": wire.MESSAGES_PER_S} for kind in capped]
+    return {"id": f"rate-{name}", "flows": ["ingress"], "messages": ["put", "delete"], **where, "rules": rules}
 
 
 def access_control(fleet: Enrolment) -> Section:

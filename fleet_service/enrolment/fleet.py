@@ -35,21 +35,36 @@ class Router(Settings):
         default=["127.0.0.1", "localhost"], min_length=1, description="names and addresses by which others reach it"
     )
     listen: Host = Field(default="127.0.0.1", description="address that it listens on; :: for every one")
-    port: int = Field(default=7447, ge=1, le=65535)
+    port: int = Field(default=7447, ge=1, le=65535, description="of both transports: QUIC over UDP, TLS over TCP")
+    quic: bool = Field(default=True, description="listen on QUIC too; false where UDP cannot reach the router")
+    vehicle_interfaces: list[str] = Field(
+        default=[],
+        description="network interfaces on which no other router arrives; sessions over TLS are capped there as well",
+    )
 
     @property
-    def endpoint(self) -> str:
-        """Return its endpoint for others."""
-        return _endpoint(self.hosts[0], self.port)
+    def endpoints(self) -> list[str]:
+        """Return its endpoints for clients, in the order in which they try them."""
+        return [_endpoint(protocol, self.hosts[0], self.port) for protocol in self.protocols]
 
     @property
-    def listens(self) -> str:
-        """Return its listen address."""
-        return _endpoint(self.listen, self.port)
+    def router_endpoint(self) -> str:
+        """Return its endpoint for other routers: TLS, so that caps on QUIC apply to vehicles only."""
+        return _endpoint("tls", self.hosts[0], self.port)
+
+    @property
+    def listens(self) -> list[str]:
+        """Return its listen addresses."""
+        return [_endpoint(protocol, self.listen, self.port) for protocol in self.protocols]
+
+    @property
+    def protocols(self) -> list[str]:
+        """Return its transports: QUIC survives a change of the car's address and has a stream per priority."""
+        return ["quic", "tls"] if self.quic else ["tls"]
 
 
-def _endpoint(host: str, port: int) -> str:
-    return f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
+def _endpoint(protocol: str, host: str, port: int) -> str:
+    return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 
 class Enrolment(Settings):

@@ -1,7 +1,8 @@
 """Zenoh session of the contract: a client of routers, without scouting, gossip and shared memory.
 
 Reasons: scouting finds strangers and costs half a second at start; shared memory drops samples silently when a receiver
-stalls; the lease states how long a silent peer is kept.
+stalls; the lease states how long a silent peer is kept. An endpoint that does not answer is given up after
+`open_timeout`, so that TLS, listed after QUIC, is tried soon where UDP is blocked.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, Final
 
 import zenoh
 
+from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 
@@ -25,9 +27,13 @@ CLIENT: Final[Mapping[str, Any]] = {
     "scouting/delay": 0,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 3000,
+    "transport/unicast/open_timeout": 2000,  # several round trips of a mobile network
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 1.5},
 }
 RETRY_S: Final = 0.5
+LONGEST_OPEN_MS: Final = 10_000  # Zenoh's own time to open a link
+_TIMEOUT: Final = "connect/timeout_ms"
+_OPEN: Final = "transport/unicast/open_timeout"
 NAME: Final = "{name}"
 _TLS: Final = "transport/link/tls"
 
@@ -43,8 +49,12 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             each.
 
     Raises:
-        InputError: Zenoh refuses a setting, or a certificate that it names does not exist.
+        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a time limit keeps the
+            session from its second endpoint.
     """
+    if len(settings.connect) > 1 and settings.config.get(_TIMEOUT, 0) != 0:
+        problem = "with a limit Zenoh tries the first endpoint only"
+        raise InputError(f"zenoh.config.{_TIMEOUT}", problem, "leave it out; open_session waits for a router")
     config = zenoh.Config()
     chosen = {**CLIENT, "connect/endpoints": settings.connect, **settings.config}
     for key, value in chosen.items():
@@ -61,19 +71,30 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
     return config
 
 
+def quality_of(topic: keys.Topic) -> dict[str, Any]:
+    """Return a topic's quality of service as keyword arguments of `put` and `declare_publisher`."""
+    congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
+    priority = getattr(zenoh.Priority, topic.priority)
+    return {"priority": priority, "congestion_control": congestion, "express": topic.express}
+
+
 def open_session(settings: ZenohSettings, stop: threading.Event | None = None, name: str = "") -> zenoh.Session | None:
     """Open a session; wait for the router until one answers or `stop` is set (then return None).
 
-    A session that lost its router reconnects by itself. The reason for waiting is logged once.
+    A session that lost its router reconnects by itself. The reason for waiting is logged once. Where nothing answers in
+    time, the next try allows twice as long, so that a slow network is not taken for a blocked one for ever.
     """
     stop, logged = stop or threading.Event(), set[str]()
+    open_ms = settings.config.get(_OPEN, CLIENT[_OPEN])
     while not stop.is_set():
+        patient = settings.model_copy(update={"config": {**settings.config, _OPEN: open_ms}})
         try:
-            return zenoh.open(configuration(settings, name))
+            return zenoh.open(configuration(patient, name))
         except zenoh.ZError as error:
             reason = str(error).partition(" at /")[0].strip()  # where Zenoh was built is nobody's business
             if reason not in logged:
                 logged.add(reason)
                 log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)
+            open_ms = max(open_ms, min(2 * open_ms, LONGEST_OPEN_MS))
             stop.wait(RETRY_S)
     return None

@@ -11,6 +11,7 @@ from schemas.wire.codec import (
     MAX_BYTES,
     MAX_ROWS,
     MESSAGES,
+    MESSAGES_PER_S,
     NEEDED,
     PLAIN,
     STANDING_ENCODING,
@@ -33,6 +34,7 @@ from schemas.wire.codec import (
 
 __all__ = [
     "ACK_ENCODING", "ALERT_ENCODING", "ARROW", "ENCODING", "GEOJSON", "JSON", "MAX_BYTES", "MAX_ROWS", "MESSAGES",
+    "MESSAGES_PER_S",
     "NEEDED", "PLAIN", "STANDING_ENCODING", "WEATHER_ENCODING", "Alert", "Batch", "Columns", "Kind", "StreamAck",
     "column_types", "decode", "decode_ack", "decode_alert", "decode_standing", "encode", "encode_ack", "encode_alert",
     "encode_standing", "parse",

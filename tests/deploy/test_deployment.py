@@ -197,7 +197,7 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
     secure = DEPLOY / "secure"
     fleet = load(secure / "fleet.json", Enrolment)
     service = load(secure / "service.json", ServiceConfig)
-    endpoints = [router.endpoint for router in fleet.routers.values()]
+    endpoints = [endpoint for router in fleet.routers.values() for endpoint in router.endpoints]
     assert service.name in fleet.services
     for config in (service, load(secure / "agent.json", AgentConfig), load(secure / "reader.json", ServiceConfig)):
         assert config.zenoh.connect == endpoints

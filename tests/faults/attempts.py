@@ -92,9 +92,9 @@ def certificate_without_its_key(ground: Ground) -> bool:
 
 @attempt
 def plain_tcp(ground: Ground) -> bool:
-    endpoint = ground.network.endpoints[ROUTERS[0]].replace("tls/", "tcp/")
+    address = ground.network.endpoints[ROUTERS[0]].partition("/")[2]
     try:
-        with zenoh.open(configuration(ZenohSettings(connect=[endpoint]))):
+        with zenoh.open(configuration(ZenohSettings(connect=[f"tcp/{address}"]))):
             return True
     except zenoh.ZError:
         return False
@@ -110,7 +110,7 @@ def lures(ground: Ground, folder: Path, name: str) -> bool:
     file = ground.folder / "false-router.json5"
     file.write_text(json.dumps({"mode": "router", "scouting": {"delay": 0, "multicast": {"enabled": False}},
                                 "transport": {"link": {"tls": tls}}}))  # fmt: skip
-    router, endpoints = open_router(file, FREE)
+    router, endpoints = open_router(file, FREE[ground.network.protocol])
     with router:
         try:
             with zenoh.open(configuration(settings(endpoints[0], ground.folder), HONEST)):

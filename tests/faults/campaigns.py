@@ -18,6 +18,7 @@ from tests.faults import (
     fuzz_wire,
     insider,
     kill,
+    link,
     outages,
     path,
     queries,
@@ -175,5 +176,6 @@ CAMPAIGNS: Final = (
         flood.run,
         ("faults.flood.honest_delay_s", "faults.flood.map_difference", "faults.flood.rate"),
     ),
+    Campaign("link", link.measure, link.OWES, in_quick=False),  # needs root, and a minute for each transport
     Campaign("soak", soak.run, soak.OWES, in_quick=False),  # what grows shows only in half an hour
 )

@@ -41,9 +41,9 @@ def breaches(where: Ground) -> set[str]:
     return {name for name, attempt in ATTEMPTS.items() if attempt(where)}
 
 
-@pytest.fixture
-def running(tmp_path: Path) -> Iterator[Network]:
-    with network(tmp_path) as found:
+@pytest.fixture(params=["quic", "tls"])
+def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Network]:
+    with network(tmp_path, protocol=request.param) as found:
         yield found
 
 
@@ -52,8 +52,9 @@ def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
         assert breaches(found) == set()
 
 
-def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path) -> None:
-    with network(tmp_path, guarded=False) as open_to_all, ground(open_to_all) as found:
+@pytest.mark.parametrize("protocol", ["quic", "tls"])
+def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
+    with network(tmp_path, guarded=False, protocol=protocol) as open_to_all, ground(open_to_all) as found:
         assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
 
 

@@ -7,9 +7,29 @@ import socket
 import threading
 
 import pytest
+import zenoh
 
+from schemas import keys
 from schemas.config import ZenohSettings
+from schemas.errors import InputError
 from schemas.runtime import zenoh_session
+
+
+def test_a_time_limit_that_hides_the_second_endpoint_is_refused() -> None:
+    two = ["quic/127.0.0.1:1", "tls/127.0.0.1:1"]
+    limited = ZenohSettings(connect=two, config={"connect/timeout_ms": 5000})
+    with pytest.raises(InputError, match="^zenoh.config.connect/timeout_ms: "):
+        zenoh_session.configuration(limited)
+    zenoh_session.configuration(ZenohSettings(connect=two))
+    zenoh_session.configuration(limited.model_copy(update={"connect": two[:1]}))
+
+
+def test_alerts_have_the_highest_priority_and_are_sent_at_once() -> None:
+    first = zenoh_session.quality_of(keys.TOPICS["alert"])
+    assert (first["priority"], first["express"]) == (zenoh.Priority.REAL_TIME, True)
+    assert keys.TOPICS["obs"].block
+    others = [zenoh_session.quality_of(topic) for name, topic in keys.TOPICS.items() if name != "alert"]
+    assert all(one["priority"] != first["priority"] for one in others)
 
 
 def test_waiting_for_a_router_is_reported_once_without_build_paths(

@@ -1,0 +1,116 @@
+"""Links of a session: which router it is connected to now, over which transport, and how often that changed.
+
+Zenoh reports each transport and link that opens or closes. The watch keeps the present state and counts, so that its
+owner learns of a loss when it happens and not from missing answers.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import zenoh
+
+from schemas.runtime.metrics import Metric
+
+PROTOCOLS: Final = ("quic", "tls", "tcp")  # shown even where nothing uses them, so that an alarm can name them
+
+log = logging.getLogger(__name__)
+
+
+class LinkWatch:
+    """Present links of `session`.
+
+    Attributes:
+        epoch: number of times that the session was connected to a router.
+        lost: number of times that it lost one.
+
+    Args:
+        session: to watch.
+        name: of the session, for the log.
+        on_change: called after each change, on a thread of Zenoh.
+    """
+
+    def __init__(self, session: zenoh.Session, name: str, on_change: Callable[[], None] = lambda: None) -> None:
+        self._name, self._on_change = name, on_change
+        self._lock = threading.Lock()
+        self._routers = set[str]()
+        self._links = dict[tuple[str, str], str]()  # protocol by identity of the router and address
+        self.epoch = self.lost = 0
+        info = session.info
+        self._listeners = (
+            info.declare_link_events_listener(self._record_link, history=True),
+            info.declare_transport_events_listener(self._record_transport, history=True),
+        )
+
+    @property
+    def is_connected(self) -> bool:
+        """True if a router is connected."""
+        return bool(self._routers)
+
+    @property
+    def protocols(self) -> list[str]:
+        """Transports of the present links: quic, tls or tcp."""
+        with self._lock:
+            return sorted(self._links.values())
+
+    def close(self) -> None:
+        """Stop watching."""
+        for listener in self._listeners:
+            listener.undeclare()  # type: ignore[no-untyped-call]
+
+    def _record_link(self, event: zenoh.LinkEvent) -> None:
+        link = event.link
+        protocol, address = link.dst.split("/", 1)
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT:
+                self._links[str(link.zid), link.dst] = protocol
+            else:
+                self._links.pop((str(link.zid), link.dst), None)
+        if event.kind == zenoh.SampleKind.DELETE:
+            log.warning("%s lost the router at %s (%s)", self._name, address, protocol)
+        else:
+            level = logging.WARNING if self.lost else logging.INFO
+            log.log(level, "%s is connected to the router at %s over %s", self._name, address, protocol)
+
+    def _record_transport(self, event: zenoh.TransportEvent) -> None:
+        transport = event.transport
+        if transport.whatami != zenoh.WhatAmI.ROUTER:
+            return
+        zid = str(transport.zid)
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT and zid not in self._routers:
+                self._routers.add(zid)
+                self.epoch += 1
+            elif event.kind == zenoh.SampleKind.DELETE and zid in self._routers:
+                self._routers.remove(zid)
+                self.lost += 1
+        self._on_change()
+
+
+def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
+    """Return the links of some sessions as metrics."""
+    found = Counter(protocol for watch in watches for protocol in watch.protocols)
+    return [
+        Metric("links", "gauge", "links to routers, by transport", _by_protocol(found), "protocol"),
+        Metric("links_opened", "counter", "connections to a router", {"": sum(watch.epoch for watch in watches)}),
+        Metric("links_lost", "counter", "losses of a router", {"": sum(watch.lost for watch in watches)}),
+    ]
+
+
+def _by_protocol(found: Mapping[str, int]) -> dict[str, float]:
+    return {protocol: float(found.get(protocol, 0)) for protocol in (*PROTOCOLS, *found)}
+
+
+def router_metrics(session: zenoh.Session) -> list[Metric]:
+    """Return the sessions and links of a router as metrics, read from the router itself."""
+    kinds = Counter(str(transport.whatami).rpartition(".")[2].lower() for transport in session.info.transports())
+    protocols = Counter(link.dst.partition("/")[0] for link in session.info.links())
+    sessions = {kind: float(kinds.get(kind, 0)) for kind in ("client", "router", "peer")}
+    return [
+        Metric("router_sessions", "gauge", "open sessions, by kind of partner", sessions, "kind"),
+        Metric("router_links", "gauge", "open links, by transport", _by_protocol(protocols), "protocol"),
+    ]

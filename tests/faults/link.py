@@ -1,0 +1,334 @@
+"""Campaign on the link between a car and its router: loss, a new address, blocked UDP, a router that returns, a flood.
+
+Router and service are in one network namespace, cars in others; between them are links of `link_relay.py`. The same
+traffic runs over QUIC and over TLS, so that each figure has its control. Making namespaces and TUN devices needs root.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fleet_service.enrolment.fleet import Enrolment, Router
+from schemas import grid, keys
+from schemas.runtime.figures import Figure
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.faults.link_relay import DEVICE, LinkTerms
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, key
+from tests.secured import READER, SERVICE, registry
+
+ROUTER_ADDRESS: Final = "10.77.0.1"
+FLOOD_NET: Final = "10.78.0"
+PORTS: Final = (7447, 7448)
+HONEST: Final = tuple(f"car-{number:03}" for number in range(5))
+FLOODER: Final = "flood-001"
+SAMPLES_PER_S: Final = 48.0
+LOSSY: Final = LinkTerms(loss=0.02, delay_s=0.04, bytes_per_s=500_000.0)
+MOBILE: Final = LinkTerms(delay_s=0.04)
+UPLINK: Final = LinkTerms(delay_s=0.04, bytes_per_s=2_000_000.0)
+TILE_BYTES: Final = 40_000
+TILES_PER_S: Final = 10.0
+ALERTS_PER_S: Final = 7.3  # no divisor of the tiles' rate, so that alerts meet tiles at any phase
+QUIET_S: Final = 0.5  # after the last message, for those in flight
+START_S: Final = 30.0
+TILE: Final = int(grid.tile_of(int(grid.cell_of(LATITUDE, LONGITUDE))))
+
+
+class Namespaces:
+    """Network namespaces of one run, the routers in `road`, and the links of cars to it."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.folder, self._stack = folder, stack
+        self._tag = f"gm{os.getpid()}"
+        self.certificates = folder / "certificates"
+        routers = {
+            f"router-{letter}": Router(hosts=[ROUTER_ADDRESS, "127.0.0.1"], listen="0.0.0.0", port=port)
+            for letter, port in zip("ab", PORTS, strict=True)
+        }
+        names = {"services": [SERVICE], "readers": [READER], "vehicles": [*HONEST, FLOODER]}
+        registry(self.certificates).enrol(Enrolment.model_validate({"routers": routers, **names}))
+        self.road = self._add("road")
+
+    def _add(self, name: str) -> str:
+        namespace = f"{self._tag}-{name}"
+        run("ip", "netns", "add", namespace)
+        self._stack.callback(run, "ip", "netns", "delete", namespace)
+        run("ip", "-n", namespace, "link", "set", "lo", "up")
+        return namespace
+
+    def connect(self, name: str, terms: LinkTerms, net: str = "10.77.0") -> tuple[str, subprocess.Popen[str]]:
+        """Return a new namespace of cars, linked to the road, and the process of the link."""
+        car, device = self._add(name), f"{DEVICE}{net[3:5]}"
+        given = {"left": car, "right": self.road, "device": device, "terms": asdict(terms)}
+        link = self.start("", "tests.faults.link_relay", given)
+        read_line(link)
+        for namespace, number in ((car, 2), (self.road, 1)):
+            run("ip", "-n", namespace, "address", "add", f"{net}.{number}/24", "dev", device)
+            run("ip", "-n", namespace, "link", "set", device, "up")
+        if net != "10.77.0":
+            run("ip", "-n", car, "route", "add", "10.77.0.0/24", "dev", device)
+        return car, link
+
+    def move(self, car: str, number: int) -> None:
+        """Give the car another address, as a mobile network does; the old one is gone."""
+        device = f"{DEVICE}77"
+        run("ip", "-n", car, "address", "flush", "dev", device)
+        run("ip", "-n", car, "address", "add", f"10.77.0.{number}/24", "dev", device)
+
+    def start(self, namespace: str, module: str, given: dict[str, Any]) -> subprocess.Popen[str]:
+        """Start a process of the campaign; it ends with the campaign at the latest."""
+        inside = ["ip", "netns", "exec", namespace] if namespace else []
+        return self._popen([*inside, sys.executable, "-m", module, json.dumps(given)])
+
+    def router(
+        self, letter: str = "a", protocols: Sequence[str] = ("quic", "tls"), *, capped: bool = True
+    ) -> subprocess.Popen[str]:
+        """Start a router of the road as `fleet-service certs` configures it, on some of its transports."""
+        file = self.certificates / f"router-{letter}.json5"
+        config = json.loads(file.read_text())
+        listen = config["listen"]
+        listen["endpoints"] = [one for one in listen["endpoints"] if one.partition("/")[0] in protocols]
+        if not capped:
+            del config["downsampling"]
+        used = file.with_suffix(".running.json5")
+        used.write_text(json.dumps(config))
+        command = ["ip", "netns", "exec", self.road, sys.executable, "-m", "deploy.router", "--config", str(used)]
+        process = self._popen(command)
+        read_line(process)
+        return process
+
+    def end(
+        self, role: str, namespace: str, name: str, protocols: Sequence[str], **given: object
+    ) -> subprocess.Popen[str]:
+        """Start one end of the campaign; see `link_ends.py`."""
+        inside = "127.0.0.1" if namespace == self.road else ROUTER_ADDRESS
+        ports = given.pop("ports", PORTS[:1])
+        assert isinstance(ports, Sequence)
+        connect = [f"{protocol}/{inside}:{port}" for port in ports for protocol in protocols]
+        whole = {"role": role, "name": name, "connect": connect, "certificates": str(self.certificates), **given}
+        return self.start(namespace, "tests.faults.link_ends", whole)
+
+    def _popen(self, command: list[str]) -> subprocess.Popen[str]:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._stack.callback(stop, process)
+        return process
+
+
+def run(*command: str) -> None:
+    """Run a command of iproute2."""
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def stop(process: subprocess.Popen[str]) -> None:
+    """End a process."""
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):  # what was not yet written is of no use
+                pipe.close()
+
+
+def read_line(process: subprocess.Popen[str]) -> str:
+    """Return the next line of a process."""
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert line, f"{process.args!r} ended early"
+    return line
+
+
+def release(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """Close the stdin of an end, which then prints its result."""
+    assert process.stdin is not None
+    process.stdin.close()
+    found: dict[str, Any] = json.loads(read_line(process))
+    return found
+
+
+def command(process: subprocess.Popen[str], line: str) -> None:
+    """Write a line to a process."""
+    assert process.stdin is not None
+    process.stdin.write(line + "\n")
+    process.stdin.flush()
+
+
+@contextmanager
+def namespaces(folder: Path) -> Iterator[Namespaces]:
+    """Namespaces that are gone afterwards."""
+    folder.mkdir(parents=True)
+    with ExitStack() as stack:
+        yield Namespaces(folder, stack)
+
+
+def change_address(site: Site, protocol: str, seconds: float) -> tuple[int, int, float]:
+    """Return how many samples a car put and lost while its address changed twice, and the longest gap [s]."""
+    with namespaces(site.folder / f"address-{protocol}") as there:
+        there.router()
+        car, _ = there.connect("car", MOBILE)
+        place = key(HONEST[0])
+        service = there.end("receive", there.road, SERVICE, ("tls",), keys=[place])
+        read_line(service)
+        streams = [{"key": place, "size": 300, "rate": SAMPLES_PER_S}]
+        vehicle = there.end("send", car, HONEST[0], (protocol,), streams=streams, drain_s=QUIET_S)
+        read_line(vehicle)
+        command(vehicle, "go")
+        for number in (3, 4):
+            time.sleep(seconds / 3)
+            there.move(car, number)
+        time.sleep(seconds / 3)
+        put = release(vehicle)[place]
+        arrived = release(service).get(place, [])
+    numbers = {number for number, _, _ in arrived}
+    times = np.sort([at for _, _, at in arrived])
+    return put, put - len(numbers), float(np.diff(times).max())
+
+
+def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
+    """Return the delays of alerts over a lossy link with tiles next to them."""
+    with namespaces(site.folder / f"lossy-{protocol}") as there:
+        there.router()
+        car, _ = there.connect("car", LOSSY)
+        alert, tile = keys.alert_key(TILE), keys.map_key(TILE)
+        reader = there.end("receive", car, READER, (protocol,), keys=[alert, tile])
+        used = json.loads(read_line(reader))["protocols"]
+        assert used == [protocol], used
+        streams = [
+            {"key": alert, "size": 150, "rate": ALERTS_PER_S},
+            {"key": tile, "size": TILE_BYTES, "rate": TILES_PER_S},
+        ]
+        service = there.end("send", there.road, SERVICE, ("tls",), streams=streams)
+        read_line(service)
+        command(service, "go")
+        time.sleep(seconds)
+        put = release(service)
+        time.sleep(QUIET_S)
+        arrived = release(reader)
+    delays = 1e3 * np.array([delay for _, delay, _ in arrived[alert]])
+    return {
+        "p50": float(np.quantile(delays, 0.5)),
+        "p99": float(np.quantile(delays, 0.99)),
+        "alerts": float(len(delays)),
+        "alerts_lost": float(put[alert] - len(delays)),
+        "tiles_share": len(arrived.get(tile, [])) / put[tile],
+    }
+
+
+def block_udp(site: Site) -> float:
+    """Return how long a session takes to open where UDP is blocked [s]."""
+    with namespaces(site.folder / "udp") as there:
+        for letter in "ab":
+            there.router(letter)
+        car, _ = there.connect("car", LinkTerms(delay_s=0.04, drop_udp=True))
+        found = json.loads(read_line(there.end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS)))
+        assert found["protocols"] == ["tls"], found
+        return float(found["seconds"])
+
+
+def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
+    """Return the longest time that a car takes to find a router that came back with TLS only [s]."""
+    longest = 0.0
+    with namespaces(site.folder / "back") as there:
+        router = there.router()
+        car, _ = there.connect("car", MOBILE)
+        watched = there.end("watch", car, HONEST[0], ("quic", "tls"), ports=PORTS)
+        assert json.loads(read_line(watched))["protocols"] == ["quic"]
+        for outage_s in outages_s:
+            stop(router)
+            while json.loads(read_line(watched))["connected"]:
+                pass
+            time.sleep(outage_s)
+            router = there.router(protocols=("tls",))
+            back = time.monotonic()
+            while not (told := json.loads(read_line(watched)))["connected"]:
+                pass
+            longest = max(longest, told["time"] - back)
+            site.say(f"back after {told['time'] - back:.2f} s over {told['protocols']}")
+    return longest
+
+
+def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
+    """Return the p99 of honest messages with a flooding car over that without, and what passed of the flood [1/s]."""
+    with namespaces(site.folder / f"flood-{capped}") as there:
+        there.router(capped=capped)
+        cars, _ = there.connect("car", MOBILE)
+        flooding, _ = there.connect("flood", UPLINK, FLOOD_NET)
+        streams = [{"name": name, "key": key(name), "size": 1000, "rate": 4.0} for name in HONEST]
+        place = key(FLOODER)
+        service = there.end("receive", there.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"])
+        read_line(service)
+        honest = there.end("send", cars, HONEST[0], ("quic",), streams=streams, drain_s=QUIET_S)
+        attacker = there.end("send", flooding, FLOODER, ("quic",), streams=[{"key": place, "size": 1000, "rate": 0}])
+        read_line(honest)
+        read_line(attacker)
+        command(honest, "go")
+        time.sleep(seconds)
+        began = time.monotonic()
+        command(attacker, "go")
+        time.sleep(seconds)
+        ended = time.monotonic()
+        stop(attacker)
+        release(honest)
+        arrived = release(service)
+    delays: dict[bool, list[float]] = {False: [], True: []}
+    for name in HONEST:
+        for _, delay, at in arrived[key(name)]:
+            if at - delay < ended:
+                delays[at >= began].append(delay)
+    passed = len(arrived.get(place, [])) / (ended - began)
+    with_flood, without = (float(np.quantile(delays[during], 0.99)) for during in (True, False))
+    return with_flood / without, passed
+
+
+def measure(site: Site) -> list[Figure]:
+    """Run all parts of the campaign."""
+    address_s, lossy_s, flood_s = site.of(15, 6), site.of(60, 12), site.of(20, 5)
+    put, lost, gap = change_address(site, "quic", address_s)
+    _, tls_lost, tls_gap = change_address(site, "tls", address_s)
+    site.say(f"new addresses: QUIC lost {lost} of {put}, gap {gap:.2f} s; TLS lost {tls_lost}, gap {tls_gap:.2f} s")
+    quic, tls = (delay_alerts(site, protocol, lossy_s) for protocol in ("quic", "tls"))
+    site.say(f"lossy link: QUIC {quic}; TLS {tls}")
+    ready_s = block_udp(site)
+    back_s = return_with_tls(site, (1.0, 4.0, 7.0) if not site.quick else (2.0,))
+    ratio, passed = flood(site, flood_s, capped=True)
+    free_ratio, free = flood(site, flood_s, capped=False)
+    site.say(f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} {free_ratio:.2f} uncapped")
+    return [
+        figure("link.address_change.lost", lost),
+        figure("link.address_change.gap_s", gap),
+        figure("link.address_change.samples", put),
+        Figure("link.address_change.tls_lost", tls_lost, "samples, the same over TLS"),
+        Figure("link.address_change.tls_gap_s", tls_gap, "s, the same over TLS"),
+        figure("link.lossy.alert_p99_ms", quic["p99"]),
+        figure("link.lossy.alert_p99_ratio", quic["p99"] / tls["p99"]),
+        figure("link.lossy.alerts_lost", quic["alerts_lost"]),
+        Figure("link.lossy.alert_p50_ms", quic["p50"], "ms"),
+        Figure("link.lossy.tls_p50_ms", tls["p50"], "ms, over TLS"),
+        Figure("link.lossy.tls_p99_ms", tls["p99"], "ms, over TLS"),
+        Figure("link.lossy.tiles_share", quic["tiles_share"], "of tiles that arrived"),
+        Figure("link.lossy.tls_tiles_share", tls["tiles_share"], "of tiles that arrived over TLS"),
+        figure("link.udp_blocked.ready_s", ready_s),
+        figure("link.router_back_tls_only_s", back_s),
+        figure("link.flood.honest_p99_ratio", ratio),
+        figure("link.flood.sent_per_s", free),
+        Figure("link.flood.passed_per_s", passed, "messages/s of the flooding car"),
+        Figure("link.flood.uncapped_p99_ratio", free_ratio, "with a flood over without, no caps"),
+    ]
+
+
+OWES: Final = (
+    *("link.address_change.lost", "link.address_change.gap_s", "link.address_change.samples"),
+    *("link.lossy.alert_p99_ms", "link.lossy.alert_p99_ratio", "link.lossy.alerts_lost"),
+    *("link.udp_blocked.ready_s", "link.router_back_tls_only_s"),
+    *("link.flood.honest_p99_ratio", "link.flood.sent_per_s"),
+)

@@ -1,0 +1,137 @@
+"""`python -m tests.faults.link_ends JSON`: one end of the link campaign, in the network namespace that starts it.
+
+Roles: `receive` subscribes and notes when each numbered message arrives; `send` puts numbered messages at a rate;
+`open` measures how long a session takes to open; `watch` tells when its link changes. Times are of the system's
+monotonic clock, which all processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from schemas import keys
+from schemas.config import ZenohSettings
+from schemas.runtime.link_watch import LinkWatch
+from schemas.runtime.process import force_exit
+from schemas.runtime.zenoh_session import open_session, quality_of
+from tests.secured import settings
+
+HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it was put [s]
+
+
+def open_end(given: dict[str, Any]) -> zenoh.Session:
+    """Open a session with the certificate of its name."""
+    one = settings(given["connect"][0], Path(given["certificates"]))
+    config = {key: value for key, value in one.config.items() if key != "connect/retry"}
+    session = open_session(ZenohSettings(connect=given["connect"], config=config), None, given["name"])
+    assert session is not None
+    return session
+
+
+def receive(given: dict[str, Any]) -> None:
+    """Subscribe until stdin is closed; then print number, delay [s] and time of arrival [s] of each message by key."""
+    arrived: dict[str, list[tuple[int, float, float]]] = {}
+
+    def note(sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        number, put_at = HEAD.unpack(sample.payload.to_bytes()[: HEAD.size])
+        arrived.setdefault(str(sample.key_expr), []).append((number, now - put_at, now))
+
+    with open_end(given) as session:
+        subscribers = [session.declare_subscriber(key, note) for key in given["keys"]]
+        print(json.dumps({"protocols": wait_for_link(session), "subscribers": len(subscribers)}), flush=True)
+        sys.stdin.read()
+        print(json.dumps(arrived), flush=True)
+
+
+def send(given: dict[str, Any]) -> None:
+    """Put messages of several streams until stdin is closed; print how many were put by key.
+
+    Each stream has a key, a size in bytes and a rate; its quality of service is that of its topic. A rate of 0 puts as
+    fast as the session takes it.
+    """
+    over, counts = threading.Event(), dict[str, int]()
+
+    def drive(session: zenoh.Session, stream: dict[str, Any]) -> None:
+        quality = quality_of(keys.TOPICS[stream["key"].split("/")[2]])
+        filling, number, due = bytes(stream["size"] - HEAD.size), 0, time.monotonic()
+        while not over.is_set():
+            session.put(stream["key"], HEAD.pack(number, time.monotonic()) + filling, **quality)
+            number += 1
+            counts[stream["key"]] = number
+            if stream["rate"]:
+                due += 1.0 / stream["rate"]
+                over.wait(max(due - time.monotonic(), 0.0))
+
+    sessions = {
+        name: open_end({**given, "name": name}) for name in {one.get("name", given["name"]) for one in given["streams"]}
+    }
+    links = {name: wait_for_link(session) for name, session in sessions.items()}
+    print(json.dumps({"protocols": links}), flush=True)
+    sys.stdin.readline()
+    threads = [
+        threading.Thread(target=drive, args=(sessions[one.get("name", given["name"])], one), daemon=True)
+        for one in given["streams"]
+    ]
+    for thread in threads:
+        thread.start()
+    sys.stdin.read()
+    over.set()
+    for thread in threads:
+        thread.join(5.0)
+    time.sleep(given.get("drain_s", 0.0))
+    print(json.dumps(counts), flush=True)
+
+
+def wait_for_link(session: zenoh.Session) -> list[str]:
+    """Return the transports of a session, once it has one."""
+    watch = LinkWatch(session, "link")
+    while not watch.protocols:
+        time.sleep(0.005)
+    return watch.protocols
+
+
+def measure_opening(given: dict[str, Any]) -> None:
+    """Print how long a session took to open, and its transport."""
+    began = time.monotonic()
+    with open_end(given) as session:
+        took = time.monotonic() - began
+        print(json.dumps({"seconds": took, "protocols": wait_for_link(session)}), flush=True)
+
+
+def watch(given: dict[str, Any]) -> None:
+    """Print a line for each change of the link until stdin is closed."""
+    with open_end(given) as session:
+        seen: list[LinkWatch] = []
+
+        def tell() -> None:
+            if seen:
+                told = {"time": time.monotonic(), "connected": seen[0].is_connected, "protocols": seen[0].protocols}
+                print(json.dumps(told), flush=True)
+
+        seen.append(LinkWatch(session, given["name"], tell))
+        wait_for_link(session)
+        tell()
+        sys.stdin.read()
+
+
+ROLES: Final = {"receive": receive, "send": send, "open": measure_opening, "watch": watch}
+
+
+def main() -> int:
+    """Play one role."""
+    given = json.loads(sys.argv[1])
+    ROLES[given["role"]](given)
+    return 0
+
+
+if __name__ == "__main__":
+    force_exit(main())

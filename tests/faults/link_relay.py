@@ -1,0 +1,146 @@
+"""`python -m tests.faults.link_relay JSON`: one mobile link between two network namespaces, with loss, delay and rate.
+
+Each namespace gets a TUN device. This process moves packets between both: it loses some at random, lets the others wait
+in a queue of limited length for the rate of the link, and delivers them after the delay. It needs no kernel module
+beyond TUN. Settings can be changed by a line of JSON on stdin, for example `{"drop_udp": true}`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import heapq
+import json
+import os
+import random
+import selectors
+import struct
+import sys
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+TUNSETIFF: Final = 0x400454CA  # linux/if_tun.h
+IFF_TUN: Final = 0x0001
+IFF_NO_PI: Final = 0x1000  # packets without a header of the driver
+CLONE_NEWNET: Final = 0x40000000
+PACKET: Final = 65536
+UDP: Final = 17  # protocol number in an IPv4 header
+DEVICE: Final = "grip0"
+
+
+@dataclass(frozen=True)
+class LinkTerms:
+    """Properties of a link, the same in both directions.
+
+    Attributes:
+        loss: share of packets that are lost.
+        delay_s: one way.
+        bytes_per_s: rate; 0 for no limit.
+        queue_bytes: length of the queue in front of the rate; what does not fit is lost.
+        drop_udp: True where a network blocks UDP.
+        seed: of the losses.
+    """
+
+    loss: float = 0.0
+    delay_s: float = 0.0
+    bytes_per_s: float = 0.0
+    queue_bytes: int = 100_000
+    drop_udp: bool = False
+    seed: int = 0
+
+
+@dataclass
+class Direction:
+    """One way of the link: packets in flight, and when the rate is free again."""
+
+    out: int
+    flying: list[tuple[float, int, bytes]] = field(default_factory=list)
+    free_at: float = 0.0
+    number: int = 0
+
+    def take(self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random) -> None:
+        """Accept a packet or lose it."""
+        if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
+            return
+        if draw.random() < terms.loss:
+            return
+        self.free_at = max(self.free_at, now)
+        if terms.bytes_per_s:
+            if (self.free_at - now) * terms.bytes_per_s > terms.queue_bytes:
+                return
+            self.free_at += len(packet) / terms.bytes_per_s
+        self.number += 1
+        heapq.heappush(self.flying, (self.free_at + terms.delay_s, self.number, packet))
+
+    def deliver(self, now: float) -> None:
+        """Write the packets that have arrived."""
+        while self.flying and self.flying[0][0] <= now:
+            packet = heapq.heappop(self.flying)[2]
+            try:
+                os.write(self.out, packet)
+            except OSError:  # the other end is full, or its device is down
+                continue
+
+
+def enter(namespace: str) -> None:
+    """Move this thread into a named network namespace."""
+    with Path("/run/netns", namespace).open("rb") as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), f"cannot enter the network namespace {namespace}")
+
+
+def open_device(namespace: str, device: str) -> int:
+    """Create a TUN device in a namespace; return its file descriptor."""
+    enter(namespace)
+    found = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+    fcntl.ioctl(found, TUNSETIFF, struct.pack("16sH", device.encode(), IFF_TUN | IFF_NO_PI))
+    return found
+
+
+def relay(ends: tuple[int, int], terms: LinkTerms) -> None:
+    """Move packets until stdin is closed."""
+    ways = {ends[0]: Direction(ends[1]), ends[1]: Direction(ends[0])}
+    draw = random.Random(terms.seed)
+    with selectors.DefaultSelector() as waiting:
+        for end in (*ends, sys.stdin.fileno()):
+            waiting.register(end, selectors.EVENT_READ)
+        while True:
+            first = min((way.flying[0][0] for way in ways.values() if way.flying), default=None)
+            patience = None if first is None else max(first - time.monotonic(), 0.0)
+            for key, _ in waiting.select(patience):
+                if key.fd == sys.stdin.fileno():
+                    line = sys.stdin.readline()
+                    if not line:
+                        return
+                    terms = replace(terms, **json.loads(line))
+                    continue
+                for packet in _packets(key.fd):
+                    ways[key.fd].take(packet, time.monotonic(), terms, draw)
+            now = time.monotonic()
+            for way in ways.values():
+                way.deliver(now)
+
+
+def _packets(device: int) -> list[bytes]:
+    found: list[bytes] = []
+    while len(found) < 64:
+        try:
+            found.append(os.read(device, PACKET))
+        except BlockingIOError:
+            break
+    return found
+
+
+def main() -> int:
+    """Create both devices, say `relay: ready`, and move packets."""
+    given = json.loads(sys.argv[1])
+    ends = (open_device(given["left"], given["device"]), open_device(given["right"], given["device"]))
+    print("relay: ready", flush=True)
+    relay(ends, LinkTerms(**given["terms"]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
