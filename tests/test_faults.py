@@ -91,10 +91,10 @@ def kept(tmp_path: Path) -> list[Batch]:
         if turn:
             (root / "keys").symlink_to(tmp_path / "archive" / "keys")
         with closing(Engine(ServiceConfig(name=f"shard-{turn}"), root)) as engine:
-            engine.ingest(
+            engine.intake.ingest(
                 [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in shown], time.time_ns()
             )
-            engine.flush()
+            engine.settlement.flush()
     for segment in (tmp_path / "copy" / "inbox").glob("*.parquet"):
         segment.rename(tmp_path / "archive" / "inbox" / segment.name)
     return batches

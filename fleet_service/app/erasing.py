@@ -21,7 +21,7 @@ from typing import Any
 
 from fleet_service.app import beside
 from fleet_service.app.engine import Engine
-from fleet_service.app.memory import load_state
+from fleet_service.app.state import load_state
 from fleet_service.archive.format.layout import Cut
 from fleet_service.archive.identity import erasure_requests
 from fleet_service.archive.identity.erasure_requests import Erasure
@@ -72,9 +72,9 @@ def _erase(
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
     if vehicle is None:
-        destroyed = _reload_service(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
+        destroyed = _reload_service(engine, lambda: destroy_key(root, wanted.month, engine.state.streams.newest), stop)
         return {"rows": 0, "files": []} if destroyed else None
-    cut = engine.run_between_segments(lambda: engine.newest_segment, stop)
+    cut = engine.settlement.run_between_segments(lambda: engine.settlement.newest_segment, stop)
     if cut is None:
         return None
     request = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
@@ -92,7 +92,7 @@ def _reload_service(engine: Engine, before: Callable[[], None], stop: threading.
         engine.reload_state(before)
         return True
 
-    return engine.run_between_segments(work, stop)
+    return engine.settlement.run_between_segments(work, stop)
 
 
 def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:

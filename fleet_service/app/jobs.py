@@ -51,7 +51,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
     """Return the jobs that maintain an archive, according to the settings; `moment` returns the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
-        if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
+        if engine.copy is not None and engine.settlement.failing:  # compacted, its segments would never be put as such
             return "compaction waits for the copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)
@@ -64,7 +64,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
     def snapshot(_: threading.Event) -> str | None:
         now = moment().now
-        table = engine.whole_map(now)
+        table = engine.queries.whole_map(now)
         if table.num_rows:
             snapshots.write(root, table, now)
         return None
@@ -84,7 +84,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         return f"retired: {done.days} days" if done.days else None
 
     def old_cells(stop: threading.Event) -> str | None:
-        dropped = engine.run_between_segments(engine.drop_old, stop)
+        dropped = engine.settlement.run_between_segments(engine.drop_old, stop)
         return f"dropped: {dropped} cells that nobody visited for a week" if dropped else None
 
     def inventory(_: threading.Event) -> str | None:

@@ -52,6 +52,7 @@ class Pulse(NamedTuple):
 def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
     """Return all current values."""
     counts = dict(engine.counts)
+    report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
     found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
     found += [Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()]
@@ -68,15 +69,15 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
         gauge("routers", "routers to which the session is connected", pulse.routers),
         gauge("worker_turn_age_seconds", "time since the worker's last turn", pulse.turn_age_s),
         gauge("clock_lag_seconds", "lag of the system clock", pulse.clock_lag_s),
-        gauge("report_lag_seconds", "time between the end of the newest visit and its arrival", engine.report_lag_s),
-        gauge("unsettled_batches", "admitted batches that are not on disk yet", engine.unsettled),
+        gauge("report_lag_seconds", "time between the end of the newest visit and its arrival", report_lag_s),
+        gauge("unsettled_batches", "admitted batches that are not on disk yet", engine.settlement.unsettled),
         gauge("copy_away_seconds", "time for which the archive's copy has not accepted segments", away_s),
         gauge("lease_left_seconds", "time for which the service may acknowledge without renewing its "
                                     "lease", engine.holding.left_s),
         _serves(config, 1.0),
-        gauge("cells", "cells and sectors with a belief", engine.fusion.size),
-        gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
-        gauge("alerts", "cells under an alert", engine.alerts),
+        gauge("cells", "cells and sectors with a belief", engine.state.fusion.size),
+        gauge("window_observations", "observations younger than the checkpoint", engine.state.fusion.waiting),
+        gauge("alerts", "cells under an alert", engine.alerts.count),
         gauge("damaged_files", "damaged files set aside, at the last count", counts.get("files_set_aside", 0)),
     ]  # fmt: skip
 
@@ -98,13 +99,13 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
         found.append(f"the worker has been idle for {pulse.turn_age_s:.0f} s")
     if pulse.answer_s > STALLED_S:
         found.append(f"a tile of an answer has been in progress for {pulse.answer_s:.0f} s")
-    if engine.hangs_s > STALLED_S:
-        found.append(f"a segment write has been in progress for {engine.hangs_s:.0f} s")
+    if engine.settlement.hangs_s > STALLED_S:
+        found.append(f"a segment write has been in progress for {engine.settlement.hangs_s:.0f} s")
     if abs(pulse.clock_lag_s) > CLOCK_S:
         found.append(f"the system clock differs by {abs(pulse.clock_lag_s):.0f} s from the service's time")
     if engine.copy is not None and engine.copy.trouble is not None:
         found.append(engine.copy.trouble)
-    elif engine.failing:
+    elif engine.settlement.failing:
         found.append("segments cannot be written")
     if not engine.holding.may_acknowledge:
         found.append("the lease is not renewed, so nothing is acknowledged")

@@ -72,14 +72,14 @@ class Service:
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
-        self._replies = MapQueryable(Answering(self.engine.size, self._answer), self.engine.counts)
+        self._replies = MapQueryable(Answering(self.engine.queries.measure_answer, self._answer), self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
-            config.put_s, lambda: self.engine.map.take_dirty(), self._put_tile, self.engine.counts, time.monotonic
+            config.put_s, lambda: self.engine.state.map.take_dirty(), self._put_tile, self.engine.counts, time.monotonic
         )
         self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
         self._reported, self._began, self._survived = 0, self._stepped_at, False
@@ -100,7 +100,7 @@ class Service:
     @property
     def exit_code(self) -> int:
         """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another service took over."""
-        return 1 if self.failure is not None or self._followed or self.engine.unsettled else 0
+        return 1 if self.failure is not None or self._followed or self.engine.settlement.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         config = self._config
@@ -113,7 +113,9 @@ class Service:
             serving_regions(session, mine),
         ):
             self._session = session
-            self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
+            self._log_line(
+                f"ready: {self._config.name}, {self.engine.state.fusion.size} cells from the archive{address}"
+            )
             watchdog.notify_alive()
             try:
                 while not (stop.is_set() or self._lost(came) or self.engine.holding.leaves):
@@ -134,8 +136,8 @@ class Service:
 
     def _hanging(self) -> str | None:
         """Return what has died or hangs next to the worker, so that only a restart helps."""
-        if self.engine.hangs_s >= HANGS_S:
-            return f"a segment write has been in progress for {self.engine.hangs_s:.0f} s"
+        if self.engine.settlement.hangs_s >= HANGS_S:
+            return f"a segment write has been in progress for {self.engine.settlement.hangs_s:.0f} s"
         if self._replies.hangs_s >= HANGS_S:
             return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
         return "upkeep has ended" if self._upkeep.has_ended else None
@@ -197,7 +199,7 @@ class Service:
         """Reply with the standing alerts, for late clients."""
         expression = asked.key_expr
         with asked:
-            for tile, alerts in self.engine.standing_alerts(
+            for tile, alerts in self.engine.alerts.encode_tiles(
                 lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
             ):
                 asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
@@ -208,25 +210,25 @@ class Service:
         fits = len(sample.payload) <= wire.MAX_BYTES  # else it is refused as an empty one, where refusals are counted
         payload = sample.payload.to_bytes() if fits else b""
         message = WeatherMessage(str(sample.key_expr), payload, str(sample.encoding))
-        self.engine.weather.enqueue(message)
+        self.engine.intake.weather.enqueue(message)
 
     def _step(self, session: zenoh.Session, stop: threading.Event) -> None:
-        if self.engine.is_full:
+        if self.engine.settlement.is_full:
             stop.wait(IDLE_S)
         else:
             self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else IDLE_S))
         now = self._stepped_at = time.monotonic()
-        self._acknowledge(session, self.engine.end_flush())
+        self._acknowledge(session, self.engine.settlement.end_flush())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
-            self._acknowledge(session, self.engine.begin_flush())
-            self.engine.update_weather(self._clock.now())
+            self._acknowledge(session, self.engine.settlement.begin_flush())
+            self.engine.intake.update_weather(self._clock.now())
         if self._rounds.begin() and (at := self._clock.moment()).sure:
-            self._put_alerts(session, self.engine.fade_alerts(at.now))
+            self._put_alerts(session, self.engine.alerts.expire(at.now))
         self._rounds.go_on(SHARE_S if len(self.inbox) < BEHIND else 0.0)
         if now - self._repeated_at >= REPEAT_S:
             self._repeated_at = now
-            self._put_alerts(session, self.engine.alerts_to_repeat(REPEATED))
+            self._put_alerts(session, self.engine.alerts.next_to_repeat(REPEATED))
         if now - self._reported_at >= STATUS_S:
             self._status(now)
             if hanging := self._hanging():
@@ -248,12 +250,12 @@ class Service:
         if leaves:
             stop.set()
         deadline = time.monotonic() + LEAVE_S
-        while not self.engine.is_full and time.monotonic() < deadline:
+        while not self.engine.settlement.is_full and time.monotonic() < deadline:
             messages = self.inbox.drain(0.0)
             if not messages:
                 break
             self._take(session, messages)
-        self._acknowledge(session, self.engine.flush())
+        self._acknowledge(session, self.engine.settlement.flush())
         if not leaves:  # else they are put by who comes, which puts all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status(time.monotonic())
@@ -267,7 +269,7 @@ class Service:
             publish(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
     def _put_tile(self, tile: int) -> None:
-        stream = self.engine.tile(tile, self._clock.now())
+        stream = self.engine.queries.tile(tile, self._clock.now())
         if stream and self._session is not None:
             publish(self._session, keys.map_key(tile), stream, wire.ARROW)
 
@@ -285,21 +287,21 @@ class Service:
         rest = ", ".join(f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind))
         text = (
             f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
-            f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
+            f"{self.engine.state.fusion.size} cells, {self.engine.alerts.count} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
             + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
             + (f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it" if behind <= -LAG_S else "")
         )
-        self._log_line(LogLine(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
+        self._log_line(LogLine(text, cells=self.engine.state.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
     def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
-        return self.engine.answer(wanted, near, self._clock.now(), only)
+        return self.engine.queries.answer(wanted, near, self._clock.now(), only)
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
     """Let an engine process messages now, and pass their times to the clock."""
-    alerts = engine.ingest(messages, clock.moment())
-    clock.record_reports(engine.times)
+    alerts = engine.intake.ingest(messages, clock.moment())
+    clock.record_reports(engine.intake.times)
     return alerts
 
 

@@ -167,7 +167,7 @@ def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message], key
         for minute in range(MINUTES):
             part = [sent[k].message for k in np.flatnonzero((at >= 60.0 * minute) & (at < 60.0 * (minute + 1)))]
             extra = forged[minute - BEGIN :: MINUTES - BEGIN] if minute >= BEGIN else []
-            engine.ingest([*part, *extra], clock_of(60.0 * (minute + 1)))
-            out.append(np.isin(engine.fusion.slots_of(CELL, np.zeros(CELLS, np.int64)), engine.alert_slots))
+            engine.intake.ingest([*part, *extra], clock_of(60.0 * (minute + 1)))
+            out.append(np.isin(engine.state.fusion.slots_of(CELL, np.zeros(CELLS, np.int64)), engine.alerts.slots))
         engine.close()
     return out

@@ -60,12 +60,12 @@ def replay(rng: Generator) -> float:
         engine = Engine(ServiceConfig(), Path(folder))
         for portion in np.array_split(np.argsort(at), PARTS):
             now = clock_of(float(at[portion].max()))
-            engine.ingest([sent[k].message for k in (*portion, *portion[::7])], now)
-            engine.flush()
+            engine.intake.ingest([sent[k].message for k in (*portion, *portion[::7])], now)
+            engine.settlement.flush()
         engine.close()
         again = Engine(ServiceConfig(), Path(folder))
         again.close()
-        return difference(engine.fusion, again.fusion)
+        return difference(engine.state.fusion, again.state.fusion)
 
 
 def upper_shift(rng: Generator) -> float:

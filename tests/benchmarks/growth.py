@@ -52,9 +52,9 @@ def second_s(rate: int, seconds: int) -> float:
             sent = messages(vehicles, ROWS, now, vehicles, second * vehicles)
             began = time.process_time()
             for at in range(0, len(sent), TURN):
-                engine.ingest(sent[at : at + TURN], now)
-            engine.flush()
-            engine.tiles(now)
+                engine.intake.ingest(sent[at : at + TURN], now)
+            engine.settlement.flush()
+            engine.queries.changed_tiles(now)
             spent += time.process_time() - began if second >= WARM_S else 0.0
         assert engine.counts[Kind.OBSERVATION] == rate * (WARM_S + seconds), engine.counts
     return spent / seconds

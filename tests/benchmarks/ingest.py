@@ -125,11 +125,11 @@ def _take(sent: list[Message], records: int) -> tuple[float, float]:
         gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for
         wall, cpu = time.perf_counter(), time.process_time()
         for at in range(0, len(sent), turn):
-            engine.ingest(sent[at : at + turn], time.time_ns())
-            engine.end_flush()
+            engine.intake.ingest(sent[at : at + turn], time.time_ns())
+            engine.settlement.end_flush()
             if at % FLUSH >= FLUSH - turn:
-                engine.begin_flush()
-        engine.flush()
+                engine.settlement.begin_flush()
+        engine.settlement.flush()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         gc.unfreeze()
         assert engine.counts[Kind.OBSERVATION] == len(sent) * records, engine.counts

@@ -50,7 +50,7 @@ def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
 
 
 def _beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
-    fusion = engine.fusion
+    fusion = engine.state.fusion
     slots = np.arange(fusion.size)
     order = np.lexsort((fusion.sector[slots], fusion.cell[slots]))
     return (fusion.cell[slots] * grid.SECTORS + fusion.sector[slots])[order], fusion.beliefs(slots, END)[order]

@@ -91,8 +91,8 @@ def engine(root: str) -> None:
         for burst in ([], *bursts):
             sys.stdin.readline()
             for at in range(0, len(burst), TURN):
-                there.ingest(burst[at : at + TURN], time.time_ns())
-            there.flush()
+                there.intake.ingest(burst[at : at + TURN], time.time_ns())
+            there.settlement.flush()
             print("done", flush=True)
         assert there.counts[Kind.OBSERVATION] == sum(map(len, bursts)) * ROWS, there.counts
 

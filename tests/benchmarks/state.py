@@ -47,7 +47,7 @@ def state() -> list[Figure]:
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
             took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
-            cells = engine.fusion.size
+            cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
     told = f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} ms at the most"
     return [
@@ -68,15 +68,15 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     def work() -> None:
         for number, part in enumerate(parts):
             began = time.perf_counter()
-            engine.ingest(part, now)
-            engine.flush()
+            engine.intake.ingest(part, now)
+            engine.settlement.flush()
             turns.append(time.perf_counter() - began)
             if number == len(parts) // 2:
                 saved.wait()
 
     worker = threading.Thread(target=work)
     for part in parts[:2]:  # warm
-        engine.ingest(part, now)
+        engine.intake.ingest(part, now)
     worker.start()
     began = time.perf_counter()
     taken = engine.checkpoint(threading.Event())

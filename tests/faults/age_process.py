@@ -45,7 +45,7 @@ def _begun(root: Path, and_checkpoint: bool) -> dict[str, float]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         if and_checkpoint:
             _checkpoint(engine, root)
-        return {"cells": engine.fusion.size, "processor_s": time.process_time()}
+        return {"cells": engine.state.fusion.size, "processor_s": time.process_time()}
 
 
 def _most_mb() -> float:
@@ -61,7 +61,7 @@ def _checkpoint(engine: Engine, root: Path) -> None:
     thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(threading.Event())))
     thread.start()
     while thread.is_alive():
-        engine.flush()
+        engine.settlement.flush()
         thread.join(0.1)
     assert taken[0] is not None
     checkpoints.save(root, taken[0])

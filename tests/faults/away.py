@@ -57,8 +57,8 @@ class Made:
         if not self.up:
             return []
         taken = [self.queue.popleft() for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)))]
-        self.engine.ingest([_message(one) for one in taken], START + round(now * NS))
-        return self.engine.flush()
+        self.engine.intake.ingest([_message(one) for one in taken], START + round(now * NS))
+        return self.engine.settlement.flush()
 
 
 def _message(one: StoredBatch) -> Message:
@@ -148,5 +148,5 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
 
 def _shown(engine: Engine) -> set[int]:
     """Cells that are on the map, by a visit that counted."""
-    fusion = engine.fusion
+    fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

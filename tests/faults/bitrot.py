@@ -85,8 +85,8 @@ def _found(root: Path, whole: Path) -> dict[str, Any]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if root != whole:
-                engine.ingest(list(messages(turn)), now_of(ROUNDS))
-        engine.flush()
+                engine.intake.ingest(list(messages(turn)), now_of(ROUNDS))
+        engine.settlement.flush()
         counts = engine.counts
         told: list[Path] = []
         rows = {kind: _rows(root, kind, told) for kind in Kind}

@@ -106,9 +106,9 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
                 ingest_messages(
                     engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)]
                 )
-            engine.flush()
+            engine.settlement.flush()
             if clock.moment().sure:
-                engine.fade_alerts(clock.now())
+                engine.alerts.expire(clock.now())
 
     def live(off: int, steps: int, check: Callable[[Engine], None] | None = None) -> None:
         machine.off = off
@@ -133,10 +133,10 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             compact(root)
             drive(engine, clock, 3)
             found.rejected += sum(n for name, n in engine.counts.items() if name.startswith("refused"))
-            found.alerts_lost += engine.alerts == 0
+            found.alerts_lost += engine.alerts.count == 0
 
     def stands(engine: Engine) -> None:
-        found.alerts_lost += engine.alerts == 0
+        found.alerts_lost += engine.alerts.count == 0
 
     live(0, seconds)
     live(case.jump if case.at_start else 0, seconds, stands)

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.app.memory import ServiceState, load_state
+from fleet_service.app.state import ServiceState, load_state
 from fleet_service.archive.format import layout, reading, snapshots
 from fleet_service.archive.format.load import load
 from fleet_service.archive.format.segments import nanoseconds
@@ -159,7 +159,7 @@ class ServiceHistory(Lives[Sent]):
         taken = coming.result()
         if taken is not None:
             checkpoints.save(root, taken)
-            snapshots.write(root, engine.whole_map(self._now), self._now)
+            snapshots.write(root, engine.queries.whole_map(self._now), self._now)
 
     def _batch(self) -> Sent:
         vehicle, self._now = self.random.choice(VEHICLES), self._now + 5 * SECOND
@@ -173,12 +173,12 @@ class ServiceHistory(Lives[Sent]):
     def _take(self, engine: Engine, batches: list[Sent]) -> None:
         wanted = [Message(Kind.OBSERVATION, key(one.vehicle), one.payload, wire.ENCODING[Kind.OBSERVATION])
                   for one in batches]  # fmt: skip
-        engine.ingest(wanted, self._now)
+        engine.intake.ingest(wanted, self._now)
 
     def _flush(self, engine: Engine) -> None:
         durable = {
             (vehicle, seq)
-            for vehicle, payload in engine.flush()
+            for vehicle, payload in engine.settlement.flush()
             for stream in wire.decode_ack(payload)[1]
             for first, end in stream.durable
             for seq in range(first, end + 1)
@@ -188,8 +188,10 @@ class ServiceHistory(Lives[Sent]):
     def _report(self, engine: Engine) -> None:
         report = Report(self._now, 0.5, 0.5, 0.5)
         failures = engine.counts["weather_failures"]
-        engine.weather.enqueue(weather.WeatherMessage(keys.weather_key(REGION), encode(report), wire.WEATHER_ENCODING))
-        engine.update_weather(self._now)
+        engine.intake.weather.enqueue(
+            weather.WeatherMessage(keys.weather_key(REGION), encode(report), wire.WEATHER_ENCODING)
+        )
+        engine.intake.update_weather(self._now)
         if engine.counts["weather_failures"] == failures:
             self.weather.add(report.time)
 

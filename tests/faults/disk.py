@@ -117,7 +117,7 @@ def run(site: Site) -> list[Figure]:
                         acknowledged += got
                         false += acknowledged > _rows(root)
                     acknowledged += _until_settled(engine)
-                    stuck += engine.unsettled > 0
+                    stuck += engine.settlement.unsettled > 0
                 acknowledged += _until_done(engine)
             runs.update({name: n for name, n in engine.counts.items() if name.endswith(("_runs", "_failures"))})
             false += acknowledged > _rows(root)
@@ -143,8 +143,8 @@ def _drive(engine: Engine, since: int, steps: int) -> int:
         now = time.time_ns()
         for vehicle in range(VEHICLES):
             one = batch(f"sim-{vehicle:03}", seq, now - NS, [0.8])
-            engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
-        got += _acked(engine.flush())
+            engine.intake.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+        got += _acked(engine.settlement.flush())
         threading.Event().wait(0.2)  # for the jobs
     return got
 
@@ -160,8 +160,8 @@ def _acked(acks: list[tuple[str, bytes]]) -> int:
 
 def _until_settled(engine: Engine) -> int:
     got, deadline = 0, time.monotonic() + STUCK_S
-    while engine.unsettled and time.monotonic() < deadline:
-        got += _acked(engine.flush())
+    while engine.settlement.unsettled and time.monotonic() < deadline:
+        got += _acked(engine.settlement.flush())
         threading.Event().wait(0.05)
     return got
 
@@ -170,7 +170,7 @@ def _until_done(engine: Engine) -> int:
     """Wait until each job has gone well once, with room again; returns what was acknowledged meanwhile."""
     got, deadline = 0, time.monotonic() + STUCK_S
     while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:
-        got += _acked(engine.flush())
+        got += _acked(engine.settlement.flush())
         threading.Event().wait(0.05)
     return got
 

@@ -213,8 +213,8 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
     sent += [visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds) for k in range(rounds)]
     engine = Engine(ServiceConfig(), folder)
     for one in sorted(sent, key=lambda one: int(one.columns["leave_time"][0])):
-        engine.ingest([Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])], now)
-    tiles = list(engine.answer(query.parse({}), lambda _: True, now))
+        engine.intake.ingest([Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])], now)
+    tiles = list(engine.queries.answer(query.parse({}), lambda _: True, now))
     engine.close()
     return pa.concat_tables([decode_tile(payload) for _, payload in tiles])
 

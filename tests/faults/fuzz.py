@@ -98,11 +98,11 @@ def _honest(seq: int, now: int) -> Iterator[Message]:
 def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     """One turn of the service's worker; 1 if anything but a refusal came of it."""
     try:
-        engine.ingest(messages, now)
-        for _, ack in engine.flush():
+        engine.intake.ingest(messages, now)
+        for _, ack in engine.settlement.flush():
             wire.decode_ack(ack)
-        engine.tiles(now)
-        engine.fade_alerts(now)
+        engine.queries.changed_tiles(now)
+        engine.alerts.expire(now)
     except Exception:  # noqa: BLE001 whatever it is, it is a crash
         site.say(traceback.format_exc())
         return 1
@@ -117,7 +117,7 @@ def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
         if wanted.at is not None and not past:
             return 0, 0, 0
         rebuilt = int(wanted.at is not None)
-        list(engine.answer(wanted, lambda _: True, now))
+        list(engine.queries.answer(wanted, lambda _: True, now))
     except InputError:
         return 0, 0, 0
     except Exception:  # noqa: BLE001
@@ -129,7 +129,7 @@ def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
     """Damaged tiles as a client reads them: how many, and how many crashes."""
     r, crashes, count = np.random.default_rng(site.seed), 0, site.of(50_000, 1_000)
-    (_, good), *_ = engine.answer(query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now)
+    (_, good), *_ = engine.queries.answer(query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now)
     for _ in range(count):
         damaged = bytearray(good)
         for place in r.integers(0, len(damaged), r.integers(1, 9)).tolist():

@@ -54,7 +54,7 @@ def run(site: Site) -> list[Figure]:
     with closing(Engine(config, site.folder / "archive")) as engine:
         warm = 0.0
         for first in range(6):  # what is compiled at first use is no harm that it does
-            engine.ingest([_attack(first, 0, start - NS, random_)], start - NS)
+            engine.intake.ingest([_attack(first, 0, start - NS, random_)], start - NS)
         for second in range(seconds):
             at, now = float(second), start + second * NS
             honest = [_message(_visit(name, second + 1, now, second)) for name in HONEST]
@@ -68,13 +68,13 @@ def run(site: Site) -> list[Figure]:
                 said.append(one)
                 sent, replayed = sent + 1, replayed + again
             began = time.perf_counter()
-            engine.ingest(attack + honest, now)
-            engine.flush()
+            engine.intake.ingest(attack + honest, now)
+            engine.settlement.flush()
             longest = max(longest, time.perf_counter() - began)
             if second == WARM_S:
                 warm = _memory_mb()
         grown = _memory_mb() - warm
-        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.alerts_to_repeat(10**6))
+        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.alerts.next_to_repeat(10**6))
         settled = engine.counts[Kind.OBSERVATION]
         ours = {name: n for name, n in engine.counts.items() if n}
     site.say(f"{sent} messages of the insider, {settled} observations; {ours}")

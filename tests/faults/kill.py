@@ -117,7 +117,7 @@ def map_difference(archive: Path) -> float:
     maps = []
     for _ in range(2):
         with closing(Engine(ServiceConfig(), archive)) as engine:
-            fusion = engine.fusion
+            fusion = engine.state.fusion
             slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
             maps.append(cell_table(fusion, slots, engine.seen))
         drop_checkpoints(archive)

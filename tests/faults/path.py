@@ -95,14 +95,14 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
             if kind == "row":
                 one, (other,) = way[0], wrong
                 columns = {k: np.concatenate([v, other.columns[k]]) for k, v in one.columns.items()}
-                engine.ingest(_messages([replace(one, columns=columns)]), start + 100 * SECOND)
+                engine.intake.ingest(_messages([replace(one, columns=columns)]), start + 100 * SECOND)
             elif kind == "between":  # the first half of the way, the far place, the second half
                 half = _visits(name, 1, when[:15], _at(north[:15], np.zeros(15)), 0.8)
                 rest = _visits(name, 2, when[15:], _at(north[15:], np.zeros(15)), 0.8)
                 later = [replace(one, seq=3) for one in wrong]
-                engine.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
+                engine.intake.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
             else:
-                engine.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
+                engine.intake.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
             found, most = engine.counts["implausible_moves"] - before, sum(len(b.columns["mu"]) for b in wrong)
             if found < most:
                 site.say(f"{kind}: {most - found} of {most} accepted")
@@ -141,7 +141,7 @@ def _two_cars(site: Site, way: str) -> int:
                 visits = _visits(
                     f"insider-{car}", place + 1, when + car, _at(np.zeros(1), np.array([place * STEP_M])), 0.15
                 )
-                alerts = engine.ingest(_messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end)
+                alerts = engine.intake.ingest(_messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end)
                 raised |= {alert.cell for alert in alerts if alert.raised}
     return len(raised)
 
@@ -154,5 +154,5 @@ def _honest(site: Site, cars: int) -> int:
             for car in range(cars):
                 when = np.array([start + (place * 90 + car * 60) * SECOND])
                 visits = _visits(f"car-{car}", place + 1, when, _at(np.zeros(1), np.array([place * 1_500.0])), 0.15)
-                raised |= {a.cell for a in engine.ingest(_messages(visits), int(when[0]) + SECOND) if a.raised}
+                raised |= {a.cell for a in engine.intake.ingest(_messages(visits), int(when[0]) + SECOND) if a.raised}
     return len(raised)

@@ -63,8 +63,8 @@ def _archive(root: Path) -> tuple[list[Batch], Path]:
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
     with closing(Engine(ServiceConfig(), root)) as engine:
         for first in range(0, len(batches), BATCHES):
-            engine.ingest(_messages(batches[first : first + BATCHES]), time.time_ns())
-            engine.flush()
+            engine.intake.ingest(_messages(batches[first : first + BATCHES]), time.time_ns())
+            engine.settlement.flush()
     return batches, segments.paths(root, Kind.OBSERVATION)[-1]
 
 
@@ -106,8 +106,8 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
     """Rows that are missing or doubled once a service has been sent everything again, and acknowledged it."""
     with closing(Engine(ServiceConfig(), root)) as engine:
-        engine.ingest(_messages(batches), time.time_ns())
-        ((_, ack),) = engine.flush()
+        engine.intake.ingest(_messages(batches), time.time_ns())
+        ((_, ack),) = engine.settlement.flush()
     (stream,) = wire.decode_ack(ack)[1]
     assert stream.durable == ((1, len(batches)),)
     rows = [(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)]

@@ -239,4 +239,4 @@ def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path)
 
                 until(acknowledged)
             run.end()
-    assert run.service.engine.fusion.live.visits[0] == 1
+    assert run.service.engine.state.fusion.live.visits[0] == 1

@@ -37,8 +37,8 @@ def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
         now = time.time_ns()
         for name, age in (("sim-001", 1), ("sim-002", 600), ("sim-003", -60), ("sim-001", 300)):
             sent = batch(name, 1 + (age == 300), now - age * SECOND, [0.5])
-            engine.ingest([Message(sent.kind, key(name), wire.encode(sent), wire.ENCODING[sent.kind])], now)
-        engine.flush()
+            engine.intake.ingest([Message(sent.kind, key(name), wire.encode(sent), wire.ENCODING[sent.kind])], now)
+        engine.settlement.flush()
         yield engine
 
 
@@ -96,7 +96,7 @@ def turns(made: Service) -> tuple[int, int]:
         patch.setattr(service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
         patch.setattr(service, "IDLE_S", 0.0)
         patch.setattr(made._rounds, "_clock", lambda: clock[0])
-        for owner, name in ((made.engine, "begin_flush"), (made.engine.map, "take_dirty")):
+        for owner, name in ((made.engine, "begin_flush"), (made.engine.state.map, "take_dirty")):
             patch.setattr(owner, name, counted(name))
         for _ in range(10):
             clock[0] += 0.3
@@ -113,7 +113,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "lateness_s": (1000.0, of_engine(refused)),
     "clock_ahead_s": (120.0, of_engine(refused)),
     "oldest_s": (400.0, of_engine(refused)),
-    "public_vehicles": (9, of_engine(lambda engine: len(engine.tiles(time.time_ns())))),
+    "public_vehicles": (9, of_engine(lambda engine: len(engine.queries.changed_tiles(time.time_ns())))),
     "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
     "compact_s": (10.0, of_jobs),
     "checkpoint_s": (10.0, of_jobs),

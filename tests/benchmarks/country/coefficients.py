@@ -70,17 +70,17 @@ def main(kind: str) -> None:
     sent = _stream(kind)
     with tempfile.TemporaryDirectory() as folder, closing(Engine(ServiceConfig(), Path(folder))) as engine:
         warm = messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
-        engine.ingest(warm, time.time_ns())
-        engine.flush()
+        engine.intake.ingest(warm, time.time_ns())
+        engine.settlement.flush()
         before = _resident()
         for at in range(0, len(sent), TURN):
-            engine.ingest(sent[at : at + TURN], time.time_ns())
+            engine.intake.ingest(sent[at : at + TURN], time.time_ns())
             if at % (16 * TURN) == 0:
-                engine.flush()
-        engine.flush()
+                engine.settlement.flush()
+        engine.settlement.flush()
         assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
-        state = engine.fusion.store.state
-        print(_resident() - before, engine.fusion.size, state.pairs.nbytes / state.used[PAIRS])
+        state = engine.state.fusion.store.state
+        print(_resident() - before, engine.state.fusion.size, state.pairs.nbytes / state.used[PAIRS])
 
 
 if __name__ == "__main__":

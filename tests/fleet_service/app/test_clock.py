@@ -113,7 +113,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
             clock = system.clock(engine.seen)
             for step in range(2):
                 ingest_messages(engine, clock, [message(1 + 2 * start + step, true)])
-                engine.flush()
+                engine.settlement.flush()
                 true += SECOND
                 system.passes(SECOND, jump=jump * (start == step == 0))
             assert engine.counts[Kind.OBSERVATION] == 2
@@ -123,10 +123,10 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
 def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([message(1, now + DAY)], now)
-        engine.ingest([message(2, now)], now)
+        engine.intake.ingest([message(1, now + DAY)], now)
+        engine.intake.ingest([message(2, now)], now)
         assert (engine.counts["refused.time"], engine.counts[Kind.OBSERVATION], engine.counts["late"]) == (1, 1, 0)
-        (_, ack), *_ = engine.flush()
+        (_, ack), *_ = engine.settlement.flush()
         (stream,) = wire.decode_ack(ack)[1]
         assert stream.durable == ((2, 2),)
         assert [(seq, row) for seq, row, _ in stream.rejected] == [(1, 0)]
@@ -135,10 +135,10 @@ def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: 
 def test_an_ack_says_what_came_late_once_and_what_time_it_is(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([message(1, now)], now)
-        engine.ingest([message(2, now - HOUR // 6), message(3, now - SECOND)], now)
-        (stream,) = wire.decode_ack(engine.flush()[0][1])[1]
+        engine.intake.ingest([message(1, now)], now)
+        engine.intake.ingest([message(2, now - HOUR // 6), message(3, now - SECOND)], now)
+        (stream,) = wire.decode_ack(engine.settlement.flush()[0][1])[1]
         assert (stream.durable, stream.late, stream.time) == (((1, 3),), ((2, 2),), now)
-        engine.ingest([message(2, now - HOUR // 6)], now + SECOND)
-        (stream,) = wire.decode_ack(engine.flush()[0][1])[1]
+        engine.intake.ingest([message(2, now - HOUR // 6)], now + SECOND)
+        (stream,) = wire.decode_ack(engine.settlement.flush()[0][1])[1]
         assert (stream.durable, stream.late, stream.time) == (((2, 2),), (), now + SECOND)

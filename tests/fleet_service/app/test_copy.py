@@ -47,7 +47,7 @@ def reports(mu: float, first: int, last: int) -> list[Batch]:
 
 
 def take(engine: Engine, sent: list[Batch]) -> None:
-    engine.ingest(
+    engine.intake.ingest(
         [Message(s.kind, key(s.vehicle), wire.encode(s), wire.ENCODING[s.kind]) for s in sent], time.time_ns()
     )
 
@@ -65,14 +65,14 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
     first, second = reports(0.15, 1, 4), reports(0.15, 5, 9)
     with closing(Engine(config, root)) as engine:
         take(engine, first)
-        assert len(engine.flush()) == VEHICLES
+        assert len(engine.settlement.flush()) == VEHICLES
         if with_checkpoint:
             checkpoints.save(root, engine._image())
             assert engine.copy is not None
             engine.copy.sync()
         take(engine, second)
-        engine.flush()
-        assert engine.alerts > 0
+        engine.settlement.flush()
+        assert engine.alerts.count > 0
         rows = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
     without = ServiceConfig()
     with closing(Engine(without, root)) as engine:
@@ -81,13 +81,13 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert held(new).keys() == held(root).keys()
         missing = rows - sum(table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"]))
         assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
-        assert engine.alerts > 0
+        assert engine.alerts.count > 0
         found = known(engine)
         assert found.keys() == expected.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         take(engine, first + second)
         assert engine.counts["duplicates"] == len(first + second)
-        assert len(engine.flush()) == VEHICLES  # they are acknowledged again, and nothing is written
+        assert len(engine.settlement.flush()) == VEHICLES  # they are acknowledged again, and nothing is written
         assert len(segments.paths(new, Kind.OBSERVATION)) == len(segments.paths(root, Kind.OBSERVATION))
 
 
@@ -95,14 +95,16 @@ def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(bucket:
     root, config, sent = tmp_path / "archive", settings(bucket), reports(0.15, 1, 4)
     with closing(Engine(config, root)) as engine:
         take(engine, sent)
-        engine.flush()
+        engine.settlement.flush()
     file = tmp_path / "service.json"
     file.write_text(json.dumps({"archive": {"path": str(root), **bucket.settings}}))
     assert main(["forget", "--archive", str(root), "--period", MONTH, "--yes", "--config", str(file)]) == 0
     with closing(Engine(config, tmp_path / "new")) as engine:
         take(engine, sent)
         assert engine.counts["refused.erased"] == len(sent)
-        assert engine.fusion.live.visits[: engine.fusion.size].sum() == 3 * len(sent), "the rows stay, nobody's"
+        assert engine.state.fusion.live.visits[: engine.state.fusion.size].sum() == 3 * len(sent), (
+            "the rows stay, nobody's"
+        )
 
 
 def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(bucket: BucketServer, tmp_path: Path) -> None:
@@ -110,16 +112,20 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(bucket: B
     with closing(Engine(settings(bucket), tmp_path / "archive")) as engine:
         bucket.stop()
         take(engine, sent)
-        assert engine.flush() == []
-        assert (engine.failing, engine.counts["copy_failures"], engine.counts["segment_failures"]) == (True, 1, 0)
+        assert engine.settlement.flush() == []
+        assert (engine.settlement.failing, engine.counts["copy_failures"], engine.counts["segment_failures"]) == (
+            True,
+            1,
+            0,
+        )
         take(engine, sent)  # what comes again is known, and not acknowledged for that
-        assert engine.flush() == []
-        assert engine.fusion.size > 0  # the map goes on
+        assert engine.settlement.flush() == []
+        assert engine.state.fusion.size > 0  # the map goes on
         bucket.start()
         acks: list[tuple[str, bytes]] = []
 
         def acknowledged() -> bool:
-            acks.extend(engine.flush())
+            acks.extend(engine.settlement.flush())
             return bool(acks)
 
         until(acknowledged)

@@ -111,15 +111,17 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     assert checkpoints.newest(root), "what the service began from anew"
     drop_checkpoints(root)
     with closing(Engine(ServiceConfig(), root)) as engine:
-        assert engine.fusion.live.visits[: engine.fusion.size].tolist() == list(at_last.values()), "as the log tells it"
+        assert engine.state.fusion.live.visits[: engine.state.fusion.size].tolist() == list(at_last.values()), (
+            "as the log tells it"
+        )
         assert sum(at_last.values()) > 2 * 3
 
 
 def filled(root: Path, *names: str) -> Engine:
     engine = Engine(ServiceConfig(), root)
     messages = [Message(Kind.OBSERVATION, key(one), wire.encode(sent_by(one, 1)), "") for one in names]
-    engine.ingest(messages, time.time_ns())
-    engine.flush()
+    engine.intake.ingest(messages, time.time_ns())
+    engine.settlement.flush()
     return engine
 
 
@@ -128,24 +130,24 @@ def answered(engine: Engine, root: Path) -> None:
     thread = threading.Thread(target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event()))
     thread.start()
     while thread.is_alive():
-        engine.flush()
+        engine.settlement.flush()
         thread.join(0.01)
 
 
 def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
     with closing(filled(tmp_path, *OTHERS[1:])) as engine:
         sent = sent_by("sim-001", 1)
-        engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
-        engine.flush()
+        engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
+        engine.settlement.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
         question = erasure_requests.write_request(tmp_path, Erasure(MONTH))
         answered(engine, tmp_path)
         assert erasure_requests.answer_to(question) == {"rows": 0, "files": []}
-        assert engine.fusion.size
-        assert not any(stream.vehicle for stream in engine._streams)
+        assert engine.state.fusion.size
+        assert not any(stream.vehicle for stream in engine.state.streams)
         assert Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns()) != before
         again = wire.encode(sent)
-        engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), again, "")], time.time_ns())
+        engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-001"), again, "")], time.time_ns())
         assert engine.counts["refused.erased"] == 1, "nobody could tell that it was there before"
 
 
@@ -174,6 +176,6 @@ def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Pa
         told = erasure_requests.answer_to(question)
         assert told is not None
         assert told["rows"] == 2
-        slots = again.fusion.slots_of(np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0]))
+        slots = again.state.fusion.slots_of(np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0]))
         assert slots.tolist() == [-1]
     assert main(["forget", "--archive", str(tmp_path), "--vehicle", GONE, "--period", MONTH]) == 0

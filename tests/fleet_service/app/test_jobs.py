@@ -46,7 +46,7 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
         until(lambda: any(line.startswith("compacted: ") for line in run.lines))
     assert len(set(identities(tmp_path, Kind.OBSERVATION))) == len(identities(tmp_path, Kind.OBSERVATION)) == 30
     with running(router, tmp_path) as again:
-        assert again.service.engine.fusion.live.visits[0] == 30
+        assert again.service.engine.state.fusion.live.visits[0] == 30
         assert main(["compact", "--archive", str(tmp_path)]) == 0  # beside it
 
 
@@ -144,10 +144,10 @@ def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFix
 def test_failing_compaction_is_reported_and_a_running_one_is_stopped(tmp_path: Path) -> None:
     engine = Engine(ServiceConfig(), tmp_path)
     with closing(engine):
-        engine.ingest(
+        engine.intake.ingest(
             [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
         )
-        engine.flush()
+        engine.settlement.flush()
         compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path, SteadyClock().moment)
         with hold_compaction_lock(tmp_path), pytest.raises(InputError, match="being compacted"):
             compaction.work(threading.Event())

@@ -81,7 +81,7 @@ def test_each_trouble_is_told(tmp_path: Path) -> None:
     engine = Engine(config, tmp_path)
     well = Pulse(turn_age_s=0.1, queued=3, routers=1, clock_lag_s=0.0)
     assert metrics.health_problems(engine, well, config) == []
-    engine.failing = True
+    engine.settlement.failing = True
     ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0, answer_s=60.0)
     assert metrics.health_problems(engine, ill, config) == [
         "no router is connected",

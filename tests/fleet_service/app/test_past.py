@@ -39,8 +39,8 @@ def root(tmp_path: Path) -> Path:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in range(1, 5):
             sent = [batch(f"car-{k:03}", seq, now, [0.8] * 20) for k in range(5)]
-            engine.ingest([Message(Kind.OBSERVATION, key(b.vehicle), wire.encode(b), "") for b in sent], now)
-            engine.flush()
+            engine.intake.ingest([Message(Kind.OBSERVATION, key(b.vehicle), wire.encode(b), "") for b in sent], now)
+            engine.settlement.flush()
     compact(tmp_path)
     return tmp_path
 

@@ -36,12 +36,12 @@ def drive(root):
         taken = {name: column[part] for name, column in columns.items()}
         batch = wire.Batch(wire.Kind.OBSERVATION, "sim-001", seq, int(home[0]), seq, 1, taken, "test")
         key, encoding = keys.observation_key(int(home[0]), "sim-001"), wire.ENCODING[batch.kind]
-        engine.ingest([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
-    engine.flush()
-    engine.tiles(time.time_ns())
-    engine.fade_alerts(time.time_ns())
-    list(engine.answer(MapQuery(), lambda tile: True, time.time_ns()))
-    assert engine.fusion.size > 2100, engine.counts
+        engine.intake.ingest([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
+    engine.settlement.flush()
+    engine.queries.changed_tiles(time.time_ns())
+    engine.alerts.expire(time.time_ns())
+    list(engine.queries.answer(MapQuery(), lambda tile: True, time.time_ns()))
+    assert engine.state.fusion.size > 2100, engine.counts
     engine.close()
 
 warm_up()

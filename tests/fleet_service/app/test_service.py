@@ -141,7 +141,7 @@ def test_repeated_batch_is_acknowledged_again_and_not_counted_again(fleet: Fleet
     fleet.publish(sent)
     until(lambda: fleet.acks > before)
     assert service.service.engine.counts["duplicates"] == 1
-    assert service.service.engine.fusion.live.visits[0] == 1
+    assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
 def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(fleet: Fleet, service: Running) -> None:
@@ -149,7 +149,7 @@ def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(fleet: Fleet, 
     until(lambda: fleet.rejected)
     assert fleet.rejected == [("sim-001", 1, 1, "speed: lies outside [0, 100]; correct it at the source")]
     assert service.service.engine.counts["refused.speed"] == 1
-    assert service.service.engine.fusion.size == 0
+    assert service.service.engine.state.fusion.size == 0
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
     fleet.session.put(name, payload, encoding=encoding)
     until(lambda: service.service.engine.counts[f"refused.{rule}"] == 1)
     fleet.settle(batch("sim-001", 1, now(), [0.8]))
-    assert service.service.engine.fusion.live.visits[0] == 1
+    assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
 def seconds() -> Iterator[int]:
@@ -218,7 +218,7 @@ def test_one_liar_raises_no_alert_however_often_it_reports(fleet: Fleet, service
     fleet.settle(batch("sim-001", 1, now(), [0.3], told=False, used=0.1))
     for seq in range(1, 30):
         fleet.settle(batch("liar-01", seq, now(), [0.15, 0.15, 0.15]))
-    assert service.service.engine.alerts == 0
+    assert service.service.engine.alerts.count == 0
     assert fleet.alerts.empty()
 
 
@@ -232,9 +232,9 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
     with running(router, tmp_path) as first:
         fleet = Fleet(session).meet()
         fleet.settle(*sent)
-        before = first.service.engine.fusion
+        before = first.service.engine.state.fusion
     with running(router, tmp_path) as second:
-        after, counts = second.service.engine.fusion, second.service.engine.counts
+        after, counts = second.service.engine.state.fusion, second.service.engine.counts
         at = int(before.live.time.max())
         slots = np.arange(before.size)
         there = after.slots_of(before.cell[slots], before.sector[slots])
@@ -269,7 +269,7 @@ def test_a_person_can_publish_with_one_line_of_json(fleet: Fleet, service: Runni
     }  # fmt: skip
     fleet.session.put(key("by-hand"), json.dumps(text), encoding=wire.JSON)
     until(lambda: 1 in fleet.durable["by-hand"])
-    assert service.service.engine.fusion.live.visits[0] == 1
+    assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
 def test_three_formats_say_the_same(fleet: Fleet) -> None:
@@ -369,7 +369,7 @@ def test_two_services_share_the_world_and_a_query_gets_both(
         sent = dataclasses.replace(batch("sim-002", 1, now(), [0.8], **far), region=region)
         session.put(keys.observation_key(region, "sim-002"), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
         until(lambda: 1 in fleet.durable["sim-002"])
-        assert a.service.engine.fusion.size == b.service.engine.fusion.size == 1
+        assert a.service.engine.state.fusion.size == b.service.engine.state.fusion.size == 1
         assert {name for name, _, _ in ask(session)} == {
             keys.map_key(TILE),
             keys.map_key(int(grid.tile_of(far["cell"][0]))),

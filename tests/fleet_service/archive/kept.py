@@ -93,7 +93,7 @@ def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
     thread.start()
 
     def settled() -> bool:
-        engine.flush()
+        engine.settlement.flush()
         return bool(found)
 
     try:
@@ -106,7 +106,7 @@ def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
 
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
     """The map at a time: every cell's line as the contract has it, and its belief; by cell and sector."""
-    fusion = engine.fusion
+    fusion = engine.state.fusion
     slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
     lines = cell_table(fusion, slots, at).select(COLUMNS).to_pylist()
     return {"at": at, "cells": lines, "beliefs": np.asarray(fusion.beliefs(slots, at), np.float64).tolist()}
@@ -119,18 +119,22 @@ def make(root: Path) -> dict[str, Any]:
             if turn == 2:
                 report = weather.encode(weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0))
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))
-                engine.weather.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
-                engine.update_weather(now_of(2))
-            engine.ingest(list(messages(turn)), now_of(turn))
+                engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
+                engine.intake.update_weather(now_of(2))
+            engine.intake.ingest(list(messages(turn)), now_of(turn))
             if turn % 2:
-                engine.flush()
+                engine.settlement.flush()
             if turn == ROUNDS // 2 - 1:
                 compact(root)
                 rollup.complete(root)
-                snapshots.write(root, engine.whole_map(now_of(turn)), now_of(turn))
+                snapshots.write(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
                 checkpoints.save(root, taken(engine))
         rows = {str(kind): engine.counts[kind] for kind in Kind}
-        return map_of(engine, now_of(ROUNDS)) | {"alerts": engine.alerts, "late": engine.counts["late"], "rows": rows}
+        return map_of(engine, now_of(ROUNDS)) | {
+            "alerts": engine.alerts.count,
+            "late": engine.counts["late"],
+            "rows": rows,
+        }
 
 
 def main() -> None:

@@ -62,9 +62,9 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
     monkeypatch.setattr(os, "fsync", seen_fsync)
     monkeypatch.setattr(Path, "rename", seen_rename)
     for seq in (1, 2):
-        engine.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
         order.clear()
-        acks = engine.flush()
+        acks = engine.settlement.flush()
         order.append("ack")
         who = ["file", "folder"] if seq == 1 else []  # which vehicle of the map this is, when it is new
         assert order == [*who, "file", "rename", "folder", "ack"]
@@ -73,13 +73,13 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
 
 def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(engine: Engine, tmp_path: Path) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")
-    engine.ingest([sent("sim-001", 1)], time.time_ns())
-    assert engine.flush() == []
-    engine.ingest([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
-    assert engine.flush() == []
+    engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+    assert engine.settlement.flush() == []
+    engine.intake.ingest([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
+    assert engine.settlement.flush() == []
     assert engine.counts["segment_failures"] == 2
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
-    assert settled(engine.flush()) == {"sim-001": [(1, 2)]}
+    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION)) == 4
 
 
@@ -92,15 +92,15 @@ def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_pat
 
 def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:
     for seq in (1, 2, 3):
-        engine.ingest([sent("sim-001", seq)], time.time_ns())
-        engine.flush()
+        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.settlement.flush()
     engine.close()
     damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
     damaged.write_bytes(damaged.read_bytes()[:-20])
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.fusion.live.visits[0] == 4
+        assert again.state.fusion.live.visits[0] == 4
         assert damaged.with_name(damaged.name + ".bad").exists()
-        again.ingest([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
+        again.intake.ingest([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
         assert again.counts[Kind.OBSERVATION] == 2
         assert again.counts["duplicates"] == 2
 
@@ -109,8 +109,8 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, 
 def test_a_changed_byte_is_noticed_wherever_it_is(
     engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, place: float
 ) -> None:
-    engine.ingest([sent("sim-001", 1)], time.time_ns())
-    engine.flush()
+    engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+    engine.settlement.flush()
     engine.close()
     (segment,) = segments.paths(tmp_path, Kind.OBSERVATION)
     content = bytearray(segment.read_bytes())
@@ -122,7 +122,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
         assert ("is damaged and set aside" in caplog.text) == (not held)
-        again.ingest([sent("sim-001", 1)], time.time_ns())
+        again.intake.ingest([sent("sim-001", 1)], time.time_ns())
         assert again.counts["duplicates"] == bool(held)
 
 
@@ -134,11 +134,11 @@ def test_unsynced_names_are_synced_before_any_acknowledgement(
 
     with monkeypatch.context() as patch:
         patch.setattr(segments, "sync_directory", broken)
-        engine.ingest([sent("sim-001", 1)], time.time_ns())
-        assert engine.flush() == []
+        engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+        assert engine.settlement.flush() == []
         assert engine.counts["segment_failures"] == 1
-    engine.ingest([sent("sim-001", 2)], time.time_ns())
-    assert settled(engine.flush()) == {"sim-001": [(1, 2)]}
+    engine.intake.ingest([sent("sim-001", 2)], time.time_ns())
+    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert sum(table.num_rows for table in reading.read(tmp_path, Kind.OBSERVATION)) == 4
 
 
@@ -153,15 +153,15 @@ def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_pat
 def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
     for seq in range(1, 4):
         engine = Engine(ServiceConfig(), tmp_path)
-        engine.ingest([sent("sim-001", seq)], time.time_ns())
-        engine.flush()
+        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.settlement.flush()
         engine.close()
     assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
 
 
 def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
-    engine.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
-    engine.flush()
+    engine.intake.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.settlement.flush()
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     rows = segments.rows_of(table)
     assert rows["with_likelihood"].tolist() == [True, True, False, False]
@@ -173,8 +173,8 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
 
 
 def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
-    engine.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
-    engine.flush()
+    engine.intake.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.settlement.flush()
     pattern = str(tmp_path / "inbox" / "*.parquet")
     with duckdb.connect() as db:
         query = "select count(*), count(distinct vehicle), count(log_likelihood), min(mu) from read_parquet(?)"
@@ -212,9 +212,9 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
 def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
-    engine.ingest([sent("sim-001", 1)], now)
-    engine.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
-    assert settled(engine.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
+    engine.intake.ingest([sent("sim-001", 1)], now)
+    engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
+    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
     assert engine.counts["late"] == 1
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
@@ -222,4 +222,4 @@ def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_
     ]  # fmt: skip
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        np.testing.assert_array_equal(again.fusion.live.visits[: again.fusion.size], [3])
+        np.testing.assert_array_equal(again.state.fusion.live.visits[: again.state.fusion.size], [3])

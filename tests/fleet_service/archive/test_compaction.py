@@ -213,16 +213,18 @@ def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: P
     messages = [sent(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 20, 4):
-            engine.ingest(messages[k : k + 4], time_ns())
-            engine.flush()
+            engine.intake.ingest(messages[k : k + 4], time_ns())
+            engine.settlement.flush()
             if k == 8:
                 compact(tmp_path)  # while the service runs
-        at = int(engine.fusion.live.time.max())
-        before = engine.fusion.beliefs(np.arange(engine.fusion.size), at)
+        at = int(engine.state.fusion.live.time.max())
+        before = engine.state.fusion.beliefs(np.arange(engine.state.fusion.size), at)
     for _ in range(2):
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
-            np.testing.assert_allclose(again.fusion.beliefs(np.arange(again.fusion.size), at), before, atol=1e-6)
-            again.ingest(messages, time_ns())
+            np.testing.assert_allclose(
+                again.state.fusion.beliefs(np.arange(again.state.fusion.size), at), before, atol=1e-6
+            )
+            again.intake.ingest(messages, time_ns())
             assert again.counts["duplicates"] == 20
-            assert settled(again.flush()).keys() == {f"sim-{k:03}" for k in range(5)}
+            assert settled(again.settlement.flush()).keys() == {f"sim-{k:03}" for k in range(5)}
         compact(tmp_path)

@@ -90,9 +90,9 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
         for k in range(8):  # six in one cell; and one, and another, alone
             latitude = LATITUDE if k < 6 else LATITUDE - 0.001 * k
             one = batch(f"car-{k:03}", 1, now, [0.8], latitude=[latitude], cell=[grid.cell_of(latitude, LONGITUDE)])
-            engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
-        engine.flush()
-        snapshot = snapshots.write(root, engine.whole_map(now), now)
+            engine.intake.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+        engine.settlement.flush()
+        snapshot = snapshots.write(root, engine.queries.whole_map(now), now)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
     (root / "inbox" / f"shard-0-0000000001-00000001.parquet{BAD}").write_bytes(b"who knows")
     words = ["forget", "--archive", str(root), "--period", month, "--put-to", there.as_uri(), "--yes", "--vehicle"]
@@ -119,8 +119,8 @@ ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 
 def told(engine: Engine, sent: Batch, now: int) -> list[str]:
     """Return the acknowledgement of a batch, once a segment is written."""
-    engine.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
-    streams = [stream for _, data in engine.flush() for stream in wire.decode_ack(data)[1]]
+    engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
+    streams = [stream for _, data in engine.settlement.flush() for stream in wire.decode_ack(data)[1]]
     assert all(stream.durable in ((), ((sent.seq, sent.seq),)) for stream in streams)
     return [*("durable" for one in streams if one.durable), *(why for one in streams for *_, why in one.rejected)]
 
@@ -144,7 +144,7 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
             assert told(engine, later, after + SECOND) == ["durable"]
             assert (engine.counts["refused.erased"], engine.counts["duplicates"]) == (2, 1)
             assert rows_kept(tmp_path) == 2
-            assert engine.fusion.live.visits[: engine.fusion.size].sum() == 2
+            assert engine.state.fusion.live.visits[: engine.state.fusion.size].sum() == 2
             keep(engine, tmp_path)
     assert not list((tmp_path / "keys").glob("2026-01.key"))
 

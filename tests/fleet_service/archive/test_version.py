@@ -77,8 +77,8 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
     with closing(Engine(ServiceConfig(), old)) as engine:
         assert engine.counts["checkpoints_refused"] == (begin == "checkpoint"), "it has no digests: the log is replayed"
         same(map_of(engine, MADE["at"]), MADE)
-        assert engine.alerts == MADE["alerts"] > 0
-        engine.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
+        assert engine.alerts.count == MADE["alerts"] > 0
+        engine.intake.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
         assert engine.counts["duplicates"] == 8 * 2 * ROUNDS, "it knows every batch again"
     assert not list(old.rglob("*.bad"))
 
@@ -86,8 +86,8 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
 def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         for turn in (ROUNDS, ROUNDS + 1):
-            engine.ingest(list(messages(turn)), now_of(turn))
-            engine.flush()
+            engine.intake.ingest(list(messages(turn)), now_of(turn))
+            engine.settlement.flush()
     drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
         before = map_of(engine, now_of(ROUNDS + 2))
@@ -145,7 +145,7 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
     assert rows["abs_active"].dtype == np.int8
     assert set(rows["estimator"]) == {""}
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert engine.fusion.size
+        assert engine.state.fusion.size
         assert engine.counts["files_set_aside"] == 0
 
 
@@ -288,7 +288,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
         assert extract.observations(old, EVERYTHING).num_rows < whole
         assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
-        assert list(engine.answer(past, lambda _: True, now_of(ROUNDS)))
+        assert list(engine.queries.answer(past, lambda _: True, now_of(ROUNDS)))
         heard = caplog.text + capfd.readouterr().err  # the past is read by a process of its own
         assert all(f"{path} is damaged and passed over" in heard for path in harmed)
         assert all(path.exists() for path in harmed)

@@ -50,15 +50,15 @@ def test_one_car_is_one_witness_over_midnight_live_and_after_replay(tmp_path: Pa
     before, after = months(time.time_ns())
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq, at in enumerate((before, after), 1):
-            engine.ingest([message(batch("car-001", seq, at, [0.15]))], after)
-        engine.flush()
-        assert engine.alerts == 0
-        assert engine.fusion.live.vehicles[0] == 1
+            engine.intake.ingest([message(batch("car-001", seq, at, [0.15]))], after)
+        engine.settlement.flush()
+        assert engine.alerts.count == 0
+        assert engine.state.fusion.live.vehicles[0] == 1
     assert len(set(read(tmp_path / "keys"))) == 2, "two pseudonyms on disk"
     drop_checkpoints(tmp_path)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.fusion.live.vehicles[0] == 1
-        assert again.alerts == 0
+        assert again.state.fusion.live.vehicles[0] == 1
+        assert again.alerts.count == 0
 
 
 def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) -> None:
@@ -66,9 +66,9 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
     sent = [batch("car-001", seq, at, [0.8]) for seq, at in enumerate((before, after), 1)]
     for again in (False, True):
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-            engine.ingest([message(one) for one in sent], after)
+            engine.intake.ingest([message(one) for one in sent], after)
             assert engine.counts["duplicates"] == (2 if again else 0), "a restart knows both"
-            ((vehicle, ack),) = engine.flush()
+            ((vehicle, ack),) = engine.settlement.flush()
             streams = wire.decode_ack(ack)[1]
             assert {stream.boot for stream in streams} == {sent[0].boot}, "its sender hears its own name for it"
             assert sorted(seq for stream in streams for run in stream.durable for seq in run) == [1, 2]
@@ -85,10 +85,10 @@ def test_batches_with_unhashed_starts_are_recognised_again(tmp_path: Path, monke
     with monkeypatch.context() as before:
         before.setattr(Pseudonyms, "boot", lambda self, vehicle, boot, time: boot)
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-            engine.ingest(sent[:2], now)
-            engine.flush()
+            engine.intake.ingest(sent[:2], now)
+            engine.settlement.flush()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest(sent, now)
+        engine.intake.ingest(sent, now)
         assert (engine.counts["duplicates"], engine.counts[Kind.OBSERVATION]) == (2, 1)
 
 
@@ -99,10 +99,10 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
         old = now - 29 * 86_400 * SECOND
         leave = [old, now - SECOND] if seq % 2 else [now - 2 * SECOND, now - SECOND]
         one = batch("car-001", seq, now, [0.15, 0.15], leave_time=leave, enter_time=np.array(leave) - SECOND)
-        engine.ingest([message(one)], now)
-    assert engine.alerts == 0
+        engine.intake.ingest([message(one)], now)
+    assert engine.alerts.count == 0
     assert engine.counts["refused.time"] == 20, "a batch spans no month"
-    assert engine.fusion.live.vehicles[: engine.fusion.size].max() == 1
+    assert engine.state.fusion.live.vehicles[: engine.state.fusion.size].max() == 1
 
 
 def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(3):
-            engine.ingest([message(batch(f"car-{k:03}", 1, now, [0.8, 0.8]))], now)
-        engine.flush()
+            engine.intake.ingest([message(batch(f"car-{k:03}", 1, now, [0.8, 0.8]))], now)
+        engine.settlement.flush()
         assert engine.counts["witnesses_damaged"] == 0
     path = next(tmp_path.glob("keys/*.witnesses"))
     whole, data = read(path.parent), bytearray(path.read_bytes())
@@ -133,7 +133,7 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["witnesses_damaged"] == 2
         assert len(read(path.parent)) == 2
-        engine.ingest([message(batch("car-001", 2, now, [0.8, 0.8]))], now)
+        engine.intake.ingest([message(batch("car-001", 2, now, [0.8, 0.8]))], now)
         assert read(path.parent) == whole
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["witnesses_damaged"] == 0
@@ -148,9 +148,9 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(tmp_path: Path, m
 
     monkeypatch.setattr("os.fsync", noted)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([message(batch("car-000", 1, now, [0.8, 0.8]))], now)
+        engine.intake.ingest([message(batch("car-000", 1, now, [0.8, 0.8]))], now)
         assert ".witnesses" not in synced
-        assert engine.flush()
+        assert engine.settlement.flush()
         assert ".witnesses" in synced
 
 
@@ -169,25 +169,25 @@ def everywhere(seq: int, count: int, now: int) -> Batch:
 
 def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
     now, sent, at_once = time.time_ns(), 0, 3_000
-    engine._places = NewCells(at_once)
+    engine.intake._places = NewCells(at_once)
     for seq in range(200):
         at = now - (200 - seq) * 200 * SECOND
         one = everywhere(seq, 50, at)
         if len(np.unique(grid.region_of(one.columns["cell"]))) == 1:
-            engine.ingest([message(one)], now)
+            engine.intake.ingest([message(one)], now)
             sent += 50
     assert sent > 2 * at_once
     assert engine.counts[Kind.OBSERVATION] == sent, "nothing is refused"
     assert engine.counts["implausible_moves"] == 0
     assert engine.counts["too_many_places"] > sent - 2 * at_once
-    assert engine.fusion.size < 3 * at_once
+    assert engine.state.fusion.size < 3 * at_once
 
 
 def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
     now = time.time_ns()
     for boot in range(1, 1000):
         one = replace(batch("car-001", 1, now, [0.8]), boot=boot)
-        engine.ingest([message(one)], now)
+        engine.intake.ingest([message(one)], now)
     assert engine.counts[Kind.OBSERVATION] == STREAMS_AT_ONCE
     assert engine.counts["too_many_streams"] == 999 - STREAMS_AT_ONCE
 
@@ -213,8 +213,8 @@ def test_a_budget_fills_again() -> None:
 def test_a_forgotten_month_leaves_nothing_that_names_a_vehicle(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([message(batch("car-001", 1, now, [0.8]))], now)
-        engine.flush()
+        engine.intake.ingest([message(batch("car-001", 1, now, [0.8]))], now)
+        engine.settlement.flush()
     month = f"{datetime.fromtimestamp(now / SECOND, UTC) - timedelta(seconds=1):%Y-%m}"
     forget_period(tmp_path, month)
     assert not read(tmp_path / "keys")

@@ -62,8 +62,8 @@ def test_start_opens_each_waiting_segment_twice_whatever_their_number(
         for seq in range(1, segments + 1):
             sent = batch("car-001", seq, NOW, [0.8])
             key = keys.observation_key(sent.region, sent.vehicle)
-            engine.ingest([Message(sent.kind, key, wire.encode(sent), wire.ENCODING[sent.kind])], NOW)
-            engine.flush()
+            engine.intake.ingest([Message(sent.kind, key, wire.encode(sent), wire.ENCODING[sent.kind])], NOW)
+            engine.settlement.flush()
     opened: Counter[str] = Counter()
     begin = pq.ParquetFile.__init__
 
@@ -73,19 +73,19 @@ def test_start_opens_each_waiting_segment_twice_whatever_their_number(
 
     monkeypatch.setattr(pq.ParquetFile, "__init__", counted)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.fusion.size == 1
+        assert again.state.fusion.size == 1
     assert len(opened) >= segments
     assert max(opened.values()) <= 2, "once for its rows, once for who sent them"
 
 
 def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        intake = engine._intake
+        intake = engine.intake.batches
 
         def known(seq: int, now: int) -> list[tuple[str, int, int, int]]:
             sent = batch("car-1", seq, now, [0.8])
-            engine.ingest([Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now)
-            engine.flush()
+            engine.intake.ingest([Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now)
+            engine.settlement.flush()
             return list(intake._known[Kind.OBSERVATION])
 
         (first,) = known(1, NOW)

@@ -93,12 +93,12 @@ def drive(engine: Engine, begin: int, seq: int) -> None:
     """Three vehicles, one visit each, at a time [ns]."""
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
-        engine.ingest([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
-    engine.flush()
+        engine.intake.ingest([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
+    engine.settlement.flush()
 
 
 def beliefs(engine: Engine, now: int) -> np.ndarray:
-    return engine.fusion.beliefs(np.arange(engine.fusion.size), now)
+    return engine.state.fusion.beliefs(np.arange(engine.state.fusion.size), now)
 
 
 def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> None:
@@ -111,9 +111,9 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
     told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
-    engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
-    engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
-    engine.update_weather(start + 1300 * SECOND)
+    engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+    engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
+    engine.intake.update_weather(start + 1300 * SECOND)
     drive(engine, start + 3000 * SECOND, 2)
     assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
     engine.close()
@@ -134,8 +134,8 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
             told = weather.encode(Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2)))
-            engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
-            engine.update_weather(start + 600 * k * SECOND)
+            engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+            engine.intake.update_weather(start + 600 * k * SECOND)
             drive(engine, start + 600 * k * SECOND, 1 + k)
             if k == 3:
                 checkpoints.save(root, taken(engine))

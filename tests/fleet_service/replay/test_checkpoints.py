@@ -50,7 +50,7 @@ def keep(engine: Engine, root: Path) -> Path:
     thread.start()
 
     def settled() -> bool:
-        engine.flush()
+        engine.settlement.flush()
         return bool(taken)
 
     try:
@@ -63,8 +63,10 @@ def keep(engine: Engine, root: Path) -> Path:
 
 
 def beliefs(engine: Engine, at: int) -> FloatArray:
-    slots = np.arange(engine.fusion.size)
-    return engine.fusion.beliefs(slots[np.lexsort((engine.fusion.sector[slots], engine.fusion.cell[slots]))], at)
+    slots = np.arange(engine.state.fusion.size)
+    return engine.state.fusion.beliefs(
+        slots[np.lexsort((engine.state.fusion.sector[slots], engine.state.fusion.cell[slots]))], at
+    )
 
 
 @pytest.fixture
@@ -86,21 +88,21 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
     sent = [icy(k % 6, 1 + k // 6, 0.2 if k % 5 else 0.8) for k in range(60)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 40, 4):
-            engine.ingest(sent[k : k + 4], time.time_ns())
-            engine.flush()
+            engine.intake.ingest(sent[k : k + 4], time.time_ns())
+            engine.settlement.flush()
         compact(tmp_path)
         path = keep(engine, tmp_path)
-        engine.ingest(sent[40:], time.time_ns())
-        engine.flush()
-        at, alerts = time.time_ns(), engine.alerts
+        engine.intake.ingest(sent[40:], time.time_ns())
+        engine.settlement.flush()
+        at, alerts = time.time_ns(), engine.alerts.count
         running = beliefs(engine, at)
     replayed.clear()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         from_checkpoint = beliefs(again, at)
         assert replayed == [20]
-        assert again.alerts == alerts > 0
+        assert again.alerts.count == alerts > 0
         assert again.counts["checkpoints_refused"] == 0
-        again.ingest(sent, time.time_ns())
+        again.intake.ingest(sent, time.time_ns())
         assert again.counts["duplicates"] == 60
     assert path.name
     drop_checkpoints(tmp_path)
@@ -112,10 +114,10 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
 
 def known(engine: Engine) -> dict[str, NDArray[Any]]:
     """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
-    fusion, rows = engine.fusion, engine.fusion.store.state.live
+    fusion, rows = engine.state.fusion, engine.state.fusion.store.state.live
     order = np.lexsort((fusion.sector, fusion.cell))
     columns = {name: rows.cells[name][order] for name in CELL.names or () if name not in ("window", "reporters")}
-    times = {"epoch": np.array([fusion.epoch]), "newest": np.array([engine.newest])}
+    times = {"epoch": np.array([fusion.epoch]), "newest": np.array([engine.state.streams.newest])}
     return {"belief": rows.belief[order], **columns, **times}
 
 
@@ -128,15 +130,15 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(tmp_path: Path
         for vehicle, at in (("sim-001", old), ("sim-002", now)):
             one = batch(vehicle, 1, at, [0.8])
             sent = Message(Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
-            engine.ingest([sent], at + SECOND)
-            engine.flush()
+            engine.intake.ingest([sent], at + SECOND)
+            engine.settlement.flush()
         keep(engine, tmp_path)
-        engine.ingest([icy(3, 1, 0.8)], now + SECOND)
-        engine.flush()
+        engine.intake.ingest([icy(3, 1, 0.8)], now + SECOND)
+        engine.settlement.flush()
         compact(tmp_path)
-        assert engine.fusion.live.visits[: engine.fusion.size].tolist() == [3]
+        assert engine.state.fusion.live.visits[: engine.state.fusion.size].tolist() == [3]
     with closing(Engine(config, tmp_path)) as again:
-        assert again.fusion.live.visits[: again.fusion.size].tolist() == [3]
+        assert again.state.fusion.live.visits[: again.state.fusion.size].tolist() == [3]
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
@@ -154,19 +156,19 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
     sent.sort(key=lambda pair: pair[0])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 120, 8):
-            engine.ingest([message(one) for _, one in sent[k : k + 8]], now + (k + 9) * SECOND)
-            engine.flush()
+            engine.intake.ingest([message(one) for _, one in sent[k : k + 8]], now + (k + 9) * SECOND)
+            engine.settlement.flush()
             if k == 56:
                 compact(tmp_path)
                 keep(engine, tmp_path)
         keep(engine, tmp_path)  # and nothing after it
         live = known(engine)
-        assert engine.fusion.waiting
+        assert engine.state.fusion.waiting
     for kept in (2, 1, 0):  # from the last checkpoint, from the one before, from the log alone
         assert len(checkpoints.newest(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             found = known(again)
-            assert (again.seen, again.counts["checkpoints_refused"]) == (again.newest, 0)
+            assert (again.seen, again.counts["checkpoints_refused"]) == (again.state.streams.newest, 0)
         assert [name for name in live if not np.array_equal(found[name], live[name])] == []
         if kept:
             shutil.rmtree(checkpoints.newest(tmp_path)[0])
@@ -174,20 +176,20 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
 
 def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
-        engine.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
+        engine.intake.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.fusion.live.visits[0] == 4
-        again.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
-        assert (again.counts["duplicates"], again.fusion.live.visits[0]) == (4, 8)
+        assert again.state.fusion.live.visits[0] == 4
+        again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
+        assert (again.counts["duplicates"], again.state.fusion.live.visits[0]) == (4, 8)
 
 
 @pytest.mark.parametrize("harm", ["truncate", "remove", "flip"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(tmp_path: Path, harm: str) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in (1, 2, 3):
-            engine.ingest([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
+            engine.intake.ingest([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
             keep(engine, tmp_path)
         at = time.time_ns()
         running = beliefs(engine, at)
@@ -225,39 +227,39 @@ def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Pat
     """The checkpoint's run was an hour ahead; then the clock is put right, and ice is found."""
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([icy(9, 1, 0.15)], ahead)
+        engine.intake.ingest([icy(9, 1, 0.15)], ahead)
         keep(engine, tmp_path)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in range(1, 9):
-            engine.ingest([icy(k, seq, 0.15) for k in range(6)], time.time_ns())
-            engine.flush()
-        keep_alerts, at = engine.alerts, time.time_ns()
-        running, visits = beliefs(engine, at), engine.fusion.live.visits[: engine.fusion.size].sum()
+            engine.intake.ingest([icy(k, seq, 0.15) for k in range(6)], time.time_ns())
+            engine.settlement.flush()
+        keep_alerts, at = engine.alerts.count, time.time_ns()
+        running, visits = beliefs(engine, at), engine.state.fusion.live.visits[: engine.state.fusion.size].sum()
         compact(tmp_path)
     assert keep_alerts > 0
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.counts["checkpoints_refused"] == 0
-        assert again.alerts == keep_alerts
-        assert again.fusion.live.visits[: again.fusion.size].sum() == visits
+        assert again.alerts.count == keep_alerts
+        assert again.state.fusion.live.visits[: again.state.fusion.size].sum() == visits
         np.testing.assert_allclose(beliefs(again, at), running, atol=1e-6)
 
 
 def test_compacted_file_across_the_checkpoint_is_not_replayed_twice(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
-        engine.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())
-        engine.flush()
+        engine.intake.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())
+        engine.settlement.flush()
     compact(tmp_path)  # both segments in one file
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.fusion.live.visits[0] == 8
-        again.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
+        assert again.state.fusion.live.visits[0] == 8
+        again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
         assert again.counts["duplicates"] == 8
 
 
 def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         path = keep(engine, tmp_path)
     for _ in range(checkpoints.TRIES):
         checkpoints.load(path)

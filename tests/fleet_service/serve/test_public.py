@@ -48,13 +48,13 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
     """One visit of each."""
     now = time.time_ns() if now is None else now
     sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "") for n in names]
-    engine.ingest(sent, now)
-    engine.flush()
+    engine.intake.ingest(sent, now)
+    engine.settlement.flush()
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
     """Cells of an answer."""
-    tiles = engine.answer(query.parse(parameters), lambda _: True, time.time_ns() if now is None else now)
+    tiles = engine.queries.answer(query.parse(parameters), lambda _: True, time.time_ns() if now is None else now)
     return [row for _, payload in tiles for row in pa.ipc.open_stream(payload).read_all().to_pylist()]
 
 
@@ -63,10 +63,10 @@ def test_a_cell_is_public_from_k_vehicles_on_in_answers_and_tiles(start: Start) 
     hear(engine, "sim-001", "sim-002")
     for parameters in ({}, {"min_vehicles": "1"}, {"basis": "borrowed"}):
         assert not rows(engine, None, **parameters)
-    assert not engine.tiles(time.time_ns())
+    assert not engine.queries.changed_tiles(time.time_ns())
     hear(engine, *MORE)
     assert [row["vehicles"] for row in rows(engine)] == [5]
-    assert len(engine.tiles(time.time_ns())) == 1
+    assert len(engine.queries.changed_tiles(time.time_ns())) == 1
     assert not rows(engine, min_vehicles="7")
 
 
@@ -118,14 +118,14 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     names = [f"sim-{k:03}" for k in range(6)]
     route = f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}"
     hear(engine, *names, now=day)
-    assert len(rows(engine, day)) == len(rows(engine, day, route=route)) == engine.whole_map(day).num_rows == 1
+    assert len(rows(engine, day)) == len(rows(engine, day, route=route)) == engine.queries.whole_map(day).num_rows == 1
     night = day + 18 * 3600 * SECOND
     hear(engine, "sim-007", now=night)
-    engine.tiles(day)
+    engine.queries.changed_tiles(day)
     assert not rows(engine, night)
     assert not rows(engine, night, route=route)
-    assert not engine.whole_map(night).num_rows
-    assert not engine.tiles(night)
+    assert not engine.queries.whole_map(night).num_rows
+    assert not engine.queries.changed_tiles(night)
     hear(engine, *MORE, now=night + SECOND)
     (row,) = rows(engine, night + 2 * SECOND)
     assert row["vehicles"] in (5, 10), "of twelve, less those that share a bit, rounded down"
@@ -137,7 +137,7 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
 def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(start: Start, tmp_path: Path) -> None:
     engine = start(3)
     hear(engine, *MORE)
-    engine.flush()
+    engine.settlement.flush()
     taken = taken_from(engine)
     checkpoints.save(tmp_path, taken)
     for _ in ("checkpoint", "log"):
@@ -153,7 +153,7 @@ def taken_from(engine: Engine) -> checkpoints.Taken:
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))
     thread.start()
     while thread.is_alive():
-        engine.flush()
+        engine.settlement.flush()
         thread.join(0.01)
     assert found[0] is not None
     return found[0]
@@ -185,10 +185,10 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
     old = now - 8 * 86_400 * SECOND
     where: dict[str, Any] = {"latitude": [alone], "cell": [grid.cell_of(alone, LONGITUDE)]}
     sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 9, old, [0.8], **where)), "") for n in names]
-    engine.ingest(sent, old)
+    engine.intake.ingest(sent, old)
     hear(engine, *names, now=now)
     hear(engine, *(f"sim-1{k:02}" for k in range(4)), now=now + 300 * SECOND)
-    assert engine.fusion.size == 2
+    assert engine.state.fusion.size == 2
     ice = hear_ice(engine, now + 600 * SECOND)
     assert ice
     assert engine.drop_old() == 1
@@ -196,7 +196,7 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
     at = now + 601 * SECOND
     (row,) = [one for one in rows(engine, at) if one["cell"] == CELL]
     assert row["vehicles"] == 8
-    assert [alert.cell for alert in engine.alerts_to_repeat(9)] == [ice[0].cell]
+    assert [alert.cell for alert in engine.alerts.next_to_repeat(9)] == [ice[0].cell]
     hear(engine, "sim-020", now=at + SECOND)
     shown = {one["cell"]: one["vehicles"] for one in rows(engine, at + 2 * SECOND)}
     engine.close()
@@ -212,4 +212,6 @@ def hear_ice(engine: Engine, now: int) -> list[wire.Alert]:
         "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)] * 3,
     }
     sent = [batch(f"sim-2{k:02}", 1, now, [0.12] * 3, **where) for k in range(4)]
-    return engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "") for one in sent], now)
+    return engine.intake.ingest(
+        [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "") for one in sent], now
+    )

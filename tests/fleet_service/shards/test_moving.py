@@ -92,7 +92,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         until(lambda: two.said("ready: "), PATIENCE_S)
         assert two.service is not None
         engine = two.service.engine
-        assert engine.alerts > 0
+        assert engine.alerts.count > 0
         expected, found = known(former.engine), known(engine)
         assert expected.keys() == found.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []

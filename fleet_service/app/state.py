@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -24,6 +25,7 @@ from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
 from fleet_service.serve.map_state import MapState
+from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 
@@ -73,6 +75,30 @@ class ServiceState(NamedTuple):
         files."""
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(self.visitors)
         return Taken(tables, cut, tuple(path.name for path in weather))
+
+
+class SharedState:
+    """State of a running service as its threads see it: the worker changes it, queries read it.
+
+    Args:
+        state: loaded from the archive.
+        public_vehicles: minimum number of vehicles of a public cell.
+
+    Attributes:
+        guard: lock held while the map is changed or read.
+        state: current state; replaced as a whole by `adopt`.
+        tiles: cached tiles of its map.
+    """
+
+    def __init__(self, state: ServiceState, public_vehicles: int) -> None:
+        self.guard = threading.Lock()
+        self._public_vehicles = public_vehicles
+        self.adopt(state)
+
+    def adopt(self, state: ServiceState) -> None:
+        """Replace the state and start with an empty tile cache."""
+        self.state = state
+        self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.visitors)
 
 
 def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:

@@ -1,0 +1,147 @@
+"""Intake of a running service: messages and weather in; fused rows for the log, and alerts, out."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from itertools import compress
+from pathlib import Path
+
+import numpy as np
+
+from fleet_service.app.clock import TimeNow
+from fleet_service.app.state import SharedState
+from fleet_service.archive.format.segments import Rows
+from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.archive.segment_log import SegmentLog
+from fleet_service.fusion import observations_of
+from fleet_service.fusion.standing import UNCORRECTED
+from fleet_service.fusion.weather import Reports
+from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.budgets import NewCells
+from fleet_service.ingest.dedup import BatchId
+from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
+from fleet_service.ingest.paths import VehiclePaths
+from fleet_service.ingest.validation import Clock
+from fleet_service.ingest.weather import WeatherInbox
+from schemas.config import ServiceConfig
+from schemas.numeric import BoolArray
+from schemas.thresholds import NS
+from schemas.wire import Alert, Kind
+
+
+class Intake:
+    """Admission and fusion of messages, for the worker's thread.
+
+    Args:
+        config: settings.
+        root: of the archive.
+        shared: state of the service.
+        log: queues the admitted rows for the disk.
+        counts: counters of the service.
+
+    Attributes:
+        acks: acknowledgements to send.
+        batches: admission of batches; replaced by `reset`.
+        now: time of the last `ingest` [ns].
+        report_lag_s: time between the end of the newest visit and its arrival.
+        weather: queue of weather messages.
+    """
+
+    def __init__(
+        self, config: ServiceConfig, root: Path, shared: SharedState, log: SegmentLog[BatchId], counts: Counter[str]
+    ) -> None:
+        self._config = config
+        self._root = root
+        self._shared = shared
+        self._log = log
+        self._counts = counts
+        self.acks = Acks()
+        self.now = 0
+        self.report_lag_s = 0.0
+        self.weather = WeatherInbox(root, config.name, shared.state.fusion, counts)
+        self.reset()
+        if config.weather is not None:
+            self._apply_weather(self.weather.begin(config.weather, shared.state.weather, time.time_ns()))
+
+    def reset(self) -> None:
+        """Follow a replaced state: forget budgets and paths, which belong to the former one."""
+        self._paths = VehiclePaths()
+        self._places = NewCells()
+        keys = Pseudonyms(self._root / "keys")
+        self.batches = BatchIntake(self._shared.state.streams, keys, self._counts, self.acks)
+        self.weather.fusion = self._shared.state.fusion
+
+    def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
+        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a number is
+        certain."""
+        at = at if isinstance(at, TimeNow) else TimeNow(at)
+        ahead = int(self._config.clock_ahead_s * NS) + at.slack
+        clock = Clock(at.now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
+        self.now = clock.now
+        out: list[Alert] = []
+        for kind, accepted in self.batches.accept(messages, clock).items():
+            if kind is Kind.OBSERVATION:
+                out += self._fuse(accepted)
+            self._counts[kind] += len(accepted.rows["row"])
+            self._log.add(kind, accepted.rows, accepted.batches)
+        return out
+
+    @property
+    def times(self) -> dict[str, int]:
+        """Return the newest time that each vehicle reported in the last `ingest` [ns]."""
+        return self.batches.times
+
+    def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
+        rows = accepted.rows
+        state = self._shared.state
+        self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
+        with self._shared.guard:
+            fused = np.flatnonzero(~self._excluded_from_fusion(rows))
+            taken = observations_of(rows, rows["witness"]).take(fused)
+            updated = state.fusion.update(taken)
+            if state.visitors is not None:
+                state.visitors.add(taken)
+            state.map.mark_changed(updated.slots)
+            raised = state.alerts.update(updated.slots)
+            if raised:
+                self._shared.tiles.acknowledge()
+        n = len(rows["row"])
+        rows["late"] = np.ones(n, bool)
+        rows["late_by"] = np.zeros(n, np.int64)
+        rows["weight"] = np.zeros(n, np.float32)
+        rows["late"][fused] = updated.late
+        rows["late_by"][fused] = updated.late_by
+        rows["weight"][fused] = updated.weight
+        rows |= {name: np.full(n, value, np.float32) for name, value in UNCORRECTED.items()}
+        self._counts["late"] += int(updated.late.sum())
+        if updated.late.any():
+            missed = np.zeros(n, bool)
+            missed[fused] = updated.late
+            of_batch = np.logical_or.reduceat(missed, np.flatnonzero(rows["row"] == 0))
+            self.acks.record_late(compress(accepted.batches, of_batch.tolist()))
+        return raised
+
+    def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
+        """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
+        places."""
+        witness = rows["witness"]
+        beyond = self._paths.find_implausible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
+        self._counts["implausible_moves"] += int(beyond.sum())
+        slots = self._shared.state.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64))
+        new = np.flatnonzero((slots < 0) & ~beyond)
+        over = self._places.beyond(witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS)
+        beyond[new[over]] = True
+        self._counts["too_many_places"] += int(over.sum())
+        return beyond
+
+    def update_weather(self, now: int) -> None:
+        """Apply the weather that arrived since the last call."""
+        self._apply_weather(self.weather.take(now))
+
+    def _apply_weather(self, reports: Reports | None) -> None:
+        if reports is not None:
+            with self._shared.guard:
+                self._shared.state.fusion.update_weather(reports)
+            self._counts["weather"] += len(reports.time)

@@ -1,0 +1,80 @@
+"""Queries to a running service: tiles, the whole map, and answers about now or the past."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.app.past import HistoricalMaps, PastQuery
+from fleet_service.app.state import SLOTS, SharedState
+from fleet_service.serve.encode import batch_of
+from fleet_service.serve.query import AnswerSize, answer, size_asked
+from schemas.config import ServiceConfig, nanoseconds
+from schemas.errors import InputError
+from schemas.query import MapQuery
+from schemas.tables import MAP_SCHEMA
+
+
+class Queries:
+    """Readers of a running service's map; safe to call from several threads.
+
+    Args:
+        config: settings.
+        root: of the archive, for maps of the past.
+        shared: state of the service.
+    """
+
+    def __init__(self, config: ServiceConfig, root: Path, shared: SharedState) -> None:
+        self._config = config
+        self._shared = shared
+        self._past = HistoricalMaps(root)
+
+    def tile(self, tile: int, now: int) -> bytes:
+        """Return the Arrow stream of the public cells of a tile; empty if there are none."""
+        shown = self._shared.tiles.make(tile, now)
+        return shown.payload if shown.cells.num_rows else b""
+
+    def changed_tiles(self, now: int) -> list[tuple[int, bytes]]:
+        """Return tile and payload of every tile that changed since the last call and is not empty."""
+        changed = self._shared.state.map.take_dirty()
+        return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
+
+    def whole_map(self, now: int) -> pa.Table:
+        """Return all public cells; the lock is held for a few at a time, so that ingest continues."""
+        tables = []
+        shared = self._shared
+        for start in range(0, shared.state.fusion.size, SLOTS):
+            with shared.guard:
+                slots = np.arange(start, min(start + SLOTS, shared.state.fusion.size))
+                seen = shared.tiles.seen(shared.tiles.public(slots, now), now)
+                tables.append(pa.Table.from_batches([batch_of(seen, now)]))
+        return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
+
+    def answer(
+        self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield tile and payload of every reply to a query, computed on demand; see `serve.query.answer`.
+
+        Raises:
+            InputError: the route is too long, the time is in the future, or the archive cannot be read.
+        """
+        least = max(query.min_vehicles, self._config.public_vehicles)
+        query = query.model_copy(update={"min_vehicles": least})
+        if query.at is None:
+            return answer(self._shared.tiles, query, wanted, now, only)
+        at = nanoseconds(query.at)
+        if at > now:
+            raise InputError("at", "lies in the future", "give a time that has been")
+        past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
+        return self._past.ask(past, wanted)
+
+    def measure_answer(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
+        """Return the upper bound of an answer's size; errors as for `answer`."""
+        return size_asked(self._shared.tiles, query, wanted, only)
+
+    def close(self) -> None:
+        """Stop the process that rebuilds maps of the past."""
+        self._past.close()

@@ -1,0 +1,126 @@
+"""Settlement of admitted batches: segments on disk (and in the bucket) first, then acknowledgements."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from fleet_service.app.intake import Intake
+from fleet_service.app.state import SharedState
+from fleet_service.app.tasks import Tasks
+from fleet_service.archive.format.layout import Cut
+from fleet_service.archive.segment_log import SegmentLog
+from fleet_service.ingest.dedup import BatchId
+from fleet_service.replication.bucket import CopyError
+from fleet_service.replication.ownership import Ownership
+
+# Most rows that wait for the disk. With more, nothing is taken from the queue until a segment is written.
+WAITING_ROWS: Final = 1_000_000
+WAITING_BATCHES: Final = 1_000_000  # the same for batches that are on disk and not yet in the copy: 100 MB
+T = TypeVar("T")
+
+
+class Settlement:
+    """Flushes of the log and the acknowledgements that follow, for the worker's thread.
+
+    Args:
+        shared: state of the service.
+        intake: owner of the waiting acknowledgements.
+        log: rows that wait for the disk.
+        holding: ownership of the archive.
+        counts: counters of the service.
+
+    Attributes:
+        failing: True if the last segment could not be written.
+    """
+
+    def __init__(
+        self,
+        shared: SharedState,
+        intake: Intake,
+        log: SegmentLog[BatchId],
+        holding: Ownership,
+        counts: Counter[str],
+    ) -> None:
+        self._shared = shared
+        self._intake = intake
+        self._log = log
+        self._holding = holding
+        self._counts = counts
+        self._tasks = Tasks()
+        self.failing = False
+
+    @property
+    def is_full(self) -> bool:
+        """Return True if too many rows wait for the disk, or batches for the copy."""
+        return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
+
+    @property
+    def unsettled(self) -> int:
+        """Return the number of admitted batches that are not on disk yet."""
+        return self._log.unsettled
+
+    @property
+    def hangs_s(self) -> float:
+        """Return how long the current segment has been written [s]."""
+        return self._log.hangs_s
+
+    @property
+    def newest_segment(self) -> Cut:
+        """Return the last written segment."""
+        return self._log.newest
+
+    def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+        """Let the worker run `work` right after a segment, when every row it took is on disk; return the result.
+
+        None if stopped meanwhile. Another thread calls this.
+
+        Raises:
+            OSError: no segment could be written for too long.
+        """
+        return self._tasks.ask(work, stop)
+
+    def flush(self) -> list[tuple[str, bytes]]:
+        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements to send.
+
+        A full disk is counted, and the next call tries again; nothing of it is acknowledged.
+        """
+        acks = self._acknowledge(self._log.flush)
+        if not self.failing:
+            self._tasks.do()
+        return acks
+
+    def begin_flush(self) -> list[tuple[str, bytes]]:
+        """Begin a flush; messages may be processed while segments are written. `end_flush` returns the acks.
+
+        If work waits for `run_between_segments`, this is `flush`.
+        """
+        if self._tasks:
+            return self.flush()
+        self._log.begin()
+        return []
+
+    def end_flush(self) -> list[tuple[str, bytes]]:
+        """Return the acknowledgements of a flush that was begun and has ended."""
+        return self._acknowledge(self._log.end) if self._log.ended else []
+
+    def _acknowledge(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
+        try:
+            self._intake.batches.sync()
+            self._intake.batches.acknowledge(durable())
+        except OSError as error:
+            if isinstance(error, CopyError) and self._holding.copy is not None:
+                self._counts["copy_failures"] = self._holding.copy.failures
+            else:
+                self._counts["segment_failures"] += 1
+            self.failing = True
+        else:
+            self.failing = False
+            self._shared.tiles.acknowledge()
+        return self._intake.acks.messages(self._intake.now) if self._holding.may_acknowledge else []
+
+    def close(self) -> None:
+        """Stop the thread that writes segments."""
+        self._log.close()
