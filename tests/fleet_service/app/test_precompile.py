@@ -32,11 +32,14 @@ def drive(root):
     columns = visits(np.random.default_rng(0), np.zeros(8000, np.int64), time.time_ns(), 256).columns
     home = columns["cell"] >> 22
     mine = np.flatnonzero(home == home[0])
-    for seq, part in enumerate(np.array_split(mine, len(mine) // 40), 1):
-        taken = {name: column[part] for name, column in columns.items()}
-        batch = wire.Batch(wire.Kind.OBSERVATION, "sim-001", seq, int(home[0]), seq, 1, taken, "test")
-        key, encoding = keys.observation_key(int(home[0]), "sim-001"), wire.ENCODING[batch.kind]
-        engine.intake.ingest([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
+    messages = []
+    for row in mine:  # each visit by a vehicle of its own, because no vehicle can be at all these places
+        taken = {name: column[row : row + 1] for name, column in columns.items()}
+        batch = wire.Batch(wire.Kind.OBSERVATION, f"sim-{row}", 1, int(home[0]), 1, 1, taken, "test")
+        key, encoding = keys.observation_key(int(home[0]), f"sim-{row}"), wire.ENCODING[batch.kind]
+        messages.append(Message(batch.kind, key, wire.encode(batch), encoding))
+    for start in range(0, len(messages), 40):
+        engine.intake.ingest(messages[start : start + 40], time.time_ns())
     engine.settlement.flush()
     engine.queries.changed_tiles(time.time_ns())
     engine.alerts.expire(time.time_ns())
