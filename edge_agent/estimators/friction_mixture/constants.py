@@ -58,8 +58,8 @@ class Constants(NamedTuple):
     diffusion: float = 0.003
     # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is covered)
     patch_length: float = 8.0
-    # [1] share of roads whose two sides differ
-    split_prior: float = 0.05
+    # [1] probability of unlike sides at the first sign of them, slip that force does not ask for (.05: called late)
+    split_prior: float = 0.2
     # [1/m] end of such a road
     split_hazard: float = 1 / 60
     # [1] left against right, in force over load, that wakes the split nodes
@@ -258,7 +258,7 @@ class Constants(NamedTuple):
     strain_most: float = 3.0
 
     # [nat] likelihood ratio at which contradiction is believed: errors that are three times what is stated, for 1 s
-    odd_least: float = 3.0
+    odd_least: float = 12.0
     # [s] before the model is tried again, the first time: a bend or two of a race track would pass, a lap does not
     patience: float = 120.0
     # [1] R of the axles while distrusted, over R

@@ -15,6 +15,7 @@ HELD_S = 1.0  # the largest grip holds so long,
 FORGOTTEN = 0.5  # [1/s] and then fades: roads change
 ABOVE = 0.02  # what smoothing takes from the top of a hard stop
 LARGEST_LOSS = 3.0  # [nat] a block
+AT_PEAK = 0.95  # of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
 
 
 @compiled
@@ -41,3 +42,18 @@ def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
     """The upper end of a friction, never below the grip in use: racing tyres pass the grid's 1.2."""
     return max(friction.upper, grip.held + ABOVE)
+
+
+@compiled
+def lower_while_sliding(slides: float, used: float, lower: float) -> float:
+    """Return the lower end of a friction whose wheels slide: a sliding tyre may be at its peak.
+
+    A tyre that slides gives between its peak force and the smaller force of full sliding. Slip tells which of them
+    only as well as the speed is known, and no wheel rolls that would tell the speed.
+
+    Args:
+        slides: membership in "a wheel slides" [1].
+        used: grip that the axle which uses more has used in the last second [1].
+        lower: the end by the belief [1].
+    """
+    return lower - slides * max(lower - AT_PEAK * used, 0.0)

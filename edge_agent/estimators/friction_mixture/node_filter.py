@@ -124,7 +124,7 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
         if state == STRAIGHT:
             find_shape_force(curve, side_mu, features, node)
             price = weigh_slopes(curve, side_mu, features, constants.sliding_slope, node)
-        correct_forces(curve, side_mu, features, node)
+        correct_forces(row, curve, side_mu, features, node)
         out = node.residual[:] if state == STRAIGHT else node.derivative[state]
         find_residuals(curve, side_mu, features, node, out)
         if state < STRAIGHT:
@@ -158,7 +158,7 @@ def _by_wheel_speeds(memory: MixtureMemory, design: MixtureDesign, scratch: Scra
     for wheel in range(4):
         node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel] + step
     find_slips(row, design.constants, mean, features, node)
-    correct_forces(design.curve, side_mu, features, node)
+    correct_forces(row, design.curve, side_mu, features, node)
     by_lag = node.derivative[NodeState.LAG_WHEEL]
     find_residuals(design.curve, side_mu, features, node, by_lag)
     for wheel in range(4):

@@ -126,29 +126,39 @@ def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatu
 
 
 @compiled
-def correct_forces(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
+def correct_forces(
+    row: FloatArray, curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
+) -> None:
     """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape.
 
     Without torque only the sum of both sides is measured; on a split road the slippery side gives SPLIT_LIMIT of its
-    friction at most, and the other side the rest.
+    friction at most, and the other side the rest. The unlike forces turn the car, which the axles' side forces hold.
     """
     leak, shape, gain = node.point[NodeState.LEAK_Y], node.point[NodeState.SHAPE], node.point[NodeState.GAIN]
     bias_x, bias_y = node.point[NodeState.BIAS_X], node.point[NodeState.BIAS_Y]
     force, slip_at_force = node.force, node.slip_at_force
+    moment = 0.0
+    for wheel in range(4):
+        along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
+        mu, other = side_mu[wheel % 2], side_mu[1 - wheel % 2]
+        force[wheel] = along
+        if other != mu and features.force_unit[wheel] != 0.0:
+            force[wheel] = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
+            lever = wheel_position(row, wheel)[1] * features.steer_cos[wheel]
+            moment -= lever * features.loads[wheel] * (force[wheel] - along)
+    turning = moment / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
         side = features.side[axle] + leak * features.side_leak[axle] - bias_y * features.side_unit[axle]
+        load = (features.loads[left] + features.loads[right]) * features.steer_cos[left]
+        side += (-turning if axle == 0 else turning) / load
         across = 0.0 if math.isnan(side) else side
         mean_along = mean_mu = 0.0
         for wheel in range(left, right + 1):
-            mu, load = side_mu[wheel % 2], features.load_share[wheel]
-            along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
-            other = side_mu[1 - wheel % 2]
-            if other != mu and features.force_unit[wheel] != 0.0:
-                along = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
-            mean_along += load * along
-            mean_mu += load * mu
-            force[wheel] = along - shape * node.shape_force[wheel]
+            mu, share = side_mu[wheel % 2], features.load_share[wheel]
+            mean_along += share * force[wheel]
+            mean_mu += share * mu
+            force[wheel] -= shape * node.shape_force[wheel]
             slip_at_force[wheel] = _slip_at_force(curve, mu, force[wheel], across)
         force[4 + axle] = side - shape * node.shape_force[4 + axle]
         slip_at_force[4 + axle] = _slip_at_force(curve, mean_mu, force[4 + axle], mean_along)

@@ -17,6 +17,7 @@ from edge_agent.estimators.friction_mixture.block_features import block_features
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
+from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.ice_patch import drive_onto
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
@@ -106,6 +107,9 @@ def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> 
     """Friction with its interval, grip used in the last second, and whether wheels slide."""
     _find_friction(memory, design, scratch)
     note_excitation(memory.excitation, memory.last.time, scratch.features.demand)
+    if not memory.split:
+        for friction in (memory.friction, memory.friction_left, memory.friction_right):
+            friction.lower = lower_while_sliding(memory.slip.held, memory.excitation.largest, friction.lower)
     vx = memory.overall_mean[NodeState.VX]
     speed = max(abs(vx), SLOWEST_SLIDING_M_S)
     for wheel in range(4):
