@@ -50,7 +50,7 @@ MOVES = {
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
-    "split_asymmetry": Move("split probability", "split-braking", 0.99),  # they wake later
+    "split_asymmetry": Move("split probability", "split-braking", 0.997),  # they wake later
     # how much a block counts
     "demand_half": Move(
         "least probabilities", "braking", 0.3

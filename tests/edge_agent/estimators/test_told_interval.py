@@ -9,6 +9,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
 from edge_agent.estimators.friction_mixture.design import design_of
 from edge_agent.estimators.friction_mixture.friction_grid import quantile
+from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.reported_interval import (
     DRAWN_IN,
@@ -95,3 +96,23 @@ def test_a_patch_lowers_the_lower_end_alone() -> None:
     icy, same_median, same_upper = told(about(0.8, 0.1), 0.1)
     assert icy < 0.2 < lower
     assert (same_median, same_upper) == (median, upper)
+
+
+@nogil
+def _lower_while_sliding(slides: float, used: float, lower: float) -> float:
+    return lower_while_sliding(slides, used, lower)
+
+
+@pytest.mark.parametrize(
+    ("slides", "used", "lower", "reported"),
+    [
+        (1.0, 0.10, 0.15, 0.95 * 0.10),  # the tyre may be at its peak: friction is the grip in use
+        (1.0, 0.30, 0.15, 0.15),  # the belief is lower already
+        (0.0, 0.10, 0.15, 0.15),  # no wheel slides: the grip in use says nothing of the limit
+        (0.5, 0.10, 0.15, 0.5 * (0.15 + 0.95 * 0.10)),
+    ],
+)
+def test_lower_end_of_a_sliding_tyre_is_at_most_its_grip_in_use(
+    slides: float, used: float, lower: float, reported: float
+) -> None:
+    assert _lower_while_sliding(slides, used, lower) == pytest.approx(reported)

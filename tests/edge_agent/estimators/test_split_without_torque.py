@@ -1,0 +1,44 @@
+"""Roads with unlike sides in a car that records no wheel torque: the yaw balance tells which side is slippery."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates
+from edge_agent.lab.simulation import simulate_manoeuvre
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from tests.edge_agent.estimators.drives import TORQUE
+
+FIRST_SIDES, LAST_SIDES = 0.5, 0.9  # shares of the stop between which the estimates are judged
+DRY, SNOW = 0.8, 0.3  # true frictions of the manoeuvre "split-braking", left and right
+
+
+def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
+    """Return true v_x (T,) and the estimates of a stop on a split road without torque; mirrored: snow on the left."""
+    log, vehicle = simulate_manoeuvre("split-braking", seed=seed)
+    signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
+    signals[:, TORQUE] = np.nan
+    if mirrored:
+        signals[:, [S.AY, S.YAW_RATE]] *= -1.0
+        for first in (S.DELTA, S.OMEGA):
+            signals[:, first : first + 4] = signals[:, [first + 1, first, first + 3, first + 2]]
+        signals[:, S.DELTA : S.DELTA + 4] *= -1.0
+    t = log["t"].to_numpy()
+    return log["true_vx"].to_numpy(), bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_split_stop_without_torque_tells_the_sides_and_the_speed(seed: int, *, mirrored: bool) -> None:
+    vx, estimates = stop(seed, mirrored=mirrored)
+    judged = slice(int(FIRST_SIDES * len(vx)), int(LAST_SIDES * len(vx)))
+    wheels = estimates.mu_wheel
+    assert wheels is not None
+    dry, snow = (wheels[judged, 0, side].mean(axis=0) for side in ((1, 0) if mirrored else (0, 1)))
+    assert snow[2] < 0.45 < dry[0]  # the upper end of the snow, the median of the dry side
+    assert snow[1] < SNOW < snow[2]
+    assert dry[1] < DRY < dry[2]
+    assert np.sqrt(np.mean((estimates.vx[judged, 0] - vx[judged]) ** 2)) < 0.08  # [m/s]; .3 without the yaw balance
