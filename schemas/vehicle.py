@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.config import explain
 from schemas.errors import InputError
+from schemas.thresholds import GRAVITY
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
 # Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et al., SAE 1999-01-1336).
@@ -47,7 +48,7 @@ class Calibration(BaseModel):
         Learned | None, Field(description="[s] by which wheel speeds speak later than the inertial unit")
     ] = None
     steer_lag: Annotated[Learned | None, Field(description="[s] likewise, the steering angle")] = None
-    understeer: Annotated[Learned | None, Field(description="[rad per m/s^2], told and not yet used")] = None
+    understeer: Annotated[Learned | None, Field(description="[rad per m/s^2] that steering needs beyond L r/v")] = None
 
 
 class Vehicle(BaseModel):
@@ -71,6 +72,20 @@ class Vehicle(BaseModel):
     cornering_stiffness: Annotated[
         float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N/rad], one wheel at static load")
     ]
+    wheel_radius_front: Annotated[Metres | None, Field(description="[m], where the axles' tyres differ")] = None
+    wheel_radius_rear: Annotated[Metres | None, Field(description="[m], likewise")] = None
+    cornering_stiffness_front: Annotated[
+        float | None,
+        Field(gt=0.0, lt=1e7, description="[N/rad], one front wheel, bushes and steering included"),
+    ] = None
+    cornering_stiffness_rear: Annotated[
+        float | None, Field(gt=0.0, lt=1e7, description="[N/rad], one rear wheel, likewise")
+    ] = None
+    steering_compliance: Annotated[
+        float | None,
+        Field(ge=-0.1, le=0.1, description="[rad per g] that the front wheels lose to steering, bushes and roll"),
+    ] = None
+    rear_axle_locked: Annotated[bool, Field(description="whether the rear wheels turn as one: no differential")] = False
     drive_split_front: Annotated[
         float | None, Field(ge=0.0, le=1.0, description="share of the driving torque at the front axle, where known")
     ] = None
@@ -79,6 +94,27 @@ class Vehicle(BaseModel):
         Field(gt=1.0, lt=60.0, description="angle of the steering wheel over the road wheels', where known"),
     ] = None
     calibration: Annotated[Calibration | None, Field(description="learned by edge-agent calibrate")] = None
+
+    def axle_radius(self, axle: int) -> float:
+        """Return the wheel radius [m] of the front (0) or rear (1) axle."""
+        own = self.wheel_radius_front if axle == 0 else self.wheel_radius_rear
+        return self.wheel_radius if own is None else own
+
+    def understeer_per_g(self) -> float | None:
+        """Return the steering [rad per g] beyond L r/v that the file's axles ask for; None where it does not say.
+
+        The axles' slip angles at 1 g differ by load over stiffness: 1/k_f - 1/k_r, k of a wheel over its static load.
+        """
+        wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
+        per_axle = 0.5 * self.mass * GRAVITY / wheelbase
+        front = self.cornering_stiffness_front
+        rear = self.cornering_stiffness_rear
+        if front is None and rear is None:
+            return self.steering_compliance
+        usual = self.cornering_stiffness / (0.25 * self.mass * GRAVITY)
+        slip_front = 1.0 / usual if front is None else per_axle * self.cg_to_rear_axle / front
+        slip_rear = 1.0 / usual if rear is None else per_axle * self.cg_to_front_axle / rear
+        return slip_front - slip_rear + (self.steering_compliance or 0.0)
 
 
 def load_vehicle(path: Path | str) -> Vehicle:

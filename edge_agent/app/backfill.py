@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,7 @@ from typing import NamedTuple
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimates_file import EstimatesFile, writable
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError
 from schemas.runtime import spark
@@ -109,8 +108,8 @@ def estimate(task: Task, estimator: str, memberships: Memberships | None = None)
     """Estimate one drive."""
     try:
         vehicle = load_vehicle(task.vehicle)
-        bank, log = bank_of(estimator, [vehicle], memberships), read_log(task.log)
-        log = replace(log, signals=corrected(log.t, log.signals, vehicle))
+        log, vehicle, *_ = prepare_log(read_log(task.log), vehicle)
+        bank = bank_of(estimator, [vehicle], memberships)
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):
                 file.write(block.t, bank.advance(block.t, block.signals))

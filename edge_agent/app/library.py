@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ from edge_agent.app.estimates_file import table
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.inputs import signal_log
-from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -64,10 +63,11 @@ def estimate(
 ) -> pa.Table:
     """Return the estimates of a log, one row per sample, with the columns of schemas.tables.ESTIMATES.
 
-    Known device errors of a calibrated vehicle file are corrected in the signals first, as in `edge-agent replay`.
+    Known device errors of a calibrated vehicle file and the lags that the signal doctor measures are corrected in the
+    signals first, as in `edge-agent replay`.
     """
+    log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)
-    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     parts = [table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
     return pa.concat_tables([*parts, ESTIMATES_SCHEMA.empty_table()]).combine_chunks()
 

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     import zenoh
 
     from edge_agent.app.live_loop import Progress
-    from edge_agent.inputs.signal_log import SignalLog
+    from edge_agent.inputs.doctor.diagnosis import Diagnosis
     from edge_agent.publish.publisher import Publisher
-    from schemas.vehicle import Vehicle
 
 
 FLEET = "fleet"  # what {name} in the path of an outbox is for many vehicles
@@ -67,38 +66,32 @@ def publisher_of(
     return publisher
 
 
-def require_valid_signals(log: SignalLog, vehicle: Vehicle) -> None:
+def require_valid_signals(diagnosis: Diagnosis) -> None:
     """Raise unless the signals of a log agree with each other.
 
     Raises:
         InputError: the signal doctor finds a fault, or cannot decide.
     """
-    from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.report import advice, lines
 
-    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     if not diagnosis.passed:
         print("\n".join(line for line in lines(diagnosis) if not line.startswith("sound")), file=sys.stderr)
         raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
 
 
-def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> list[str]:
+def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
     """Print on stderr the faults that the signal doctor finds in a log; return notes to print after the estimates."""
-    from edge_agent.inputs.doctor.findings import diagnose
-    from edge_agent.inputs.doctor.fix import small_lags
-
-    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     found = diagnosis.findings
     for fault in found:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
         print("warning: the estimates below mean nothing until that is mended; run edge-agent check", file=sys.stderr)
     notes = []
-    if not found and not diagnosis.passed:
+    if found:
+        notes.append("note: the signal doctor did not pass this log; replay --publish would refuse it")
+    elif not diagnosis.passed:
         channels = ", ".join(diagnosis.unknown)
         notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
-    for device, seconds in small_lags(diagnosis).items():
-        notes.append(f"note: {device} is {seconds:+.3f} s late; edge-agent check --fix corrects it")
     return notes
 
 

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
     from edge_agent.cli.common import require_valid_signals, warn_about_faults
-    from edge_agent.inputs.correct import corrected
+    from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
     from schemas.vehicle import load_vehicle
@@ -78,16 +77,16 @@ def run(args: argparse.Namespace) -> int:
     path = args.log[0]
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
-    bank = bank_of(estimator, [vehicle], memberships)
+    bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
     log = read_log(path)
     start_ns = _start(args.start, log)
-    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
+    log, vehicle, diagnosis, notes = prepare_log(log, vehicle)
+    bank = bank_of(estimator, [vehicle], memberships)
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
-        require_valid_signals(log, vehicle)
-        notes = []
+        require_valid_signals(diagnosis)
     else:
-        notes = warn_about_faults(log, vehicle)
+        notes += warn_about_faults(diagnosis)
     with EstimatesFile(args.out) as file:
         code = 0
 

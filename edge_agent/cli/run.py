@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -151,15 +150,14 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
 
 def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.cli.common import require_valid_signals
-    from edge_agent.inputs.correct import corrected
+    from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log
     from schemas.thresholds import NS
     from schemas.vehicle import load_vehicle
 
     vehicle = load_vehicle(_vehicle_file(args))
-    log = read_log(source)
-    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
+    log, vehicle, diagnosis, _ = prepare_log(read_log(source), vehicle)
     if not args.trust:
-        require_valid_signals(log, vehicle)
+        require_valid_signals(diagnosis)
     first_ns = time.time_ns() - round(float(log.t[0]) * NS)
     return vehicle, args.name or vehicle.name, log.blocks(first_ns, LIVE_ROWS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -21,6 +22,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.backfill import vehicle_file_of
 from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
 from edge_agent.cli.common import warn_about_faults
+from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import (
@@ -121,8 +123,10 @@ def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tupl
     logs = []
     for path in args.log:
         vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
-        logs.append((read_log(path), vehicle))
-        warn_about_faults(*logs[-1])
+        log = read_log(path)
+        logs.append((log, vehicle))
+        for note in warn_about_faults(diagnose(log.t, log.signals, vehicle, log.ground)):
+            print(note, file=sys.stderr)
     return own_drives(logs, duration_s)
 
 

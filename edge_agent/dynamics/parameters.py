@@ -35,9 +35,13 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
     """The parameters of `vehicle`, shape (12,), indexed by `Parameter`.
 
     Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per newton of load makes
-    them valid for the lightly and the heavily loaded wheel alike.
+    them valid for the lightly and the heavily loaded wheel alike. Where the file has a rear stiffness of its own, that
+    one counts: the front axle's difference from it is compliance, a state of the default estimator.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
+    rear = vehicle.cornering_stiffness_rear
+    rear_load = 0.5 * vehicle.mass * GRAVITY * vehicle.cg_to_front_axle
+    rear_load /= vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
     drive = vehicle.drive_split_front
     return np.array(
         [
@@ -51,7 +55,7 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
             vehicle.wheel_radius,
             vehicle.wheel_inertia,
             vehicle.longitudinal_stiffness / static_load,
-            vehicle.cornering_stiffness / static_load,
+            vehicle.cornering_stiffness / static_load if rear is None else rear / rear_load,
             np.nan if drive is None else drive,
         ]
     )

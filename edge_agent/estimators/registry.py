@@ -17,7 +17,7 @@ from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.calibrated import spreads_of
+from edge_agent.estimators.friction_mixture.calibrated import means_of, spreads_of
 from edge_agent.estimators.friction_mixture.design import design_of
 from edge_agent.estimators.friction_mixture.tyre_curve import Curve, proven
 from schemas.errors import InputError
@@ -84,4 +84,5 @@ def create(
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
     design = design_of(memberships, adaptive=name != "ckf", curve=curve)
-    return mixture_bank(parameter_table(vehicles), design, spreads_of(vehicles, design.nominal.std))
+    spreads, means = spreads_of(vehicles, design.nominal.std), means_of(vehicles, design.nominal.mean)
+    return mixture_bank(parameter_table(vehicles), design, spreads, means)

@@ -24,17 +24,22 @@ class Corrector:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
         self._known = vehicle.calibration
         self._waits = _waits(self._known)
         self._t, self._rows = np.empty(0), np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
         """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is known."""
-        if self._known is None:
-            return signals
-        signals = _mended(signals, self._known)
-        if not self._waits:
-            return signals
+        if self._known is not None:
+            signals = _mended(signals, self._known)
+        if self._waits:
+            signals = self._wait_for_latest(t, signals)
+        signals = scale_axles(signals, self._vehicle)
+        return free_rear_wheels(signals, self._vehicle) if self._vehicle.rear_axle_locked else signals
+
+    def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
+        """Return signals of one moment each: devices that speak early wait for the latest."""
         times, rows = np.concatenate([self._t, t]), np.concatenate([self._rows, signals])
         together = signals.copy()
         for channels, wait in self._waits.items():
@@ -50,6 +55,37 @@ class Corrector:
 def corrected(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """A whole log, times t (T,) [s] and signals (T, 18), as a `Corrector` makes it."""
     return Corrector(vehicle).advance(t, signals)
+
+
+def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """Return signals (T, 18) of wheels that all have `wheel_radius`: speed at the rim and force on the road stay.
+
+    The same array where the vehicle file gives no axle a radius of its own.
+    """
+    for axle in range(2):
+        share = vehicle.axle_radius(axle) / vehicle.wheel_radius
+        if share == 1.0:
+            continue
+        signals = signals.copy()
+        first = 2 * axle
+        signals[..., S.OMEGA + first : S.OMEGA + first + 2] *= share
+        signals[..., S.TORQUE + first : S.TORQUE + first + 2] /= share
+    return signals
+
+
+def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """Return signals (T, 18) whose rear wheels turn as freely rolling ones with the same mean do at the yaw rate.
+
+    Wheels of a locked axle turn alike, so that each slips by half the track times the yaw rate in every turn. That slip
+    tells nothing of the force that the axle transmits as a whole.
+    """
+    signals = signals.copy()
+    half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius
+    half = np.where(np.isfinite(half), half, 0.0)
+    mean = signals[..., S.OMEGA + 2 : S.OMEGA + 4].mean(axis=-1)
+    signals[..., S.OMEGA + 2] = mean - half
+    signals[..., S.OMEGA + 3] = mean + half
+    return signals
 
 
 def _mended(signals: FloatArray, known: Calibration) -> FloatArray:

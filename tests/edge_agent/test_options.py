@@ -108,9 +108,15 @@ OBSERVED = {
     "state_rate_hz": 5.0, "slippery_mu": 1.15, "position_std": 3.0, "yaw_std": 0.1, "trip_end_m": 30.0,
     "trip_end_s": 3.0, "tyre_season": 2,
 }  # fmt: skip
+# none by default; tested with the corrections (inputs/test_adopt.py) and with the prior (schemas/test_vehicle_axles.py)
+OPTIONAL = {
+    "wheel_radius_front", "wheel_radius_rear", "cornering_stiffness_front", "cornering_stiffness_rear",
+    "steering_compliance", "rear_axle_locked",
+}  # fmt: skip
 NUMBERS = [
     (estimator, name) for name in Vehicle.model_fields for estimator in ("aco-fckf", "compensated-wckf")
     if name not in ("name", "steering_ratio", "calibration")  # read by `import`, and by what reads logs: test_learn
+    and name not in OPTIONAL
     and (estimator, name) != ("compensated-wckf", "drive_split_front")
 ]  # fmt: skip
 SENT = {"zenoh", "spool", "spool_mb", "resend_s", "flush_s", "batch_rows", "estimator"}

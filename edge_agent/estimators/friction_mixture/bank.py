@@ -25,15 +25,23 @@ from schemas.runtime.records import Records, put_record, records
 YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 
 
-def mixture_bank(rows: FloatArray, design: MixtureDesign, spreads: FloatArray | None = None) -> EstimatorBank:
+def mixture_bank(
+    rows: FloatArray, design: MixtureDesign, spreads: FloatArray | None = None, means: FloatArray | None = None
+) -> EstimatorBank:
     """Friction mixtures of vehicles with parameters `rows` (N, 12).
 
-    `spreads` (N, STATES) are the standard deviations of their states' priors, where they are not those of the design.
+    `spreads` and `means` (N, STATES) are standard deviations and means of their states' priors, where they are not
+    those of the design.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
     return EstimatorBank(
-        new_filters(rows, design.nominal, design.nominal.std if spreads is None else spreads),
+        new_filters(
+            rows,
+            design.nominal,
+            design.nominal.mean if means is None else means,
+            design.nominal.std if spreads is None else spreads,
+        ),
         context,
         _advance,
         columns=FOUR_FRICTIONS,

@@ -10,6 +10,7 @@ import numpy as np
 from edge_agent.estimators.friction_mixture.constants import STATES, NodeState
 from schemas.numeric import FloatArray
 from schemas.signals import WHEELS
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 # state -> (quantity of the calibration, what the state carries beside it: the pitch and slope that a_x feels, toe and
@@ -23,8 +24,12 @@ LEARNED: Final[dict[int, tuple[str, float]]] = {
     NodeState.GAIN: ("force_gain", 0.02),
     NodeState.LAG_WHEEL: ("wheel_lag", 0.006),
     NodeState.LAG_STEER: ("steer_lag", 0.006),
+    NodeState.STEER_GAIN: ("steer_gain", 0.01),
     **{NodeState.RADIUS + i: (f"radius_{wheel}", 0.0015) for i, wheel in enumerate(WHEELS)},
 }
+
+
+EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make of understeer per g
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
@@ -37,4 +42,23 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
         for state, (quantity, each_drive) in LEARNED.items() if vehicle.calibration else ():
             if (estimate := getattr(vehicle.calibration, quantity)) is not None:
                 row[state] = min(row[state], np.hypot(estimate[1], each_drive))
+        if vehicle.calibration is not None and vehicle.calibration.understeer is not None:
+            learned = GRAVITY * vehicle.calibration.understeer[1]
+            row[NodeState.COMPLIANCE] = min(row[NodeState.COMPLIANCE], np.hypot(learned, EACH_COMPLIANCE))
     return spreads
+
+
+def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
+    """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a vehicle where it is known.
+
+    Understeer learned from drives counts before that of the vehicle file's axles; without both the mean of all vehicles
+    stays.
+    """
+    means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
+    for row, vehicle in zip(means, vehicles, strict=True):
+        calibration = vehicle.calibration
+        learned = None if calibration is None else calibration.understeer
+        per_g = vehicle.understeer_per_g() if learned is None else GRAVITY * learned[0]
+        if per_g is not None:
+            row[NodeState.COMPLIANCE] = per_g
+    return means

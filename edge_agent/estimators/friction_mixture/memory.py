@@ -159,14 +159,14 @@ class MixtureMemory:
     log_likelihood: float  # of what was measured at the sample [nat]
 
 
-def new_filters(rows: FloatArray, nominal: Nominal, spreads: FloatArray) -> RecordArray:
+def new_filters(rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray) -> RecordArray:
     """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample.
 
-    The prior of their states is `nominal`, with the standard deviations `spreads` (N, STATES).
+    The prior of their states is `nominal`, with the means and standard deviations `means`, `spreads` (N, STATES).
     """
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]
-    prior["mean"], prior["std"], prior["time"] = nominal.mean, spreads, nominal.time
+    prior["mean"], prior["std"], prior["time"] = means, spreads, nominal.time
     filters["row"], filters["factor"] = rows, 1.0
     filters["last_side"] = filters["usual_rolling"] = np.nan
     return filters

@@ -6,15 +6,17 @@ it is unknown when nothing was said of it. Only a log whose channels are all sou
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from edge_agent.inputs.doctor.clocks import measure_clocks, wheels_speak_late
+from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare
 from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
 from edge_agent.inputs.doctor.places import exchanged, yaw_findings
-from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, SETTLED, Verdict, clocks, explain
+from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, Verdict, clocks, explain
 from edge_agent.inputs.doctor.slip import (
     RADIUS_PARTS,
     STEADY,
@@ -22,11 +24,11 @@ from edge_agent.inputs.doctor.slip import (
     TURNS_LIKE,
     find_exchanged_axles,
     find_followed,
+    find_locked_axles,
     has_equal_steps,
     is_foreign,
     is_same_when_coasting,
     is_steady,
-    measure_lags_twice,
     share_of_parts,
     spread_of_parts,
 )
@@ -47,49 +49,11 @@ CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice t
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
 TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
 FEWEST_OFFSET_S: Final = 8.0
-FILTER_BEARS_S: Final = 0.025  # by which devices may be apart: standard deviation of the filter's own prior
-LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
 WHOLE: Final = 0.35  # in logarithms, by which the whole drive's gain may be off that of a fault
 NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One fault: the channel, what it is called, the words for it, and what mends it.
-
-    Attributes:
-        scale: to multiply the channel by; offset: to add after that; delay_s: that its stamps are late.
-        confidence: log odds over the next best explanation, where there is one.
-    """
-
-    channel: str
-    kind: str
-    words: str
-    scale: float = 1.0
-    offset: float = 0.0
-    delay_s: float = 0.0
-    confidence: float = SETTLED
-
-
-@dataclass
-class Diagnosis:
-    """Faults, channels that are in order, channels that nothing was learned of, and the identities' fits."""
-
-    findings: list[Finding] = field(default_factory=list)
-    sound: list[str] = field(default_factory=list)
-    unknown: list[str] = field(default_factory=list)
-    fits: dict[str, Fit] = field(default_factory=dict)
-    drive: EvenDrive | None = None
-    lags: dict[str, float] = field(default_factory=dict)  # [s] behind the gyro, by quantity, where turns tell it
-    doubts: set[str] = field(default_factory=set)  # quantities that only some parts of the drive speak against
-
-    @property
-    def passed(self) -> bool:
-        """Whether every channel was found to be in order."""
-        return not self.findings and not self.unknown
 
 
 def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None) -> Diagnosis:
@@ -116,13 +80,16 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
         diagnosis.findings.append(Finding("omega", f"{axle} left and right exchanged", words))
         signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[:, [S.OMEGA + right, S.OMEGA + left]]
         drive = prepare(t, signals, vehicle, ground)
+    diagnosis.locked = find_locked_axles(drive)
+    if diagnosis.locked == ["rear"]:
+        drive = replace(drive, r_wheels=drive.yaw_front)
     found = fits(drive)
     verdict = explain(found, vehicle)
     diagnosis.fits, diagnosis.drive = found, drive
     _scales(verdict, found, diagnosis)
     scaled = any(fault is not None for fault in verdict.faults.values())  # offsets and radii in wrong units say nothing
     late = clocks(found)
-    if "wheels" in late and not _speaks_late(found["axle"], late["wheels"][0]):
+    if "wheels" in late and not wheels_speak_late(found["axle"], late["wheels"][0]):
         late = {}  # in a slide wheels slow down before the car does; their yaw rate is not late then
     for device, (seconds, margin) in late.items():
         if margin < CLOCK_SETTLED:
@@ -132,7 +99,7 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
             words = f"the clock of the {device} is {abs(seconds):.2f} s {way}"
             diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds, confidence=margin))
     if not late and not scaled:
-        _lags(t, signals, vehicle, diagnosis)
+        measure_clocks(t, signals, vehicle, diagnosis)
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
         diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
@@ -145,27 +112,6 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
     if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw"}:
         (diagnosis.sound if found["ground"].known else diagnosis.unknown).append("latitude")
     return diagnosis
-
-
-def _speaks_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the wheels' yaw rate is late as well, by half of it at least."""
-    return axle.known and np.isfinite(axle.lag_error_s) and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
-
-
-def _lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis) -> None:
-    """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
-    diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
-    wheel = diagnosis.lags.get("wheel_lag")
-    steer = diagnosis.lags.get("steer_lag")
-    if wheel is not None and steer is not None and abs(wheel - steer) < 0.5 * abs(wheel) and abs(wheel) > LARGEST_LAG_S:
-        listed = [("imu", -0.5 * (wheel + steer))]
-    else:
-        listed = [("wheels", wheel or 0.0), ("steering", steer or 0.0)]
-    for device, seconds in listed:
-        if abs(seconds) > LARGEST_LAG_S:
-            way = "late" if seconds > 0.0 else "early"
-            words = f"speaks {abs(seconds):.2f} s {way}; the estimator bears {FILTER_BEARS_S:g} s"
-            diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
 
 
 def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:

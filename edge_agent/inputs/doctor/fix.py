@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from edge_agent.inputs.doctor.findings import FILTER_BEARS_S, Diagnosis, Finding
+from edge_agent.inputs.doctor.clocks import FILTER_BEARS_S, late_devices
+from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
 from edge_agent.inputs.profile import Channel, Profile
 from schemas.signals import per_wheel
 from schemas.vehicle import Vehicle
 
 OF_DEVICE: Final = {
-    "imu": ("ax", "ay", "yaw_rate"), "steering": per_wheel("delta"), "wheels": per_wheel("omega"),
-    "receiver": ("latitude", "longitude", "yaw"),
+    "imu": ("ax", "ay", "yaw_rate"), "gyro": ("yaw_rate",), "steering": per_wheel("delta"),
+    "wheels": per_wheel("omega"), "receiver": ("latitude", "longitude", "yaw"),
     "delta": per_wheel("delta"), "omega": per_wheel("omega"),
 }  # fmt: skip
 LEFT_RIGHT: Final = (("omega_fl", "omega_fr"), ("omega_rl", "omega_rr"))
@@ -24,14 +25,11 @@ EXCHANGED: Final = {
 }  # fmt: skip
 
 
-DEVICES: Final = {"wheel_lag": "wheels", "steer_lag": "steering"}
-
-
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the lags [s] by device that are no fault, but more than the filter bears."""
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
-    return {DEVICES[name]: lag for name, lag in diagnosis.lags.items() if abs(lag) > FILTER_BEARS_S}
+    return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}
 
 
 def corrections(diagnosis: Diagnosis) -> list[Finding]:

@@ -1,6 +1,6 @@
 """How late devices speak against the inertial unit, each from two ways to the yaw rate.
 
-    wheel_lag   wheels' yaw rate, mean of the axles, behind the gyro's
+    wheel_lag   wheels' yaw rate behind the gyro's: mean of both axles, or the axle that follows the gyro best
     steer_lag   yaw rate of a bicycle model on the measured angle behind the gyro's (Rajamani 2012, section 2.3)
 
     m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
@@ -11,7 +11,7 @@ builds up behind its slip (LEAD), so that wheels and steering move a little befo
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-LONGEST_S: Final = 0.3
+LONGEST_S: Final = 0.5
 LEAST_S: Final = 10.0  # of driving
 SLOW_S: Final = 5.0  # what changes more slowly is offset and bank
 LEAST_LIKE: Final = 0.9  # correlation from which on a lag is believed
+LEAST_RATE: Final = 1e-5  # [rad/s] of yaw; less is rounding
+ALIKE: Final = 0.02  # of two correlations
 SMOOTH_S: Final = 0.1  # of a running mean, taken twice
 LONGEST_DRIVE_S: Final = 1800.0
 DRIVEN: Final = 4.0  # [m/s]
@@ -47,22 +49,38 @@ def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> dict[str, floa
     rims = [column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
     v = np.mean(rims, axis=0)
     gyro, left = column(S.YAW_RATE), signals[:, S.DELTA]
-    wheels = 0.5 * ((rims[1] - rims[0]) / vehicle.track_front + (rims[3] - rims[2]) / vehicle.track_rear)
+    front = (rims[1] - rims[0]) / vehicle.track_front
+    rear = (rims[3] - rims[2]) / vehicle.track_rear
     delta = smooth(even(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at), SMOOTH_S)
     driven = (v > DRIVEN) & np.isfinite(gyro)
-    ways = {"wheel_lag": wheels, "steer_lag": _bicycle(v, delta, vehicle)}
-    found = {name: _behind(way, gyro, driven & np.isfinite(way)) for name, way in ways.items()}
-    return {name: lag + LEAD[name] for name, lag in found.items() if lag is not None}
+    ways = {"wheel_lag": (0.5 * (front + rear), front, rear), "steer_lag": (_bicycle(v, delta, vehicle),)}
+    found = {}
+    for name, sides in ways.items():
+        peaks = [_behind(side, gyro, driven & np.isfinite(side)) for side in sides]
+        told = [peak for peak in peaks if peak is not None]
+        if told:  # the mean of the axles comes first: a locked axle says nothing, and spoils the mean
+            likest = max(peak.likeness for peak in told)
+            found[name] = next(peak for peak in told if peak.likeness > likest - ALIKE).seconds + LEAD[name]
+    return found
 
 
-def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> float | None:
-    """Seconds that `left` is behind `right`; None where the drive does not tell."""
+class _Peak(NamedTuple):
+    """Lag [s] at the largest correlation, and that correlation."""
+
+    seconds: float
+    likeness: float
+
+
+def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> _Peak | None:
+    """Return by how much `left` is behind `right`; None where the drive does not tell."""
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
     among[: most + 1] = among[len(among) - most - 1 :] = False
     if among.sum() < LEAST_S * RATE_HZ:
         return None
     left, right = ((x - smooth(x, SLOW_S)) for x in (left, right))
+    if np.nanstd(left[among]) < LEAST_RATE or np.nanstd(right[among]) < LEAST_RATE:  # a locked axle, or straight on
+        return None
     like = np.zeros(2 * most + 1)
     for k in range(-most, most + 1):
         other = np.roll(right, k)
@@ -72,7 +90,8 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> float | No
     if like[top] < LEAST_LIKE or top in (0, 2 * most):
         return None
     before, here, after = like[top - 1 : top + 2]
-    return float((top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ)
+    seconds = (top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ
+    return _Peak(float(seconds), float(here))
 
 
 def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from edge_agent.inputs.doctor.diagnosis import Finding
 from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, over_ground
 from schemas.numeric import FloatArray
 from schemas.signals import S
-
-if TYPE_CHECKING:
-    from edge_agent.inputs.doctor.findings import Finding
 
 FEWEST: Final = 200  # moments, four seconds
 BETTER: Final = 0.25  # by which another reading of yaw must fit the course better (mean resultant length)
@@ -30,8 +28,6 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
     """Faults of yaw."""
-    from edge_agent.inputs.doctor.findings import Finding
-
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []

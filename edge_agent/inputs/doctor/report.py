@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.findings import Diagnosis
+from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.identities import Fit
 from schemas.numeric import FloatArray
 

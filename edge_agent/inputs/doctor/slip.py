@@ -20,6 +20,10 @@ STEADY: Final = 0.4
 STEADY_SHARE: Final = 0.75
 
 LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
+LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
+LEAST_CURVATURE: Final = 0.004  # [1/m] root mean square, from which on an axle shows that it is locked
+LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
+LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's
 TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
 
 
@@ -67,6 +71,30 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
     if sign < 0.0:  # one of a_y, yaw rate and steering is flipped: nobody knows which axle is right
         return []
     return [("front", (0, 1))] if front < 0.0 else [("rear", (2, 3))]
+
+
+def find_locked_axles(drive: EvenDrive) -> list[str]:
+    """Return the axles whose wheels turn as one, "front" or "rear": a locked differential, or one sensor for both.
+
+    The other axle follows the yaw rate. A wheel speed of a locked axle tells the mean of both; a filter that takes the
+    difference for slip reads a slide in every tight turn.
+    """
+    locked = []
+    for name, own, other in (("front", drive.yaw_front, drive.yaw_rear), ("rear", drive.yaw_rear, drive.yaw_front)):
+        good = np.isfinite(own) & np.isfinite(other) & np.isfinite(drive.r) & (drive.moving > 0)
+        if good.sum() < 20 * RATE_HZ:
+            continue
+        speed = np.maximum(np.abs(drive.v[good]), 1.0)
+        turns = float(np.sqrt(np.mean(np.square(drive.r[good] / speed))))
+        covariance = np.cov(np.stack([drive.r[good], own[good], other[good]]) / speed)
+        if turns < LEAST_CURVATURE or covariance[0, 0] <= 0.0 or covariance[2, 2] <= 0.0:
+            continue
+        follows = covariance[0, 2] / np.sqrt(covariance[0, 0] * covariance[2, 2])
+        gain = covariance[0, 2] / covariance[0, 0]
+        own_gain = covariance[0, 1] / covariance[0, 0]
+        if follows > LOCKED_LIKE and 0.6 < gain < 1.6 and abs(own_gain) < LOCKED_GAIN:
+            locked.append(name)
+    return locked
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
@@ -121,6 +149,8 @@ def measure_lags_twice(t: FloatArray, signals: FloatArray, vehicle: Vehicle, fou
         fit = found[identity]
         sound = fit.known and fit.correlation > TURNS_LIKE and abs(np.log(abs(fit.gain))) < 0.35 and is_steady(fit)
         values = [part[name] for part in parts if name in part]
-        if sound and len(values) == len(parts) and np.ptp(values) < LAGS_APART_S:
-            told[name] = float(np.median(values))
+        lag = float(np.median(values)) if values else 0.0
+        apart = max(LAGS_APART_S, LAGS_APART * abs(lag))
+        if sound and len(values) == len(parts) and np.ptp(values) < apart:
+            told[name] = lag
     return told

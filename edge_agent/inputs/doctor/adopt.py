@@ -1,0 +1,77 @@
+"""Correction of a recorded drive by the measurements of the signal doctor: late devices and locked axles.
+
+The doctor and the estimator so have one tolerance for clocks. A lag that the doctor measured is taken out of the log
+before the estimator sees it; a clock that is late by an unknown time stays a finding, and the log is not published.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.inputs.correct import corrected, free_rear_wheels
+from edge_agent.inputs.doctor.diagnosis import Diagnosis
+from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.doctor.fix import OF_DEVICE, corrections
+from edge_agent.inputs.signal_log import SignalLog
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from schemas.vehicle import Vehicle
+
+
+class Adopted(NamedTuple):
+    """A log as the estimator gets it, its vehicle, its diagnosis, and notes on the changes."""
+
+    log: SignalLog
+    vehicle: Vehicle
+    diagnosis: Diagnosis
+    notes: list[str]
+
+
+def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
+    """Return a log as the estimator gets it: corrected by its calibration, then by the doctor's measurements."""
+    return adopt_measured(replace(log, signals=corrected(log.t, log.signals, vehicle)), vehicle)
+
+
+def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
+    """Examine a log, correct the measured faults, and examine the result."""
+    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
+    delays = {finding.channel: finding.delay_s for finding in corrections(diagnosis) if finding.kind == "clock"}
+    delays = {device: seconds for device, seconds in delays.items() if seconds and device in OF_DEVICE}
+    notes = [
+        f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; corrected for this replay"
+        for device, seconds in delays.items()
+    ]
+    signals = align_devices(log.t, log.signals, delays) if delays else log.signals
+    if diagnosis.locked == ["rear"] and not vehicle.rear_axle_locked:
+        vehicle = vehicle.model_copy(update={"rear_axle_locked": True})
+        notes.append("note: the rear wheels turn as one; taken as a locked differential (rear_axle_locked)")
+        signals = free_rear_wheels(signals, vehicle)
+    if signals is log.signals:
+        return Adopted(log, vehicle, diagnosis, notes)
+    log = replace(log, signals=signals)
+    return Adopted(log, vehicle, diagnose(log.t, signals, vehicle, log.ground) if delays else diagnosis, notes)
+
+
+def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
+    """Return signals (T, 18) with devices moved earlier by `delays` [s]; readings between samples are linear."""
+    signals = signals.copy()
+    for device, seconds in delays.items():
+        for name in OF_DEVICE[device]:
+            column = CHANNELS.index(name)
+            signals[:, column] = _moved(t, signals[:, column], seconds, angle=column == S.YAW)
+    return signals
+
+
+def _moved(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
+    """Return values (T,) as they were read `seconds` later; missing readings stay missing."""
+    at = t + seconds
+    after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    share = np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)
+    before, behind = values[after - 1], values[after]
+    nearest = np.where(share < 0.5, before, behind)
+    between = before + share * (behind - before)
+    return np.where(np.isfinite(between) & (not angle), between, nearest)

@@ -1,0 +1,49 @@
+"""Clocks of the devices, by the lags that the turns of a drive tell."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
+from edge_agent.inputs.doctor.identities import Fit
+from edge_agent.inputs.doctor.scales import CLOCK_CENTRE_S
+from edge_agent.inputs.doctor.slip import measure_lags_twice
+from schemas.numeric import FloatArray
+from schemas.vehicle import Vehicle
+
+FILTER_BEARS_S: Final = 0.025  # by which devices may be apart: standard deviation of the filter's own prior
+LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
+
+
+def wheels_speak_late(axle: Fit, seconds: float) -> bool:
+    """Return True if the wheels' yaw rate is late as well, by half of it at least."""
+    return axle.known and np.isfinite(axle.lag_error_s) and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
+
+
+def measure_clocks(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis) -> None:
+    """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
+    diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
+    listed = late_devices(diagnosis)
+    for device, seconds in listed.items():
+        if abs(seconds) > LARGEST_LAG_S:
+            way = "late" if seconds > 0.0 else "early"
+            words = f"speaks {abs(seconds):.2f} s {way}; the estimator bears {FILTER_BEARS_S:g} s"
+            diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
+
+
+def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
+    """Return by how many seconds each device speaks late, by the lags that the turns of a drive tell.
+
+    Wheels and steering that are early by the same time show that the yaw rate is late. Where the accelerometer is not
+    late against the wheels, the gyroscope is late alone.
+    """
+    wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
+    if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):
+        return {"wheels": wheel, "steering": steer}
+    late = -0.5 * (wheel + steer)
+    along = diagnosis.fits["longitudinal"]
+    told = along.known and np.isfinite(along.lag_error_s)
+    alone = told and abs(along.lag_s - CLOCK_CENTRE_S["longitudinal"]) < 0.5 * abs(late)
+    return {"gyro" if alone else "imu": late}

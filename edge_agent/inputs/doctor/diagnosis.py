@@ -1,0 +1,46 @@
+"""Records of the signal doctor: one fault, and everything that is known of a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from edge_agent.inputs.doctor.drive import EvenDrive
+from edge_agent.inputs.doctor.identities import Fit
+from edge_agent.inputs.doctor.scales import SETTLED
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault: the channel, what it is called, the words for it, and what mends it.
+
+    Attributes:
+        scale: to multiply the channel by; offset: to add after that; delay_s: that its stamps are late.
+        confidence: log odds over the next best explanation, where there is one.
+    """
+
+    channel: str
+    kind: str
+    words: str
+    scale: float = 1.0
+    offset: float = 0.0
+    delay_s: float = 0.0
+    confidence: float = SETTLED
+
+
+@dataclass
+class Diagnosis:
+    """Faults, channels that are in order, channels that nothing was learned of, and the identities' fits."""
+
+    findings: list[Finding] = field(default_factory=list)
+    sound: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    fits: dict[str, Fit] = field(default_factory=dict)
+    drive: EvenDrive | None = None
+    lags: dict[str, float] = field(default_factory=dict)  # [s] behind the gyro, by quantity, where turns tell it
+    locked: list[str] = field(default_factory=list)  # axles whose wheels turn as one: "front", "rear"
+    doubts: set[str] = field(default_factory=set)  # quantities that only some parts of the drive speak against
+
+    @property
+    def passed(self) -> bool:
+        """Whether every channel was found to be in order."""
+        return not self.findings and not self.unknown

@@ -1,0 +1,82 @@
+"""Corrections that a replay takes from the signal doctor: late devices, a locked rear axle, radii of the axles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.doctor.adopt import adopt_measured, align_devices
+from edge_agent.inputs.signal_log import SignalLog
+from edge_agent.lab.evaluation.planted import DELTA, IMU, OMEGA, Recorded, drives
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+RATE_HZ = 100
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recorded:
+    """Two minutes and a half of a car with exact devices."""
+    return drives(1, 31, rough=False)[0]
+
+
+def log_of(drive: Recorded) -> SignalLog:
+    return SignalLog(drive.t, drive.signals, None, None, None)
+
+
+def late(signals: FloatArray, columns: Sequence[int], seconds: float) -> FloatArray:
+    samples = round(seconds * RATE_HZ)
+    moved = signals.copy()
+    moved[samples:, columns] = signals[:-samples, columns]
+    return moved
+
+
+def test_exact_drive_is_left_as_it_is(drive: Recorded) -> None:
+    log = log_of(drive)
+    adopted = adopt_measured(log, drive.vehicle)
+    assert adopted.log is log
+    assert adopted.vehicle is drive.vehicle
+    assert adopted.notes == []
+
+
+@pytest.mark.parametrize(("device", "columns"), [("steering", DELTA[:2]), ("wheels", OMEGA)])
+def test_late_device_is_measured_and_corrected(drive: Recorded, device: str, columns: Sequence[int]) -> None:
+    wrong = replace(log_of(drive), signals=late(drive.signals, columns, 0.15))
+    adopted = adopt_measured(wrong, drive.vehicle)
+    assert [note.split()[1] for note in adopted.notes] == [device]
+    assert adopted.diagnosis.passed
+    rows = slice(1000, -1000)
+    before = np.nanmean(np.abs(wrong.signals[rows][:, columns] - drive.signals[rows][:, columns]))
+    after = np.nanmean(np.abs(adopted.log.signals[rows][:, columns] - drive.signals[rows][:, columns]))
+    assert after < 0.35 * before
+
+
+def test_alignment_moves_readings_back_by_their_delay(drive: Recorded) -> None:
+    moved = align_devices(drive.t, late(drive.signals, IMU, 0.2), {"imu": 0.2})
+    rows = slice(100, -100)
+    assert np.nanmax(np.abs(moved[rows][:, IMU] - drive.signals[rows][:, IMU])) < 1e-9
+    assert np.array_equal(moved[rows][:, OMEGA], drive.signals[rows][:, OMEGA], equal_nan=True)
+
+
+def test_locked_rear_axle_is_recognised_and_freed(drive: Recorded) -> None:
+    signals = drive.signals.copy()
+    mean = signals[:, OMEGA[2:]].mean(axis=1)
+    signals[:, OMEGA[2]] = signals[:, OMEGA[3]] = mean
+    adopted = adopt_measured(replace(log_of(drive), signals=signals), drive.vehicle)
+    assert adopted.vehicle.rear_axle_locked
+    apart = adopted.log.signals[:, OMEGA[3]] - adopted.log.signals[:, OMEGA[2]]
+    true = drive.signals[:, OMEGA[3]] - drive.signals[:, OMEGA[2]]
+    assert np.nanstd(apart - true) < 0.3 * np.nanstd(true)
+
+
+def test_radius_of_an_axle_scales_its_wheels_and_torques(drive: Recorded) -> None:
+    vehicle = drive.vehicle.model_copy(update={"wheel_radius_rear": 1.04 * drive.vehicle.wheel_radius})
+    scaled = corrected(drive.t, drive.signals, vehicle)
+    assert np.allclose(scaled[:, OMEGA[2:]], 1.04 * drive.signals[:, OMEGA[2:]], equal_nan=True)
+    assert np.array_equal(scaled[:, OMEGA[:2]], drive.signals[:, OMEGA[:2]], equal_nan=True)
+    torques = slice(S.TORQUE + 2, S.TORQUE + 4)
+    assert np.allclose(scaled[:, torques], drive.signals[:, torques] / 1.04, equal_nan=True)
