@@ -1,7 +1,9 @@
 """Correction of a recorded drive by the measurements of the signal doctor: late devices and locked axles.
 
-The doctor and the estimator so have one tolerance for clocks. A lag that the doctor measured is taken out of the log
-before the estimator sees it; a clock that is late by an unknown time stays a finding, and the log is not published.
+A clock that is further off than the filter bears is a finding of the doctor. Where the drive tells by how much, the lag
+is taken out of the log before the estimator sees it; a clock that is off by an unknown time stays a finding, and the
+log is not published. Lags that the filter bears are left to its own states, so that a replay of a sound log stays
+causal.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import numpy as np
 from edge_agent.inputs.correct import corrected, free_rear_wheels
 from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.inputs.doctor.fix import OF_DEVICE, corrections
+from edge_agent.inputs.doctor.fix import OF_DEVICE
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
@@ -39,8 +41,10 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Examine a log, correct the measured faults, and examine the result."""
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
-    delays = {finding.channel: finding.delay_s for finding in corrections(diagnosis) if finding.kind == "clock"}
+    delays = {finding.channel: finding.delay_s for finding in diagnosis.findings if finding.kind == "clock"}
     delays = {device: seconds for device, seconds in delays.items() if seconds and device in OF_DEVICE}
+    if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
+        return Adopted(log, vehicle, diagnosis, [])
     notes = [
         f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; corrected for this replay"
         for device, seconds in delays.items()
