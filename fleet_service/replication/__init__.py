@@ -11,7 +11,7 @@ segment log calls `BucketReplica.upload_segments` through a callback.
 | waiting | no lease exists, or it was released, for this service or for any | taking | create the next number |
 | waiting | the lease was held by an earlier start of this folder | taking | create the next number |
 | waiting | the same turn for `lease_s` (HINT of it if the holder's token fell) | taking | create the next number |
-| waiting | any other look | waiting | a standby downloads what is new |
+| waiting | any other look | waiting | a standby downloads new objects |
 | taking | another service created the number first | waiting | |
 | taking | created, and the former turn is the one seen last | joining | |
 | taking | created, but the former holder renewed meanwhile | joining | wait for `lease_s / 2` first |
