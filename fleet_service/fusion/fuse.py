@@ -16,7 +16,7 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.neighbours import beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, shape_class, shared_parts
+from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class, shared_parts
 from fleet_service.fusion.standing import Standing, first_standing
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import NOBODY, NONE, USED, Rows
@@ -78,7 +78,7 @@ class Fusion:
         self.standings: list[Standing] = [first_standing(initial_trust(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
-        self._shape = shape_class(c.SHAPE_PRIOR)
+        self._shape = UNKNOWN_SHAPE
 
     def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
         """Go on from an epoch, the standings since, and the weather; the store is set before."""
@@ -185,19 +185,19 @@ class Fusion:
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns], and with what
         slippery neighbours tell of it."""
-        return self._read(KERNELS[self._shape], slots, np.full(len(slots), now))
+        return self._read(KERNELS[shape_class(self._shape.reader)], slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return self._read(KERNELS[self._shape], slots, self.live.time[slots])
+        return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
         """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
-        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS[self._shape], slots)
+        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots)
 
     def alarming(self, slots: IntArray) -> FloatArray:
         """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
-        return self._read(ALARM_KERNELS, slots, self.live.time[slots])
+        return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
     def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
         return beliefs(self.store.state.live, self.store.table, self._weather, kernels, slots, now)
@@ -259,7 +259,7 @@ class Fusion:
             self._find_shape()
 
     def _find_shape(self) -> None:
-        self._shape = shape_class(shape_of(self.store.peers, self.standings[-1].weight))
+        self._shape = shape_of(self.store.peers, self.standings[-1].weight)
 
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int

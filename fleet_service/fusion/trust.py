@@ -26,6 +26,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.shared import Shape
 from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.records import NOBODY, USED
 from schemas import mugrid
@@ -168,18 +169,19 @@ def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
     return True
 
 
-def shape_of(peers: RecordArray, weight: Float32Array) -> float:
-    """Return how much too low the fleet's values are for each μ that was left unused: λ, 0 ≤ λ ≤ 1.
+def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
+    """Return how much too low the fleet's values are for each μ that was left unused, λ in [0, 1], and its error.
 
     From differences of single vehicles with themselves, in which an error common to value and use cancels. λ corrects
-    no value; it says how much doubt upwards a gentle value bears (`shared.shape_class`).
+    no value; it says how much doubt upwards a gentle value bears (`shared.Shape`).
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)
     prior = 1.0 / c.SHAPE_STD**2
     squares = float((trust * peers["used_squares"][:vehicles]).sum())
     products = float((trust * peers["used_products"][:vehicles]).sum())
-    return float(np.clip((products + c.SHAPE_PRIOR * prior) / (squares + prior), 0.0, 1.0))
+    slope = (products + c.SHAPE_PRIOR * prior) / (squares + prior)
+    return Shape(float(np.clip(slope, 0.0, 1.0)), (squares + prior) ** -0.5)
 
 
 def initial_trust(established: bool) -> float:

@@ -24,7 +24,7 @@ from fleet_service.fusion.belief import (
     unpack,
     vote,
 )  # fmt: skip
-from fleet_service.fusion.shared import fade, note_value
+from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade, note_value
 from fleet_service.fusion.store.pairs import returning
 from fleet_service.fusion.store.records import AGED, FINE, GRIP, ICE, NONE, SOURCES, UNTRUSTED, USED, Rows
 from fleet_service.fusion.weather import Weather, aged
@@ -42,6 +42,7 @@ _GRIP_MEAN: Final = 0.5 * (c.SOURCE_USED + mugrid.UPPER)  # of "at least u" agai
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, c.SLIPPERY))  # first that is no ice
 _NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
+_WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 
 @refcount_free_inlined
@@ -206,15 +207,16 @@ def _aged(seconds: float) -> np.uint16:
 def ice_evidence(entries: RecordArray, entry: int) -> float:
     """Return the evidence of a value for ice against grip: the log-likelihood ratio with the doubt about tyres [nat].
 
-    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(ALERT_SLOPE·(SHARED_SHARE - u/μ), 0,
-    ALERT_MOST), one standard deviation. So grip explains the value as well as
-    max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum one.
+    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST), one
+    standard deviation, with λ the slope that an alarm doubts of an unknown fleet: a witness vouches alone. So grip
+    explains the value as well as max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum
+    one.
     """
     evidence, used = entries[entry].evidence, entries[entry].used / USED
     least = math.inf
     for i in range(_GRIP_BIN, mugrid.BINS):
         road = mugrid.CENTRES[i]
-        doubt = min(max(c.ALERT_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.ALERT_MOST) * road
+        doubt = min(max(_WITNESS_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.SHARED_MOST) * road
         for j in range(i, -1, -1):
             away = road - mugrid.CENTRES[j]
             if away > 3.0 * doubt:

@@ -37,7 +37,7 @@ def acquainted(slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool 
 
 
 def learned(fusion: Fusion) -> float:
-    return shape_of(fusion.store.peers, fusion.standings[-1].weight)
+    return shape_of(fusion.store.peers, fusion.standings[-1].weight).slope
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
@@ -72,8 +72,20 @@ def test_shape_widens_a_gentle_value_upwards_and_lifts_no_lower_end() -> None:
 
 
 def test_shape_is_the_slope_and_a_doubt() -> None:
-    found = [shared.SHAPES[shared.shape_class(slope)] for slope in (0.0, 0.11, 0.42, 1.0)]
-    assert found == [0.1, 0.2, 0.5, 0.7]
+    shapes = [shared.Shape(slope, 0.0) for slope in (0.0, 0.11, 0.42, 1.0)]
+    assert [shared.SHAPES[shared.shape_class(shape.reader)] for shape in shapes] == [0.1, 0.2, 0.5, 0.7]
+
+
+def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
+    """A service that knows nobody doubts a gentle value more before an alarm; one that knows its fleet hardly."""
+    unknown = shared.UNKNOWN_SHAPE
+    assert unknown.alarm == pytest.approx(0.5, abs=0.01)
+    fusion = acquainted(0.0)
+    known = shape_of(fusion.store.peers, fusion.standings[-1].weight)
+    assert known.std < 0.05
+    assert known.alarm < known.reader + 0.08 < unknown.alarm - 0.2
+    steep = acquainted(0.5)
+    assert shape_of(steep.store.peers, steep.standings[-1].weight).alarm > 0.5
 
 
 def test_vehicle_with_a_record_sharpens_a_cell_and_a_newcomer_does_not() -> None:
