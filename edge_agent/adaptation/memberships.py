@@ -61,7 +61,7 @@ class Memberships:
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
     consequents: tuple[float, ...] = (0.67, 0.25)  # without: in town three times as many contradictions
-    shares: tuple[float, ...] = (-5.0, -3.1, -2.6, -0.7, -1.9, 0.0, -5.0, -1.6, -2.6, 0.0, -1.0, 0.0)
+    shares: tuple[float, ...] = (-5.0, -3.1, -2.6, -0.7, -0.7, 0.0, -5.0, -1.6, -2.6, 0.0, -1.0, 0.0)
     strained: tuple[float, ...] = (-0.9, -0.4)
 
     def __post_init__(self) -> None:
