@@ -18,7 +18,7 @@ from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
-LIVE: Final = ("run", "watch", "page")  # commands that go on until a signal
+LIVE: Final = ("run", "watch", "page", "cits")  # commands that go on until a signal
 
 COMMANDS: Final = (
     Command("run", "fleet_service.cli.run", "run the service: receive observations, serve the map, keep the archive",
@@ -29,6 +29,8 @@ COMMANDS: Final = (
             "fleet-service watch --bbox 11.9,57.6,12.1,57.8"),
     Command("page", "fleet_service.cli.page", "serve the live map for browsers: now, alerts, the past, routes",
             "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
+    Command("cits", "fleet_service.cli.cits", "send alerts as DENM to an AMQP interchange, and take foreign ones",
+            "fleet-service cits --amqp amqps://host:5671 --from subscriptions --witness cits-se"),
     Command("hand-over", "fleet_service.cli.hand_over", "move a region to a standby while it runs",
             "fleet-service hand-over 1202/310/* --to north-b"),
     Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, and compute roll-ups",

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import zenoh
 
@@ -69,6 +69,17 @@ class DatexFile:
             self._say(f"{len(standing)} slippery stretches in {self._path}")
 
 
+class StretchOutput(Protocol):
+    """Publication of stretches that is kept current."""
+
+    @property
+    def is_due(self) -> bool:
+        """Return True if it must be looked at without news."""
+
+    def keep_up(self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+        """Publish the standing stretches."""
+
+
 class DatexFeed:
     """Keeps a publication current with received alerts.
 
@@ -76,7 +87,7 @@ class DatexFeed:
         file: the publication.
     """
 
-    def __init__(self, file: DatexFile) -> None:
+    def __init__(self, file: StretchOutput) -> None:
         self._file, self._stretches, self._lock = file, Stretches(), threading.Lock()
         self._has_news = True
         self._heard: dict[int, bool] = {}

@@ -1,0 +1,153 @@
+"""AMQP 1.0 link to an interchange: messages out until each is accepted, and messages in, on a thread of their own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from schemas.errors import InputError
+
+try:
+    import proton
+    from proton.handlers import MessagingHandler
+    from proton.reactor import ApplicationEvent, Container, EventInjector, Selector
+except ImportError as _missing:
+    _fix = "pip install 'gripmap[cits]'"
+    raise InputError("cits", "the package python-qpid-proton is missing", _fix) from _missing
+
+CREDIT: Final = 200  # messages that the other side may send ahead
+HEARTBEAT_S: Final = 10.0
+RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)  # between two tries to connect
+
+log = logging.getLogger(__name__)
+
+
+class Parcel(NamedTuple):
+    """A message with a name of its sender's."""
+
+    name: str
+    body: bytes
+    properties: Mapping[str, Any]
+
+
+class _Handler(MessagingHandler):  # type: ignore[misc]
+    """Events of the connection; everything here runs on the thread of the container."""
+
+    def __init__(self, link: AmqpLink) -> None:
+        super().__init__(prefetch=CREDIT, auto_accept=True)
+        self._link, self._sender = link, None
+        self._flying: dict[Any, Parcel] = {}
+
+    def on_start(self, event: Any) -> None:  # noqa: ANN401
+        event.container.selectable(self._link.injector)
+        connection = event.container.connect(self._link.url, heartbeat=HEARTBEAT_S, reconnect=list(RETRY_S))
+        if self._link.target:
+            self._sender = event.container.create_sender(connection, self._link.target)
+        if self._link.source:
+            select = Selector(self._link.selector) if self._link.selector else None
+            event.container.create_receiver(connection, self._link.source, options=select)
+
+    def on_connection_opened(self, _: Any) -> None:  # noqa: ANN401
+        self._link.is_connected = True
+
+    def on_disconnected(self, _: Any) -> None:  # noqa: ANN401
+        self._link.is_connected = False
+        log.warning("the interchange at %s does not answer; trying again", self._link.url)
+        waiting = list(self._flying.values())
+        self._flying.clear()
+        self._link.queue.extendleft(reversed(waiting))
+
+    def on_sendable(self, _: Any) -> None:  # noqa: ANN401
+        self._send()
+
+    def on_send(self, _: Any) -> None:  # noqa: ANN401
+        """Send what was queued by another thread."""
+        self._send()
+
+    def on_leave(self, event: Any) -> None:  # noqa: ANN401
+        event.container.stop()
+
+    def _send(self) -> None:
+        sender, queue = self._sender, self._link.queue
+        while sender is not None and queue and sender.credit > 0:
+            parcel = queue.popleft()
+            message = proton.Message(body=parcel.body, properties=dict(parcel.properties), durable=True, inferred=True)
+            self._flying[sender.send(message)] = parcel
+
+    def on_accepted(self, event: Any) -> None:  # noqa: ANN401
+        parcel = self._flying.pop(event.delivery, None)
+        if parcel is not None:
+            self._link.on_accepted(parcel.name)
+
+    def on_rejected(self, event: Any) -> None:  # noqa: ANN401
+        parcel = self._flying.pop(event.delivery, None)
+        if parcel is not None:
+            self._link.rejected += 1
+            log.warning("the interchange refuses message %s: %s", parcel.name, event.delivery.remote.condition)
+            self._link.on_accepted(parcel.name)  # the same content would be refused again
+
+    def on_released(self, event: Any) -> None:  # noqa: ANN401
+        parcel = self._flying.pop(event.delivery, None)
+        if parcel is not None:
+            self._link.queue.append(parcel)
+
+    def on_message(self, event: Any) -> None:  # noqa: ANN401
+        body = event.message.body
+        self._link.on_message(
+            bytes(body) if isinstance(body, bytes | memoryview) else b"", event.message.properties or {}
+        )
+
+
+class AmqpLink:
+    """Connection to an interchange.
+
+    Attributes:
+        is_connected: True while the interchange answers.
+        rejected: messages that it refused.
+
+    Args:
+        url: amqp://HOST:PORT or amqps://HOST:PORT.
+        target: address to send to; "" to send nothing.
+        source: address to receive from; "" to receive nothing.
+        selector: of the messages to receive, e.g. "messageType = 'DENM'".
+        on_accepted: called with the name of each message that needs not be sent again.
+        on_message: called with body and properties of each message that comes in.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        target: str = "",
+        source: str = "",
+        selector: str = "",
+        on_accepted: Callable[[str], None] = lambda _: None,
+        on_message: Callable[[bytes, Mapping[str, Any]], None] = lambda *_: None,
+    ) -> None:  # fmt: skip
+        if not url.startswith(("amqp://", "amqps://")):
+            raise InputError("amqp", f"{url!r} is no address", "write it like amqps://interchange.example.org:5671")
+        self.url, self.target, self.source, self.selector = url, target, source, selector
+        self.on_accepted, self.on_message = on_accepted, on_message
+        self.queue: deque[Parcel] = deque()
+        self.is_connected, self.rejected = False, 0
+        self.injector = EventInjector()
+        self._container = Container(_Handler(self))
+        self._thread = threading.Thread(target=self._container.run, name="amqp", daemon=True)
+
+    def open(self) -> AmqpLink:
+        """Connect, and keep connecting, on a thread."""
+        self._thread.start()
+        return self
+
+    def send(self, parcel: Parcel) -> None:
+        """Queue a message; it is sent until the interchange accepts it."""
+        self.queue.append(parcel)
+        self.injector.trigger(ApplicationEvent("send"))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.injector.trigger(ApplicationEvent("leave"))
+        self._thread.join(5.0)
+        self.injector.close()

@@ -1,0 +1,163 @@
+"""Events of one originating station: which stretch under alert has which number, and what must be sent when. Pure.
+
+A stretch is one event from its first to its last cell, also over restarts: the book is kept in a file and continued.
+An event is sent when it begins, when it changes, before its validity ends, and once more when it is over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
+from fleet_service.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach
+from fleet_service.client.stretches import StretchAlert
+from fleet_service.serve.alerts import QUIET_NS
+from schemas import grid
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+VALID_NS: Final = QUIET_NS  # after which an alert that nobody confirmed may fade
+RENEW_NS: Final = VALID_NS // 2
+ICE_MU: Final = 0.2  # of the road materials that a DENM names, only ice is below
+SEQUENCES: Final = 1 << 16
+SURE: Final = 0.97  # P(slippery) that raises the quality of the information by one
+CELL_STD: Final = 5.0  # [m] of a place within its cell
+TERMINATED_NS: Final = VALID_NS  # for which the number of an ended event is not used again
+
+
+@dataclass(frozen=True)
+class OpenEvent:
+    """An event that was sent.
+
+    Attributes:
+        name: of the stretch.
+        sequence: number of the event.
+        detected, sent: first detection, and time of the last message [ns UTC].
+        state: what the last message said, to see changes.
+        position: latitude and longitude [deg] of the event; stays, so that an update refers to the same place.
+        ended: [ns UTC], 0 while it lasts.
+    """
+
+    name: str
+    sequence: int
+    detected: int
+    sent: int
+    state: tuple[float, ...]
+    position: tuple[float, float]
+    ended: int = 0
+
+
+class EventBook:
+    """All events of a station.
+
+    Args:
+        station: identifier of the originating station.
+        content: what `content` returned before; None for a new book.
+
+    Raises:
+        InputError: the content is of another station or not valid.
+    """
+
+    def __init__(self, station: int, content: dict[str, Any] | None = None) -> None:
+        if not 0 < station < 1 << 32:
+            raise InputError("station", f"{station} is no station identifier", "give 1 to 4294967295")
+        self.station, self._next = station, 0
+        self._events: dict[str, OpenEvent] = {}
+        if content is not None:
+            self._read(content)
+
+    @property
+    def open_events(self) -> list[OpenEvent]:
+        """Return the events that last."""
+        return [event for event in self._events.values() if not event.ended]
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Return the book for a file."""
+        return {
+            "station": self.station, "next": self._next,
+            "events": [asdict(event) for event in self._events.values()],
+        }  # fmt: skip
+
+    def update(
+        self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]
+    ) -> list[Denm]:
+        """Return the messages that are due; events of places without a service do not end.
+
+        Args:
+            standing: every stretch under alert.
+            now: [ns UTC].
+            is_heard: returns True if a service answers for a place (latitude, longitude).
+        """
+        out: list[Denm] = []
+        for name in [name for name, event in self._events.items() if event.ended and now - event.ended > TERMINATED_NS]:
+            del self._events[name]
+        for alert in standing:
+            state = _state(alert)
+            known = self._events.get(alert.id)
+            if known is None or known.ended:
+                known = OpenEvent(alert.id, self._number(), alert.since, 0, (), (alert.latitude, alert.longitude))
+            if known.state != state or now - known.sent >= RENEW_NS:
+                self._events[alert.id] = OpenEvent(
+                    known.name, known.sequence, known.detected, now, state, known.position
+                )
+                out.append(self._message(self._events[alert.id], alert, now))
+        present = {alert.id for alert in standing}
+        for name, event in list(self._events.items()):
+            if name not in present and not event.ended and is_heard(*event.position):
+                out.append(self._end(event, now))
+        return out
+
+    def _end(self, event: OpenEvent, now: int) -> Denm:
+        self._events[event.name] = OpenEvent(
+            event.name, event.sequence, event.detected, now, event.state, event.position, now
+        )
+        return self._head(event, now, "isCancellation")
+
+    def _message(self, event: OpenEvent, alert: StretchAlert, now: int) -> Denm:
+        one_way = len(alert.headings) == 1
+        bearings = [90.0 - 90.0 * grid.HEADINGS.index(heading) for heading in alert.headings]
+        return replace(
+            self._head(event, now, None),
+            quality=min(7, 1 + alert.vehicles + int(alert.p_slippery > SURE)),
+            sub_cause=ICE if alert.mu < ICE_MU else UNKNOWN_SLIPPERY,
+            history=tuple(point for point in alert.points if point != event.position),
+            traces=tuple(approach(event.position, bearing) for bearing in bearings),
+            heading=bearings[0] % 360.0 if one_way else None,
+        )
+
+    def _head(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
+        """Return what all messages of an event have; an update and the end are detected now."""
+        return Denm(
+            self.station, event.sequence, self.station, now, now, termination, event.position, CELL_STD, VALID_NS // NS
+        )
+
+    def _number(self) -> int:
+        used = {event.sequence for event in self._events.values()}
+        for _ in range(SEQUENCES):
+            number = self._next
+            self._next = (self._next + 1) % SEQUENCES
+            if number not in used:
+                return number
+        raise InputError("events", "all 65536 numbers of the station are in use", "use a second station for a part")
+
+    def _read(self, content: dict[str, Any]) -> None:
+        try:
+            if content["station"] != self.station:
+                problem = f"the file is of station {content['station']}"
+                raise InputError("station", problem, "give that station, or another file")
+            self._next = int(content["next"])
+            for one in content["events"]:
+                both = {"state": tuple(one["state"]), "position": tuple(one["position"])}
+                self._events[one["name"]] = OpenEvent(**{**one, **both})
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            fix = "move it away; events that it held end by their validity"
+            raise InputError("state", "the file of events is damaged", fix) from error
+
+
+def _state(alert: StretchAlert) -> tuple[float, ...]:
+    """Return what a receiver should learn of: extent, sub-cause, and witnesses."""
+    return (float(alert.cells), round(alert.length_m), float(alert.mu < ICE_MU), float(min(alert.vehicles, 6)))

@@ -1,0 +1,114 @@
+"""Running gateway: the map's alerts on one side, the interchange on the other."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+
+from fleet_service.cits.amqp import AmqpLink
+from fleet_service.cits.denm import decode
+from fleet_service.cits.foreign import reports
+from fleet_service.cits.output import DenmOutput
+from fleet_service.cits.properties import Originator
+from fleet_service.client.datex_feed import DatexFeed, publish
+from schemas import keys
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.runtime.zenoh_session import open_session, quality_of
+from schemas.wire import JSON
+
+log = logging.getLogger(__name__)
+
+
+class Sending(NamedTuple):
+    """What our DENM need: address, station, publisher and state file."""
+
+    target: str
+    station: int
+    originator: Originator
+    state: Path
+
+
+class Receiving(NamedTuple):
+    """What foreign DENM need: address, selector, and the name of the witness."""
+
+    source: str
+    selector: str
+    witness: str
+
+
+class Witness:
+    """Puts foreign DENM on the bus as reports of one name.
+
+    Attributes:
+        refused: messages that are no DENM.
+        silent: DENM that say nothing about grip here and now.
+    """
+
+    def __init__(self, session: zenoh.Session, name: str, clock: Callable[[], int] = time.time_ns) -> None:
+        self._session, self._name, self._clock = session, name, clock
+        self._boot, self._seq = secrets.randbits(63), 1
+        self.refused = self.silent = 0
+
+    def close(self) -> None:
+        """Close the session."""
+        self._session.close()
+
+    def take(self, body: bytes, _: Mapping[str, Any]) -> None:
+        """Publish what a message says about grip."""
+        try:
+            batches = reports(decode(body), self._name, self._boot, self._seq, self._clock())
+        except InputError as error:
+            self.refused += 1
+            log.warning("a foreign message is ignored: %s", error)
+            return
+        self.silent += not batches
+        for key, payload in batches:
+            self._session.put(key, payload, encoding=JSON, **quality_of(keys.TOPICS["obs"]))
+        self._seq += len(batches)
+
+
+def run(
+    connection: ZenohSettings, url: str, sending: Sending | None, receiving: Receiving | None, stop: threading.Event
+) -> None:
+    """Send and receive until `stop` is set.
+
+    Raises:
+        InputError: no service answers, the state file has other content, or a package is missing.
+    """
+    witness = None
+    if receiving is not None:
+        session = open_session(connection, stop, receiving.witness)
+        if session is None:
+            return
+        witness = Witness(session, receiving.witness)
+    settled: list[Callable[[str], None]] = []
+    link = AmqpLink(
+        url,
+        "" if sending is None else sending.target,
+        "" if receiving is None else receiving.source,
+        "" if receiving is None else receiving.selector,
+        lambda name: settled[0](name),
+        (lambda *_: None) if witness is None else witness.take,
+    )
+    output = None
+    if sending is not None:
+        output = DenmOutput(sending.station, sending.originator, sending.state, link.send)
+        settled.append(output.settle)
+    link.open()
+    try:
+        if output is None:
+            stop.wait()
+        else:
+            publish(connection, DatexFeed(output), stop)
+    finally:
+        link.close()
+        if witness is not None:
+            witness.close()

@@ -1,0 +1,112 @@
+"""Alerts as DENM at an interchange: what must be sent is on disk before it is sent, until it is accepted."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from fleet_service.cits.amqp import Parcel
+from fleet_service.cits.denm import Denm, decode, encode
+from fleet_service.cits.events import EventBook
+from fleet_service.cits.properties import Originator, properties
+from fleet_service.client.stretches import StretchAlert
+from schemas.errors import InputError
+from schemas.runtime import commandline
+from schemas.runtime.durable import open_durably
+
+CHECK_S: Final = 10.0  # between two looks for events whose validity must be renewed
+
+
+class DenmOutput:
+    """Keeps an interchange current with the standing stretches.
+
+    Args:
+        station: identifier of the originating station.
+        originator: for the properties.
+        path: file of events and of messages that are not yet accepted; it is continued.
+        send: takes a message; `settle` is called with its name once it is accepted.
+        clock: [ns UTC].
+
+    Raises:
+        InputError: the file has other content.
+    """
+
+    def __init__(
+        self,
+        station: int,
+        originator: Originator,
+        path: Path,
+        send: Callable[[Parcel], None],
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._originator, self._path, self._send, self._clock = originator, path, send, clock
+        self._lock = threading.Lock()
+        self._checked = -float("inf")
+        before = _read(path)
+        self._book = EventBook(station, None if before is None else before["book"])
+        self._pending: dict[str, bytes] = {}
+        for name, body in ({} if before is None else before["pending"]).items():
+            self._pending[name] = bytes.fromhex(body)
+            self._send(self._parcel(name, self._pending[name], decode(self._pending[name])))
+
+    @property
+    def is_due(self) -> bool:
+        """Return True if the validity of events must be looked at."""
+        return time.monotonic() >= self._checked + CHECK_S
+
+    @property
+    def unsettled(self) -> int:
+        """Number of messages that the interchange has not accepted yet."""
+        return len(self._pending)
+
+    @property
+    def events(self) -> int:
+        """Number of events that last."""
+        return len(self._book.open_events)
+
+    def settle(self, name: str) -> None:
+        """Record that a message was accepted."""
+        with self._lock:
+            self._pending.pop(name, None)
+
+    def keep_up(self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+        """Send what is due.
+
+        Args:
+            standing: every stretch under alert.
+            is_heard: returns True if a service answers for a place (latitude, longitude).
+
+        Raises:
+            InputError: the file cannot be written; nothing was sent.
+        """
+        self._checked = time.monotonic()
+        due = self._book.update(standing, self._clock(), is_heard)
+        with self._lock:
+            fresh = {f"{one.sequence}-{one.referenced}": (encode(one), one) for one in due}
+            self._pending |= {name: body for name, (body, _) in fresh.items()}
+            content = {
+                "book": self._book.content, "pending": {name: body.hex() for name, body in self._pending.items()},
+            }  # fmt: skip
+        with commandline.report_write_errors(self._path), open_durably(self._path) as file:
+            file.write(json.dumps(content).encode())
+        for name, (body, denm) in fresh.items():
+            self._send(self._parcel(name, body, denm))
+
+    def _parcel(self, name: str, body: bytes, denm: Denm) -> Parcel:
+        return Parcel(name, body, properties(denm, self._originator))
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    if not path.exists():
+        return None
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        if not isinstance(found["pending"], dict) or not isinstance(found["book"], dict):
+            raise TypeError("other content")
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError("state", f"{path} is no file of events", "give another, or move it away") from error
+    return found

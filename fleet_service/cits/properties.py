@@ -1,0 +1,72 @@
+"""Application properties of a DENM at an AMQP interchange of C-ROADS and NordicWay. Pure."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Final
+
+from fleet_service.cits.denm import Denm, its_time
+from schemas import grid
+from schemas.errors import InputError
+
+QUAD_ZOOM: Final = 18  # longest key that interchanges index
+PROTOCOL: Final = "DENM:1.3.1"
+
+
+@dataclass(frozen=True)
+class Originator:
+    """Publisher at an interchange.
+
+    Attributes:
+        country: two letters, ISO 3166.
+        publisher: its identifier, by convention the country and five digits, e.g. SE00001.
+        publication: name of this publication there.
+
+    Raises:
+        InputError: country or publisher is not valid.
+    """
+
+    country: str
+    publisher: str
+    publication: str = "gripmap"
+
+    def __post_init__(self) -> None:
+        """Check country and publisher."""
+        if not re.fullmatch("[A-Z]{2}", self.country):
+            raise InputError("country", f"{self.country!r} is no country", "give two capital letters, e.g. SE")
+        if not self.publisher.strip():
+            raise InputError("publisher", "is empty", "give the publisher's identifier at the interchange")
+
+
+def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
+    """Return the properties by which subscribers select.
+
+    The quadtree has the keys of all points of the event, each between commas, so that `quadTree LIKE '%,120002%'`
+    selects all events within a square. Its digits are those of this project's cells and regions.
+    """
+    return {
+        "messageType": "DENM",
+        "protocolVersion": PROTOCOL,
+        "publisherId": originator.publisher,
+        "publicationId": f"{originator.publisher}:{originator.publication}",
+        "originatingCountry": originator.country,
+        "quadTree": quadtree(denm),
+        "latitude": denm.position[0],
+        "longitude": denm.position[1],
+        "timestamp": its_time(denm.referenced),
+        "causeCode": denm.cause,
+        "subCauseCode": denm.sub_cause,
+        "serviceType": "HLN-WCW",  # C-ROADS: hazardous location notification, weather condition warning
+        "shardId": 1,
+        "shardCount": 1,
+    }
+
+
+def quadtree(denm: Denm) -> str:
+    """Return the keys of all squares of an event."""
+    found = {
+        grid.quadkey(int(grid.cell_of(*point)) >> 2 * (grid.CELL_ZOOM - QUAD_ZOOM), QUAD_ZOOM)
+        for point in (denm.position, *denm.history)
+    }
+    return f",{','.join(sorted(found))},"

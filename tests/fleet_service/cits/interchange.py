@@ -1,0 +1,67 @@
+"""An AMQP interchange in the test's process: accepts what is sent to it, and hands out what a test gives it."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import proton
+from proton.handlers import MessagingHandler
+from proton.reactor import ApplicationEvent, Container, EventInjector
+
+
+@dataclass
+class Interchange:
+    """What an interchange received, and its address."""
+
+    url: str
+    received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
+
+
+class _Handler(MessagingHandler):  # type: ignore[misc]
+    def __init__(self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector) -> None:
+        super().__init__(prefetch=500)
+        self._there, self._offered, self._injector = there, deque(offered), injector
+        self.listening = threading.Event()
+
+    def on_start(self, event: Any) -> None:  # noqa: ANN401
+        event.container.selectable(self._injector)
+        event.container.listen(self._there.url)
+        self.listening.set()
+
+    def on_message(self, event: Any) -> None:  # noqa: ANN401
+        self._there.received.append((bytes(event.message.body), dict(event.message.properties)))
+
+    def on_sendable(self, event: Any) -> None:  # noqa: ANN401
+        while self._offered and event.sender.credit > 0:
+            event.sender.send(self._offered.popleft())
+
+    def on_leave(self, event: Any) -> None:  # noqa: ANN401
+        event.container.stop()
+
+
+def free_url() -> str:
+    """Address at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return f"amqp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[Interchange]:
+    """Listen at an address."""
+    there, injector = Interchange(url), EventInjector()
+    handler = _Handler(there, offered, injector)
+    thread = threading.Thread(target=Container(handler).run, daemon=True)
+    thread.start()
+    assert handler.listening.wait(30.0)
+    try:
+        yield there
+    finally:
+        injector.trigger(ApplicationEvent("leave"))
+        thread.join(10.0)
+        injector.close()

@@ -1,0 +1,226 @@
+"""DENM, their events over restarts, the interchange's properties, and foreign DENM as a witness."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import proton
+import pytest
+from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
+
+from fleet_service.app.engine import Engine
+from fleet_service.cits.amqp import AmqpLink, Parcel
+from fleet_service.cits.denm import ICE, SALTED, Denm, approach, decode, encode
+from fleet_service.cits.events import RENEW_NS, VALID_NS
+from fleet_service.cits.foreign import reports
+from fleet_service.cits.output import DenmOutput
+from fleet_service.cits.properties import Originator, properties
+from fleet_service.client.stretches import StretchAlert
+from fleet_service.ingest.inbox import Message
+from schemas import grid
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.thresholds import NS
+from schemas.wire import JSON, Kind
+from tests.fleet_service.cits.interchange import free_url, interchange
+from tests.fleet_service.examples import START
+from tests.waiting import until
+
+OURS = Originator("SE", "SE00001")
+PLACE = (57.7, 11.97)
+
+
+def random_denm(draw: np.random.Generator) -> Denm:
+    """A DENM with everything that ours can have."""
+    position = (float(draw.uniform(-80, 80)), float(draw.uniform(-179, 179)))
+    near = [(position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3))) for _ in range(40)]
+    termination = draw.choice([None, None, "isCancellation", "isNegation"])
+    heading = float(draw.uniform(0, 360)) if termination is None and draw.random() < 0.5 else None
+    return Denm(
+        station=int(draw.integers(1, 1 << 32)), sequence=int(draw.integers(0, 1 << 16)),
+        sender=int(draw.integers(1, 1 << 32)), detected=START, referenced=START + int(draw.integers(0, 1 << 40)),
+        termination=termination, position=position,
+        position_std=float(draw.uniform(0, 60)), validity_s=int(draw.integers(0, 86_401)),
+        quality=int(draw.integers(0, 8)), sub_cause=int(draw.integers(0, 11)),
+        history=tuple(near[: int(draw.integers(0, 30))]),
+        traces=(approach(position, heading or 0.0), *(((),) if draw.random() < 0.5 else ())), heading=heading,
+    )  # fmt: skip
+
+
+def test_second_decoder_reads_and_writes_the_same_bytes() -> None:
+    draw, oracle = np.random.default_rng(42), DENM_PDU_Descriptions.DENM
+    for _ in range(100):
+        sent = random_denm(draw)
+        data = encode(sent)
+        oracle.from_uper(data)
+        assert oracle.to_uper() == data
+        management = oracle.get_val()["denm"]["management"]
+        assert management["actionID"]["sequenceNumber"] == sent.sequence
+        assert management["eventPosition"]["latitude"] == round(1e7 * sent.position[0])
+        assert management.get("termination") == sent.termination
+        read = decode(data)
+        assert encode(read) == data
+        if sent.termination is None:
+            assert (read.sub_cause, len(read.history)) == (sent.sub_cause, min(len(sent.history), 23))
+
+
+def test_a_foreign_denm_with_further_containers_is_read() -> None:
+    oracle = DENM_PDU_Descriptions.DENM
+    oracle.from_uper(encode(replace(random_denm(np.random.default_rng(1)), termination=None)))
+    content = oracle.get_val()
+    content["denm"]["alacarte"] = {"externalTemperature": -3}
+    oracle.set_val(content)
+    read = decode(oracle.to_uper())
+    assert read.sequence == content["denm"]["management"]["actionID"]["sequenceNumber"]
+    assert read.history or "eventHistory" not in content["denm"]["situation"]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x02", bytes(40), b"no DENM at all"])
+def test_bytes_that_are_no_denm_are_refused(data: bytes) -> None:
+    with pytest.raises(InputError, match="^payload: "):
+        decode(data)
+
+
+def stretch(name: str, mu: float = 0.15, place: tuple[float, float] = PLACE, cells: int = 2) -> StretchAlert:
+    points = tuple((place[0] + 1e-4 * k, place[1]) for k in range(cells))
+    return StretchAlert(
+        name, "raised", START, START, 20.0, "north-south", ("north",), *place, (0, 0, 0, 0), cells, mu, 0.1, 0.3, 0.95,
+        3, "", points,
+    )  # fmt: skip
+
+
+class Run:
+    """An output with a clock of its own; `sent` are its messages, `settles` whether the interchange accepts them."""
+
+    def __init__(self, path: Path, settles: bool = True) -> None:
+        self.now, self.sent = START, list[Parcel]()
+        self.path, self.settles = path, settles
+        self.start()
+
+    def start(self) -> None:
+        self.output = DenmOutput(4711, OURS, self.path, self.sent.append, lambda: self.now)
+
+    def step(self, *standing: StretchAlert, heard: bool = True) -> list[Denm]:
+        before = len(self.sent)
+        self.output.keep_up(standing, lambda *_: heard)
+        fresh = self.sent[before:]
+        for parcel in fresh if self.settles else ():
+            self.output.settle(parcel.name)
+        return [decode(parcel.body) for parcel in fresh]
+
+
+def test_an_event_keeps_its_number_over_restarts_until_it_is_cancelled(tmp_path: Path) -> None:
+    run = Run(tmp_path / "cits.json")
+    (begun,) = run.step(stretch("a"))
+    assert (begun.sequence, begun.termination, begun.sub_cause) == (0, None, ICE)
+    assert run.step(stretch("a")) == []
+    run.start()
+    assert run.step(stretch("a")) == [], "a restart says nothing twice"
+    run.now += NS
+    changed, other = run.step(stretch("a", cells=5), stretch("b", place=(57.8, 11.9)))
+    assert (changed.sequence, other.sequence) == (0, 1)
+    assert changed.referenced > begun.referenced
+    run.now += RENEW_NS
+    assert {one.sequence for one in run.step(stretch("a", cells=5), stretch("b", place=(57.8, 11.9)))} == {0, 1}
+    run.start()
+    assert run.step(stretch("b", place=(57.8, 11.9)), heard=False) == [], "no service answers there: nothing ends"
+    (ended,) = run.step(stretch("b", place=(57.8, 11.9)))
+    assert (ended.sequence, ended.termination) == (0, "isCancellation")
+    run.start()
+    assert run.step(stretch("b", place=(57.8, 11.9))) == []
+    assert [one.sequence for one in run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))] == [2], "a new event"
+    assert begun.validity_s * NS == VALID_NS
+
+
+def test_what_the_interchange_has_not_accepted_is_sent_after_a_restart(tmp_path: Path) -> None:
+    run = Run(tmp_path / "cits.json", settles=False)
+    run.step(stretch("a"))
+    run.now += NS
+    run.step()
+    first = list(run.sent)
+    run.sent.clear()
+    run.start()
+    assert [(one.name, one.body) for one in run.sent] == [(one.name, one.body) for one in first]
+    for parcel in first:
+        run.output.settle(parcel.name)
+    run.step()
+    run.sent.clear()
+    run.start()
+    assert run.sent == []
+
+
+def test_a_quadtree_selector_finds_all_events_of_a_square_and_no_other() -> None:
+    draw = np.random.default_rng(7)
+    places = draw.normal(PLACE, 0.2, (300, 2)).tolist()
+    denms = [replace(random_denm(draw), position=tuple(place), history=()) for place in places]
+    found = 0
+    for zoom in (6, 9, 11, 13):
+        for denm in denms[:20]:
+            square = int(grid.parent(int(grid.cell_of(*denm.position)), zoom))
+            selector = f",{grid.quadkey(square, zoom)}"
+            for one in denms:
+                within = int(grid.parent(int(grid.cell_of(*one.position)), zoom)) == square
+                assert (selector in properties(one, OURS)["quadTree"]) == within
+                found += within
+    assert found > 300
+
+
+def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_path: Path) -> None:
+    url, settled, came = free_url(), list[str](), list[bytes]()
+    foreign = encode(replace(random_denm(np.random.default_rng(3)), termination=None))
+
+    def keep(body: bytes, _: Mapping[str, Any]) -> None:
+        came.append(body)
+
+    link = AmqpLink(url, "deliveries", "subscriptions", "", settled.append, keep).open()
+    run = Run(tmp_path / "cits.json", settles=False)
+    run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))
+    for parcel in run.sent:
+        link.send(parcel)
+    with interchange(url, [proton.Message(body=foreign, inferred=True)]) as there:
+        until(lambda: len(settled) == 2 and came)
+        link.close()
+    assert sorted(settled) == sorted(parcel.name for parcel in run.sent)
+    assert [body for body, _ in there.received] == [parcel.body for parcel in run.sent]
+    assert all(given["messageType"] == "DENM" and given["causeCode"] == 6 for _, given in there.received)
+    assert came == [foreign]
+
+
+def heard(engine: Engine, batches: list[tuple[str, bytes]], now: int) -> int:
+    engine.ingest([Message(Kind.OBSERVATION, key, payload, JSON) for key, payload in batches], now)
+    return engine.alerts
+
+
+@pytest.mark.parametrize("cars", [0, 2])
+def test_foreign_denm_alone_raise_nothing_and_do_not_hide_what_cars_find(tmp_path: Path, cars: int) -> None:
+    denm = replace(Denm(99, 1, 99, START, START, None, PLACE, 5.0, 3600, sub_cause=ICE), heading=0.0)
+    engine = Engine(ServiceConfig(), tmp_path / "archive")
+    try:
+        for turn in range(10):
+            now = START + 30 * turn * NS
+            again = replace(denm, referenced=now, sequence=turn)
+            alerts = heard(engine, reports(again, "cits-se", 5, 1 + turn, now), now)
+            for car in range(cars):
+                seen = reports(replace(again, sender=car), f"car-{car:03}", 7, 1 + turn, now)
+                alerts = heard(engine, seen, now)
+        assert bool(alerts) == bool(cars)
+        assert engine.counts[Kind.OBSERVATION] == 10 * (1 + cars), dict(engine.counts)
+    finally:
+        engine.close()
+
+
+def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
+    denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE)
+    said = json.loads(reports(denm, "cits-se", 5, 1, START)[0][1])
+    assert said["mu"] == [0.2]
+    for other in (
+        replace(denm, termination="isCancellation"), replace(denm, cause=1), replace(denm, sub_cause=SALTED),
+        replace(denm, position_std=40.9),
+    ):  # fmt: skip
+        assert reports(other, "cits-se", 5, 1, START) == []
+    assert reports(denm, "cits-se", 5, 1, START + 601 * NS) == []
