@@ -13,7 +13,7 @@ export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of pro
 .DEFAULT_GOAL := help
 .PHONY: help campaigns setup demo test test-all test-shuffled check package docs lint types results figures release \
   faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability roads-bench \
-  page-bench ahead-bench browser-test batch-bench image kube country-bench
+  page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
 
 help:  #- print the main targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | awk -F '\t' '{printf "%-18s%s\n", $$1, $$2}'
@@ -27,7 +27,7 @@ setup: $(STAMP)  ## install everything into .venv, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,iceberg,inputs,metrics,objects,page,webhook]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,cits,demo,dev,iceberg,inputs,mcap,metrics,objects,page,webhook]'
 	$(BIN)/python -m deploy.precompile
 	touch $@
 
@@ -86,6 +86,9 @@ ahead-bench: setup  #= warnings in the car, and the map as a prior
 	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
 	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
 
+iov-bench: setup  #= DENM at an interchange; routes around ice with Valhalla's programs
+	$(BIN)/python -m tests.benchmarks.iov
+
 usability: setup  #= the first hour of a new user; needs Chromium and unshare
 	$(BIN)/python -m tests.usability
 
@@ -141,4 +144,4 @@ lock: setup  #- write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf deploy/docs/reference/generated .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info
+	rm -rf deploy/docs/reference/generated .iov .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info

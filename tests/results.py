@@ -76,6 +76,7 @@ CAMPAIGNS: Final = {
     "analytics": Campaign("make analytics-bench", ".analytics", "analytics"),
     "batch": Campaign("make batch-bench", ".batch", "batch"),
     "page": Campaign("make page-bench", ".page", "page"),
+    "iov": Campaign("make iov-bench", ".iov", "iov"),
     "roads": Campaign("make roads-bench", ".roads", "roads"),
     "kube": Campaign("make kube", ".kube", "kube"),
     "usability": Campaign("make usability", ".usability", "usability"),

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
+from edge_agent.app.mcap_file import McapTableWriter
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.durable import open_durably
@@ -22,7 +23,17 @@ from schemas.tables import ESTIMATES_SCHEMA
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
-ENDINGS: Final[dict[str, Any]] = {"": pq.ParquetWriter, ".parquet": pq.ParquetWriter, ".csv": pacsv.CSVWriter}
+ENDINGS: Final[dict[str, Any]] = {
+    "": pq.ParquetWriter,
+    ".parquet": pq.ParquetWriter,
+    ".csv": pacsv.CSVWriter,
+    ".mcap": McapTableWriter,
+}
+    "": pq.ParquetWriter,
+    ".parquet": pq.ParquetWriter,
+    ".csv": pacsv.CSVWriter,
+    ".mcap": McapTableWriter,
+}
 WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper"))
 
 

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     add_estimator(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, help="estimates to write (.parquet, .csv); of several logs, a folder"
+        "--out", type=Path, required=True, help="estimates to write (.parquet, .csv, .mcap); of several logs, a folder"
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument("--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)")

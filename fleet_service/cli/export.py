@@ -7,6 +7,7 @@ iceberg` writes no file: it registers the compacted files in Iceberg tables.
 from __future__ import annotations
 
 import argparse
+import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -29,18 +30,22 @@ ENDINGS: Final = (".parquet", ".geojson", ".csv")
 WHAT: Final = ("map", "observations", "rollup")
 DATEX: Final = "datex"
 ICEBERG: Final = "iceberg"
+ROUTERS: Final = ("valhalla", "graphhopper")
 _LIVE: Final = ("country", "supplier", "follow", "connect", "config")
+_ROADS: Final = ("roads", "exclude_ice")
 _PART: Final = ("bbox", "since", "until")
 _TABLE: Final = ("catalog", "namespace", "at")
 _NOT: Final = {  # options of another kind of export
-    **dict.fromkeys(WHAT, (*_LIVE, *_TABLE)),
-    DATEX: ("archive", *_PART, *_TABLE),
-    ICEBERG: (*_LIVE, *_PART, "out", "snapshot"),
+    **dict.fromkeys(WHAT, (*_LIVE, *_TABLE, *_ROADS)),
+    DATEX: ("archive", *_PART, *_TABLE, *_ROADS),
+    ICEBERG: (*_LIVE, *_PART, *_ROADS, "out", "snapshot"),
+    **dict.fromkeys(ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "snapshot")),
 }
 _NEEDS: Final = {
     **dict.fromkeys(WHAT, ("archive", "out")),
     DATEX: ("country", "supplier", "out"),
     ICEBERG: ("archive", "catalog"),
+    **dict.fromkeys(ROUTERS, ("roads", "out")),
 }
 
 
@@ -49,8 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser, required=False)
     parser.add_argument(
         "what",
-        choices=(*WHAT, DATEX, ICEBERG),
-        metavar="|".join((*WHAT, DATEX, ICEBERG)),
+        choices=(*WHAT, DATEX, ICEBERG, *ROUTERS),
+        metavar="|".join((*WHAT, DATEX, ICEBERG, *ROUTERS)),
         help="the part of the archive, or of the live map",
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
@@ -61,6 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--snapshot", action="store_true", help="map: use the service's last hourly snapshot, at once")
     add_connection(parser)
     add_supplier(parser)
+    parser.add_argument("--roads", metavar="FILE", type=Path, help="valhalla, graphhopper: extract of the road network")
+    parser.add_argument("--exclude-ice", action="store_true", help="valhalla: forbid sure ice, not only make it dear")
     parser.add_argument("--follow", action="store_true", help="datex: keep the file current until a signal")
     parser.add_argument(
         "--catalog",
@@ -88,6 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")
     if arguments.what == DATEX:
         return _datex(arguments)
+    if arguments.what in ROUTERS:
+        return _route_costs(arguments)
     return on_archive(arguments, _iceberg if arguments.what == ICEBERG else _export)
 
 
@@ -99,6 +108,26 @@ def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
     done = register(root, place)
     line = f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in {place.catalog}"
     return ArchiveReport(line, dict(done._asdict()))
+
+
+def _route_costs(arguments: argparse.Namespace) -> int:
+    """Write the costs of low grip for a route planner, from the live map and a road network."""
+    from fleet_service.analytics.roads.network import read_network
+    from fleet_service.client import map_client, routing
+
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".json",))
+    links = read_network(arguments.roads).links
+    box = {"format": "arrow"} | ({} if arguments.bbox is None else {"bbox": arguments.bbox})
+    table = map_client.served_table(map_client.ask(map_client.settings(arguments.connect, arguments.config), box))
+    lines = routing.cost_lines(table, (routing.RoadLine(link.latitude, link.longitude) for link in links))
+    if arguments.what == "graphhopper":
+        costs = routing.graphhopper(lines)
+    else:
+        costs = routing.valhalla(lines, routing.ice_cells(table) if arguments.exclude_ice else ())
+    with commandline.report_write_errors(arguments.out):
+        arguments.out.write_text(json.dumps(costs), encoding="utf-8")
+    print(f"{len(lines)} stretches of low grip in {arguments.out}", flush=True)
+    return 0
 
 
 def _datex(arguments: argparse.Namespace) -> int:

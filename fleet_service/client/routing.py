@@ -1,0 +1,173 @@
+"""Grip along road links as costs of a route planner: factors for Valhalla, a model for GraphHopper. Pure.
+
+The factor comes from the lower bound of grip. Only measured and borrowed cells count: a cell without excitation has a
+low bound because nothing is known there, and unknown is not slippery. A factor is a cost, not a time: Valhalla scales
+the travel time that it reports by it, so the time of a chosen route must be asked for again without factors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import METRES_PER_DEGREE
+
+STEP_M: Final = 5.0  # between two looks along a link
+# Braking distance grows with 1/mu. Squared, a way round of a fifth is worth it from mu .45 of .5 on, and ten times the
+# length at mu .16.
+GOOD_GRIP: Final = 0.5  # lower bound of a wet road; above it costs nothing
+POWER: Final = 2.0
+MOST: Final = 20.0  # Valhalla refuses too great a spread, and finds no way round ice at the destination otherwise
+STEPS: Final = (1.0, 1.5, 2.5, 5.0, 10.0, MOST)  # factors that are written; neighbours of one class are one line
+SHORTEST_M: Final = 15.0  # a line that can be placed on a link
+ICE_LOWER, ICE_SURE = 0.3, 0.9  # upper end below which, and P(slippery) from which, a cell is taken out as ice
+HALF_WIDTH_M: Final = 8.0  # of a polygon around a road
+
+
+class RoadLine(NamedTuple):
+    """Directed polyline of a road: latitude and longitude [deg] in the order of travel."""
+
+    latitude: FloatArray
+    longitude: FloatArray
+
+
+class CostLine(NamedTuple):
+    """Part of a road with one factor; points are (longitude, latitude)."""
+
+    factor: float
+    points: list[tuple[float, float]]
+
+
+def factors(mu_lower: FloatArray) -> FloatArray:
+    """Return the factor of each lower bound of grip: 1 from GOOD_GRIP on, at most MOST."""
+    ratio = GOOD_GRIP / np.maximum(mu_lower, 1e-3)
+    exact = np.clip(ratio**POWER, 1.0, MOST)
+    steps = np.array(STEPS)
+    return np.asarray(steps[np.searchsorted(steps, exact - 1e-9)], np.float64)
+
+
+def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
+    """Return the parts of roads that cost more than their time.
+
+    Args:
+        table: cells of the map, as a query returns them.
+        roads: directed links of the network.
+    """
+    key, factor = _known(table)
+    out: list[CostLine] = []
+    for road in roads:
+        latitude, longitude, yaw = _marks(road)
+        if not len(latitude):
+            continue
+        place = grid.SECTORS * grid.cell_of(latitude, longitude) + grid.sector_of(yaw)
+        found = np.searchsorted(key, place)
+        found[found == len(key)] = 0
+        cost = np.where(key[found] == place, factor[found], 1.0) if len(key) else np.ones(len(place))
+        out += _lines(cost, latitude, longitude)
+    return out
+
+
+def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
+    """Return rings (longitude, latitude) of the cells that are surely ice."""
+    upper, slippery = (np.nan_to_num(_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery"))
+    ice = (upper < ICE_LOWER) & (slippery >= ICE_SURE) & _counts(table)
+    cells = np.unique(np.asarray(table["cell"].to_numpy(), np.int64)[ice])
+    west, south, east, north = grid.bounds(cells)
+    corners = zip(west.tolist(), south.tolist(), east.tolist(), north.tolist(), strict=True)
+    return [[(w, s), (e, s), (e, n), (w, n), (w, s)] for w, s, e, n in corners]
+
+
+def valhalla(lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()) -> dict[str, Any]:
+    """Return what is merged into a Valhalla request for a route."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"factor": line.factor},
+            "geometry": {"type": "LineString", "coordinates": line.points},
+        }
+        for line in lines
+    ]
+    found: dict[str, Any] = {"linear_cost_factors": features}
+    if rings:
+        found["exclude_polygons"] = list(rings)
+    return found
+
+
+def graphhopper(lines: Sequence[CostLine]) -> dict[str, Any]:
+    """Return a custom model for GraphHopper: one area per class of cost, and the priority there."""
+    areas, priority = [], []
+    for number, factor in enumerate(STEPS[1:], 1):
+        rings = [[_ribbon(line.points)] for line in lines if line.factor == factor]
+        if not rings:
+            continue
+        name = f"low_grip_{number}"
+        shape = {"type": "MultiPolygon", "coordinates": rings}
+        areas.append({"type": "Feature", "id": name, "properties": {}, "geometry": shape})
+        priority.append({"if": f"in_{name}", "multiply_by": f"{1.0 / factor:.3f}"})
+    return {"priority": priority, "areas": {"type": "FeatureCollection", "features": areas}}
+
+
+def _column(table: pa.Table, name: str) -> FloatArray:
+    return np.asarray(table[name].to_numpy(), np.float64)
+
+
+def _counts(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return np.array([basis in ("measured", "borrowed") for basis in table["basis"].to_pylist()], np.bool_)
+
+
+def _known(table: pa.Table) -> tuple[IntArray, FloatArray]:
+    """Return cell and sector as one sorted number, and the factor there."""
+    counts = _counts(table)
+    cell, sector = (np.asarray(table[name].to_numpy(), np.int64)[counts] for name in ("cell", "sector"))
+    factor = factors(_column(table, "mu_lower")[counts])
+    key = grid.SECTORS * cell + sector
+    order = np.argsort(key)
+    return key[order], factor[order]
+
+
+def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return points every STEP_M along a road, with the yaw there; none of a road without length."""
+    east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(road.latitude))))
+    dx, dy = np.diff(road.longitude) * east, np.diff(road.latitude) * METRES_PER_DEGREE
+    steps = np.hypot(dx, dy)
+    keep = np.r_[True, steps > 0.0]
+    run = np.r_[0.0, np.cumsum(steps)][keep]
+    if len(run) < 2:
+        return np.empty(0), np.empty(0), np.empty(0)
+    at = np.linspace(0.0, run[-1], max(2, int(np.ceil(run[-1] / STEP_M)) + 1))
+    piece = np.minimum(np.searchsorted(run, at, side="right") - 1, len(run) - 2)
+    yaw = np.arctan2(dy, dx)[steps > 0.0][piece]
+    return np.interp(at, run, road.latitude[keep]), np.interp(at, run, road.longitude[keep]), yaw
+
+
+def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> list[CostLine]:
+    """Return the runs of one factor; a run that is too short joins the dearer neighbour's class by its own end."""
+    ends = np.flatnonzero(np.r_[True, np.diff(cost) != 0.0, True])
+    out = []
+    for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        if cost[first] <= 1.0:
+            continue
+        begin, end = first, min(last, len(cost) - 1)
+        while (end - begin) * STEP_M < SHORTEST_M and (begin > 0 or end < len(cost) - 1):
+            begin, end = max(begin - 1, 0), min(end + 1, len(cost) - 1)
+        points = list(zip(longitude[begin : end + 1].tolist(), latitude[begin : end + 1].tolist(), strict=True))
+        out.append(CostLine(float(cost[first]), points))
+    return out
+
+
+def _ribbon(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the ring around a line, HALF_WIDTH_M to both sides."""
+    longitude, latitude = np.array(points).T
+    east = METRES_PER_DEGREE * np.cos(np.radians(latitude.mean()))
+    dx, dy = np.gradient(longitude) * east, np.gradient(latitude) * METRES_PER_DEGREE
+    length = np.maximum(np.hypot(dx, dy), 1e-9)
+    across_x, across_y = -dy / length * HALF_WIDTH_M / east, dx / length * HALF_WIDTH_M / METRES_PER_DEGREE
+    left = list(zip((longitude + across_x).tolist(), (latitude + across_y).tolist(), strict=True))
+    right = list(zip((longitude - across_x).tolist(), (latitude - across_y).tolist(), strict=True))
+    ring = [*left, *right[::-1]]
+    return [*ring, ring[0]]

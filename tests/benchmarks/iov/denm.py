@@ -1,0 +1,103 @@
+"""DENM of many events through an interchange: validity by a second decoder, identity over restarts, and rate."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.cits.amqp import AmqpLink
+from fleet_service.cits.denm import decode
+from fleet_service.cits.output import DenmOutput
+from fleet_service.cits.properties import Originator
+from fleet_service.client.stretches import StretchAlert
+from schemas import grid
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+from tests.fleet_service.cits.interchange import free_url, interchange
+from tests.waiting import until
+
+START: Final = 1_700_000_000 * NS
+STATION: Final = 4711
+CENTRE: Final = (57.7, 11.97)
+
+
+def _stretch(number: int, draw: np.random.Generator) -> StretchAlert:
+    latitude, longitude = draw.normal(CENTRE, 0.2).tolist()
+    points = tuple((latitude + 1e-4 * k, longitude) for k in range(int(draw.integers(1, 12))))
+    return StretchAlert(
+        f"s{number}", "raised", START, START, 20.0, "north-south", ("north",), latitude, longitude, (0, 0, 0, 0),
+        len(points), float(draw.uniform(0.1, 0.35)), 0.1, 0.4, 0.95, int(draw.integers(2, 6)), "", points,
+    )  # fmt: skip
+
+
+def measure_denm(folder: Path, quick: bool) -> list[Figure]:
+    """Raise, change and end events, with a restart of the gateway after each step."""
+    from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
+
+    draw, url, path = np.random.default_rng(4202), free_url(), folder / "cits.json"
+    path.unlink(missing_ok=True)
+    events, now = 500 if quick else 2000, [START]
+    stretches = [_stretch(number, draw) for number in range(events)]
+    steps = [
+        stretches,
+        [replace(one, cells=one.cells + 1) if k % 2 else one for k, one in enumerate(stretches)],
+        stretches[events // 2 :],
+        [],
+    ]
+    originator = Originator("SE", "SE00001")
+    seconds = []
+    with interchange(url) as there:
+        for standing in steps:
+            settled: list[str] = []
+            link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
+            until(lambda link=link: link.is_connected)  # type: ignore[misc]
+            output = DenmOutput(STATION, originator, path, link.send, lambda: now[0])
+            now[0] += NS
+            before, began = len(there.received), time.perf_counter()
+            output.keep_up(standing, lambda *_: True)
+            sent = output.unsettled
+            until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
+            seconds.append((sent, time.perf_counter() - began))
+            for name in settled:
+                output.settle(name)
+            output.keep_up(standing, lambda *_: True)
+            link.close()
+            assert len(there.received) - before == sent
+    oracle, invalid = DENM_PDU_Descriptions.DENM, 0
+    first: dict[int, tuple[float, float]] = {}
+    doubled, last = 0, dict[int, str | None]()
+    for body, _ in there.received:
+        oracle.from_uper(body)
+        invalid += oracle.to_uper() != body
+        denm = decode(body)
+        doubled += first.setdefault(denm.sequence, denm.position) != denm.position
+        last[denm.sequence] = denm.termination
+    rate = max(count / took for count, took in seconds if count > events // 4)
+    return [
+        Figure("denm.invalid", float(invalid), "messages that a second decoder does not write byte for byte", 0.0),
+        Figure("denm.duplicated", float(doubled + len(first) - events), "events over restarts", 0.0),
+        Figure("denm.unterminated", float(sum(end is None for end in last.values())), "events over restarts", 0.0),
+        Figure("denm.selector", float(_selected_wrongly(there.received)), "events of a quadTree selector", 0.0),
+        Figure("denm.per_s", rate, "messages/s, encoded, sent and accepted", 2000.0, "more"),
+        Figure("denm.events", float(len(first)), "events", 100.0, "more"),
+    ]
+
+
+def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
+    """Return how often `quadTree LIKE '%,DIGITS%'` and the place of an event disagree."""
+    wrong, squares = 0, set[tuple[int, int]]()
+    denms = [(decode(body), given) for body, given in received]
+    lasting = [(denm, given) for denm, given in denms if denm.termination is None]
+    for denm, _ in lasting[:10]:
+        for zoom in (8, 11, 14):
+            squares.add((zoom, int(grid.cell_of(*denm.position, zoom=zoom))))
+    for zoom, square in squares:
+        digits = f",{grid.quadkey(square, zoom)}"
+        for denm, given in lasting:
+            inside = any(int(grid.cell_of(*point, zoom=zoom)) == square for point in (denm.position, *denm.history))
+            wrong += (digits in str(given["quadTree"])) != inside
+    return wrong
