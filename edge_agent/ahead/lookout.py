@@ -86,8 +86,9 @@ class Lookout:
     def __init__(
         self, names: Sequence[str], hear: Hear, route_of: RouteOf = lambda _: None,
         listening: Callable[[int], bool] = lambda _: True,
+        on_horizons: Callable[[str, list[Horizon], Pose], None] = lambda *_: None,
     ) -> None:  # fmt: skip
-        self._hear, self._route_of = hear, route_of
+        self._hear, self._route_of, self._on_horizons = hear, route_of, on_horizons
         self._watchers = {k: _Watcher(name) for k, name in enumerate(names) if listening(k)}
         self._number = {watcher.name: k for k, watcher in self._watchers.items()}
         self._poses: Sequence[Pose] = ()
@@ -198,6 +199,7 @@ class Lookout:
             watcher.active, issued = update_warnings(watcher.active, horizons, pose, subscriber.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
+        self._on_horizons(watcher.name, horizons, pose)
         for warning in issued:
             self.counts.warnings += 1
             self._hear(watcher.name, warning)

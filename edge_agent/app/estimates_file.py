@@ -29,11 +29,6 @@ ENDINGS: Final[dict[str, Any]] = {
     ".csv": pacsv.CSVWriter,
     ".mcap": McapTableWriter,
 }
-    "": pq.ParquetWriter,
-    ".parquet": pq.ParquetWriter,
-    ".csv": pacsv.CSVWriter,
-    ".mcap": McapTableWriter,
-}
 WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper"))
 
 

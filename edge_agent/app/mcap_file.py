@@ -44,7 +44,7 @@ class McapTableWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write_table(self, table: pa.Table) -> None:
         """Add the samples of a table."""

@@ -36,6 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--trust", action="store_true", help="publish although the signal doctor did not pass the signals"
     )
     parser.add_argument("--ahead", action="store_true", help="receive the map and warn of slippery road ahead")
+    parser.add_argument("--autoware", metavar="ENDPOINT", help="with --ahead: router of a planner for limits")
+    parser.add_argument("--autoware-hash", metavar="RIHS01_…", help="hash of VelocityLimit in that planner's version")
     parser.add_argument("--route", type=Path, help="route for --ahead (GPX or GeoJSON)")
     parser.add_argument("--vss", action="store_true", help="report the friction as VSS signals, one line of JSON each")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); required except for simulated")
@@ -62,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     config = load(args.config, AgentConfig)
     if args.route is not None and not args.ahead:
         raise InputError("route", "is of no use without --ahead", "give both, or neither")
+    if args.autoware is not None and not args.ahead:
+        raise InputError("autoware", "is of no use without --ahead", "give both, or neither")
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _live(args, sources, config)
@@ -91,7 +95,13 @@ def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookou
     from edge_agent.cli.live import warning_lines
 
     route = read_route(args.route) if args.route is not None else None
-    return Lookout([name], warning_lines(config), lambda _: route)
+    if args.autoware is None:
+        return Lookout([name], warning_lines(config), lambda _: route)
+    from edge_agent.ahead.planner import ANY_HASH
+    from edge_agent.publish.planner_link import PlannerLink
+
+    planner = PlannerLink(args.autoware, args.autoware_hash or ANY_HASH)
+    return Lookout([name], warning_lines(config), lambda _: route, on_horizons=planner.hear)
 
 
 def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFrictionOutput | None:

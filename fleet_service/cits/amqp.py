@@ -33,15 +33,17 @@ class Parcel(NamedTuple):
     properties: Mapping[str, Any]
 
 
-class _Handler(MessagingHandler):  # type: ignore[misc]
+class _Handler(MessagingHandler):
     """Events of the connection; everything here runs on the thread of the container."""
 
     def __init__(self, link: AmqpLink) -> None:
         super().__init__(prefetch=CREDIT, auto_accept=True)
-        self._link, self._sender = link, None
+        self._link = link
+        self._sender: Any = None
         self._flying: dict[Any, Parcel] = {}
 
     def on_start(self, event: Any) -> None:  # noqa: ANN401
+        self._container = event.container
         event.container.selectable(self._link.injector)
         connection = event.container.connect(self._link.url, heartbeat=HEARTBEAT_S, reconnect=list(RETRY_S))
         if self._link.target:
@@ -67,8 +69,8 @@ class _Handler(MessagingHandler):  # type: ignore[misc]
         """Send what was queued by another thread."""
         self._send()
 
-    def on_leave(self, event: Any) -> None:  # noqa: ANN401
-        event.container.stop()
+    def on_leave(self, _: Any) -> None:  # noqa: ANN401
+        self._container.stop()
 
     def _send(self) -> None:
         sender, queue = self._sender, self._link.queue

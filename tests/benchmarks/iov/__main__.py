@@ -13,6 +13,7 @@ import numpy as np
 from fleet_service.client import routing
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
+from schemas.thresholds import METRES_PER_DEGREE
 from tests.benchmarks.iov import routes
 from tests.benchmarks.iov.denm import measure_denm
 
@@ -88,7 +89,7 @@ def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
     for middle in middles * scale:
         share = np.clip(((middle - first) * along).sum(axis=1) / length, 0.0, 1.0)
         gap = np.hypot(*(first + share[:, None] * along - middle).T).min()
-        if gap * routes.METRES_PER_DEGREE < 5.0:
+        if gap * METRES_PER_DEGREE < 5.0:
             return True
     return False
 

@@ -23,13 +23,14 @@ class Interchange:
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
 
 
-class _Handler(MessagingHandler):  # type: ignore[misc]
+class _Handler(MessagingHandler):
     def __init__(self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector) -> None:
         super().__init__(prefetch=500)
         self._there, self._offered, self._injector = there, deque(offered), injector
         self.listening = threading.Event()
 
     def on_start(self, event: Any) -> None:  # noqa: ANN401
+        self._container = event.container
         event.container.selectable(self._injector)
         event.container.listen(self._there.url)
         self.listening.set()
@@ -41,8 +42,8 @@ class _Handler(MessagingHandler):  # type: ignore[misc]
         while self._offered and event.sender.credit > 0:
             event.sender.send(self._offered.popleft())
 
-    def on_leave(self, event: Any) -> None:  # noqa: ANN401
-        event.container.stop()
+    def on_leave(self, _: Any) -> None:  # noqa: ANN401
+        self._container.stop()
 
 
 def free_url() -> str:

@@ -1,0 +1,105 @@
+"""Speed limit for a motion planner from the lower bound of grip ahead, as Autoware's message VelocityLimit.
+
+The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place ahead. It falls at
+once and rises only after it was higher for HOLD_S, so that a planner does not see it flutter. A road that nobody
+measured gives no limit.
+
+Autoware listens on `/planning/scenario_planning/max_velocity_candidates` (tier4_planning_msgs/msg/VelocityLimit). The
+message is put as rmw_zenoh puts it: CDR, with an attachment of number, time and identity of the sender.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import struct
+from typing import Final
+
+import numpy as np
+
+from edge_agent.ahead.horizon import COMFORT, MARGIN_M, Horizon
+from schemas.numeric import FloatArray
+from schemas.thresholds import NS
+
+TOPIC: Final = "planning/scenario_planning/max_velocity_candidates"
+TYPE: Final = "tier4_planning_msgs::msg::dds_::VelocityLimit_"
+ANY_HASH: Final = "TypeHashNotSupported"  # rmw_zenoh's word for a sender without one
+SENDER: Final = "gripmap"
+HOLD_S: Final = 3.0
+STEP: Final = 1.0  # [m/s] by which a limit changes before a planner hears of it
+FREE: Final = 1e3  # [m/s] no limit: above any planner's own
+MIN_JERK: Final = -1.0  # [m/s^3] of the braking that a limit asks for
+MAX_JERK: Final = 1.0
+_GID_BYTES: Final = 16
+
+
+def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
+    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT; inf without any.
+
+    Args:
+        distance: (M,) [m] from the vehicle.
+        safe_speed: (M,) [m/s]; NaN where unknown.
+    """
+    known = np.isfinite(safe_speed)
+    if not known.any():
+        return math.inf
+    way = np.maximum(distance[known] - MARGIN_M, 0.0)
+    return float(np.sqrt(safe_speed[known] ** 2 + 2.0 * COMFORT * way).min())
+
+
+def limit_of(horizons: list[Horizon]) -> float:
+    """Return the lowest limit over all ways on [m/s]; inf without any."""
+    found = [limit_ahead(np.arange(len(one.safe_speed), dtype=np.float64), one.safe_speed) for one in horizons]
+    return min(found, default=math.inf)
+
+
+class SteadyLimit:
+    """Limit with hysteresis: it falls at once, and rises after it was higher for HOLD_S."""
+
+    def __init__(self) -> None:
+        self.value = math.inf
+        self._higher_since: int | None = None
+
+    def update(self, limit: float, now: int) -> bool:
+        """Take a new limit [m/s] at `now` [ns]; return True if the value changed."""
+        if limit < self.value:
+            self._higher_since = None
+            changed = self.value - limit >= STEP or self.value == math.inf
+            if changed:
+                self.value = limit
+            return changed
+        if limit < self.value + STEP:
+            self._higher_since = None
+            return False
+        if self._higher_since is None:
+            self._higher_since = now
+        if now - self._higher_since < HOLD_S * NS:
+            return False
+        self.value, self._higher_since = limit, None
+        return True
+
+
+def encode_limit(limit: float, now: int) -> bytes:
+    """Return a VelocityLimit as CDR, little endian; inf is written as FREE."""
+    sender = SENDER.encode() + b"\0"
+    speed = min(limit, FREE)
+    body = struct.pack("<iIfB3x", now // NS, now % NS, speed, 1) + struct.pack("<fff", -COMFORT, MAX_JERK, MIN_JERK)
+    return b"\x00\x01\x00\x00" + body + struct.pack("<I", len(sender)) + sender
+
+
+class PlannerKey:
+    """Key and attachments of one sender.
+
+    Args:
+        domain: of ROS.
+        type_hash: of the message in the planner's version, e.g. RIHS01_…; rmw_zenoh subscribes to it literally.
+    """
+
+    def __init__(self, domain: int = 0, type_hash: str = ANY_HASH) -> None:
+        self.key = f"{domain}/{TOPIC}/{TYPE}/{type_hash}"
+        self._number, self._identity = 0, secrets.token_bytes(_GID_BYTES)
+
+    def attachment(self, now: int) -> bytes:
+        """Return the attachment of the next message."""
+        self._number += 1
+        return struct.pack("<qqB", self._number, now, _GID_BYTES) + self._identity

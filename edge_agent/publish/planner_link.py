@@ -1,0 +1,54 @@
+"""Zenoh session at the planner of the vehicle: its speed limit whenever it changes, and again every REPEAT_S."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Final
+
+import zenoh
+
+from edge_agent.ahead.horizon import Horizon
+from edge_agent.ahead.path import Pose
+from edge_agent.ahead.planner import PlannerKey, SteadyLimit, encode_limit, limit_of
+from schemas.config import ZenohSettings
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+
+REPEAT_S: Final = 2.0  # for a planner that starts later
+
+log = logging.getLogger(__name__)
+
+
+class PlannerLink:
+    """Publishes the limit ahead of one vehicle.
+
+    Args:
+        endpoint: Zenoh router of the planner; the session opens on a thread of its own.
+        type_hash: of VelocityLimit in the planner's version.
+        domain: of ROS.
+    """
+
+    def __init__(self, endpoint: str, type_hash: str, domain: int = 0) -> None:
+        self._settings = ZenohSettings(connect=[endpoint])
+        self._key, self._limit = PlannerKey(domain, type_hash), SteadyLimit()
+        self._session: zenoh.Session | None = None
+        self._sent = 0
+        threading.Thread(target=self._connect, name="planner", daemon=True).start()
+
+    def _connect(self) -> None:
+        self._session = open_session(self._settings)
+
+    def hear(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
+        """Take a look ahead; publish if the limit changed or was not repeated for REPEAT_S."""
+        changed = self._limit.update(limit_of(horizons), pose.time)
+        if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):
+            return
+        self._sent = pose.time
+        try:
+            self._session.put(
+                self._key.key, encode_limit(self._limit.value, pose.time),
+                attachment=self._key.attachment(pose.time), priority=zenoh.Priority.REAL_TIME, express=True,
+            )  # fmt: skip
+        except zenoh.ZError as error:
+            log.warning("the planner cannot be reached: %s", error)
