@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def test_a_ros_decoder_reads_the_message(limit: float) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
-    read = store.deserialize_cdr(encode_limit(limit, 17 * NS + 5), "tier4_planning_msgs/msg/VelocityLimit")
+    read: Any = store.deserialize_cdr(encode_limit(limit, 17 * NS + 5), "tier4_planning_msgs/msg/VelocityLimit")
     assert (read.stamp.sec, read.stamp.nanosec) == (17, 5)
     assert read.max_velocity == min(limit, FREE)
     assert read.use_constraints
@@ -53,12 +54,13 @@ def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
 
 @pytest.mark.parametrize("limited", [True, False])
 def test_limit_lets_a_car_stop_within_sight_on_ice(limited: bool) -> None:
-    draw, stops = np.random.default_rng(3), 0
+    draw, stops = np.random.default_rng(3), list[bool]()
     for _ in range(50):
         speed, mu = draw.uniform(12.0, 36.0), draw.uniform(0.06, 0.3)
         metres = int(speed**2 / (2.0 * COMFORT) + MARGIN_M + draw.uniform(5.0, 100.0))
-        stops += enter_ice(speed, mu, metres, limited=limited) <= stopping_speed(mu, SIGHT_M) + 1e-6
-    assert stops == 50 if limited else stops < 10
+        entered = enter_ice(speed, mu, metres, limited=limited)
+        stops.append(entered <= float(stopping_speed(mu, SIGHT_M)) + 1e-6)
+    assert sum(stops) == 50 if limited else sum(stops) < 10
 
 
 def test_limit_falls_at_once_and_rises_after_a_while() -> None:

@@ -22,13 +22,13 @@ from fleet_service.cits.output import DenmOutput
 from fleet_service.cits.properties import Originator, properties
 from fleet_service.client.stretches import StretchAlert
 from fleet_service.ingest.inbox import Message
-from schemas import grid, wire
+from schemas import grid
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.thresholds import NS
 from schemas.wire import JSON, Kind
 from tests.fleet_service.cits.interchange import free_url, interchange
-from tests.fleet_service.examples import LATITUDE, LONGITUDE, START, batch, key
+from tests.fleet_service.examples import START
 from tests.waiting import until
 
 OURS = Originator("SE", "SE00001")
@@ -192,21 +192,17 @@ def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_
     assert came == [foreign]
 
 
-@pytest.mark.parametrize("cars", [0, 2])
-def test_foreign_denm_alone_raise_no_alert_and_hide_none(tmp_path: Path, cars: int) -> None:
-    denm = Denm(99, 1, 99, START, START, None, (LATITUDE, LONGITUDE), 5.0, 3600, sub_cause=ICE, heading=90.0)
+@pytest.mark.campaign
+def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
+    denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 3600, sub_cause=ICE, heading=0.0)
     engine = Engine(ServiceConfig(), tmp_path / "archive")
     try:
-        for turn in range(1, 9):
+        for turn in range(10):
             now = START + 30 * turn * NS
-            foreign = reports(replace(denm, referenced=now, sequence=turn), "cits-se", 5, turn, now)
-            messages = [Message(Kind.OBSERVATION, place, payload, JSON) for place, payload in foreign]
-            for name in [f"car-{car:03}" for car in range(cars)]:
-                seen = wire.encode(batch(name, turn, now, [0.15]))
-                messages.append(Message(Kind.OBSERVATION, key(name), seen, wire.ENCODING[Kind.OBSERVATION]))
-            engine.intake.ingest(messages, now)
-        assert engine.counts[Kind.OBSERVATION] == 8 * (1 + cars), dict(engine.counts)
-        assert bool(len(engine.alerts.all)) == bool(cars)
+            batches = reports(replace(denm, referenced=now, sequence=turn), "cits-se", 5, 1 + turn, now)
+            engine.intake.ingest([Message(Kind.OBSERVATION, place, payload, JSON) for place, payload in batches], now)
+        assert engine.counts[Kind.OBSERVATION] == 10, dict(engine.counts)
+        assert engine.alerts.all == []
     finally:
         engine.close()
 
