@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class Sending(NamedTuple):
-    """What our DENM need: address, station, publisher and state file."""
+    """Needs of our DENM: address, station, publisher and state file."""
 
     target: str
     station: int
@@ -37,7 +37,7 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """What foreign DENM need: address, selector, and the name of the witness."""
+    """Needs of foreign DENM: address, selector, and the name of the witness."""
 
     source: str
     selector: str

@@ -17,7 +17,7 @@ from proton.reactor import ApplicationEvent, Container, EventInjector
 
 @dataclass
 class Interchange:
-    """What an interchange received, and its address."""
+    """Messages that an interchange received, and its address."""
 
     url: str
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
