@@ -98,7 +98,7 @@ def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookou
     if args.autoware is None:
         return Lookout([name], warning_lines(config), lambda _: route)
     from edge_agent.ahead.planner import ANY_HASH
-    from edge_agent.publish.planner_link import PlannerLink
+    from edge_agent.ahead.planner_link import PlannerLink
 
     planner = PlannerLink(args.autoware, args.autoware_hash or ANY_HASH)
     return Lookout([name], warning_lines(config), lambda _: route, on_horizons=planner.hear)

@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until a signal."""
-    from fleet_service.cits import gateway
-    from fleet_service.cits.properties import Originator
+    from fleet_service.client.cits import gateway
+    from fleet_service.client.cits.properties import Originator
     from fleet_service.client.map_client import settings
 
     if arguments.to is None and arguments.source is None:

@@ -9,15 +9,15 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.cits.amqp import AmqpLink
-from fleet_service.cits.denm import decode
-from fleet_service.cits.output import DenmOutput
-from fleet_service.cits.properties import Originator
+from fleet_service.client.cits.amqp import AmqpLink
+from fleet_service.client.cits.denm import decode
+from fleet_service.client.cits.output import DenmOutput
+from fleet_service.client.cits.properties import Originator
 from fleet_service.client.stretches import StretchAlert
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
-from tests.fleet_service.cits.interchange import free_url, interchange
+from tests.fleet_service.client.cits.interchange import free_url, interchange
 from tests.waiting import until
 
 START: Final = 1_700_000_000 * NS

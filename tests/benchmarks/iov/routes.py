@@ -33,7 +33,7 @@ EDGE: Final = "edge_walk"
 
 
 @dataclass(frozen=True)
-class Town:
+class StreetTown:
     """Crossings (n, 2) [deg] and streets as pairs of crossings."""
 
     crossings: FloatArray
@@ -45,7 +45,7 @@ class Town:
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
 
 
-def make_town(draw: np.random.Generator) -> Town:
+def make_town(draw: np.random.Generator) -> StreetTown:
     """Return a town of crooked streets; a tenth of the links is missing."""
     wide = APART_M / METRES_PER_DEGREE
     k = np.arange(STREETS)
@@ -55,10 +55,10 @@ def make_town(draw: np.random.Generator) -> Town:
     crossings = np.stack((ORIGIN[0] + wide * (north + jitter[0]), ORIGIN[1] + wide * (east + jitter[1]) / scale), 1)
     all_links = [(i, i + 1) for i in range(STREETS**2) if (i + 1) % STREETS]
     all_links += [(i, i + STREETS) for i in range(STREETS**2 - STREETS)]
-    return Town(crossings, [link for link in all_links if draw.random() > 0.1])
+    return StreetTown(crossings, [link for link in all_links if draw.random() > 0.1])
 
 
-def write_town(town: Town, path: Path) -> None:
+def write_town(town: StreetTown, path: Path) -> None:
     """Write a town as OpenStreetMap XML."""
     nodes = [f'<node id="{n + 1}" version="1" lat="{a:.7f}" lon="{b:.7f}"/>' for n, (a, b) in enumerate(town.crossings)]
     ways = [
@@ -69,7 +69,7 @@ def write_town(town: Town, path: Path) -> None:
     path.write_text("\n".join(['<osm version="0.6">', *nodes, *ways, "</osm>"]), encoding="utf-8")
 
 
-def icy_map(town: Town, icy: Sequence[tuple[int, int]]) -> pa.Table:
+def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
     """Return a map in which these streets are ice, in both directions, and all others have grip."""
     rows: dict[tuple[int, int], float] = {}
     for street in sorted(town.streets, key=lambda one: one in icy, reverse=True):

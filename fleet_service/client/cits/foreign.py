@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, Final
 
-from fleet_service.cits.denm import ADHESION, BLACK_ICE, HEAVY_FROST, ICE, SALTED, SNOW, Denm
+from fleet_service.client.cits.denm import ADHESION, BLACK_ICE, HEAVY_FROST, ICE, SALTED, SNOW, Denm
 from schemas import grid, keys
 from schemas.thresholds import NS
 

@@ -10,14 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from fleet_service.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach
+from fleet_service.client.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach
 from fleet_service.client.stretches import StretchAlert
-from fleet_service.serve.alerts import QUIET_NS
 from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS
 
-VALID_NS: Final = QUIET_NS  # after which an alert that nobody confirmed may fade
+VALID_NS: Final = 1800 * NS  # as long as the service keeps an alert that nobody confirms
 RENEW_NS: Final = VALID_NS // 2
 ICE_MU: Final = 0.2  # of the road materials that a DENM names, only ice is below
 SEQUENCES: Final = 1 << 16

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fleet_service.cits.denm import Denm, its_time
+from fleet_service.client.cits.denm import Denm, its_time
 from schemas import grid
 from schemas.errors import InputError
 

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from fleet_service.cits.amqp import Parcel
-from fleet_service.cits.denm import Denm, decode, encode
-from fleet_service.cits.events import EventBook
-from fleet_service.cits.properties import Originator, properties
+from fleet_service.client.cits.amqp import Parcel
+from fleet_service.client.cits.denm import Denm, decode, encode
+from fleet_service.client.cits.events import EventBook
+from fleet_service.client.cits.properties import Originator, properties
 from fleet_service.client.stretches import StretchAlert
 from schemas.errors import InputError
 from schemas.runtime import commandline

@@ -14,12 +14,12 @@ import pytest
 from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
 from fleet_service.app.engine import Engine
-from fleet_service.cits.amqp import AmqpLink, Parcel
-from fleet_service.cits.denm import ICE, SALTED, Denm, Termination, approach, decode, encode
-from fleet_service.cits.events import RENEW_NS, VALID_NS
-from fleet_service.cits.foreign import reports
-from fleet_service.cits.output import DenmOutput
-from fleet_service.cits.properties import Originator, properties
+from fleet_service.client.cits.amqp import AmqpLink, Parcel
+from fleet_service.client.cits.denm import ICE, SALTED, Denm, Termination, approach, decode, encode
+from fleet_service.client.cits.events import RENEW_NS, VALID_NS
+from fleet_service.client.cits.foreign import reports
+from fleet_service.client.cits.output import DenmOutput
+from fleet_service.client.cits.properties import Originator, properties
 from fleet_service.client.stretches import StretchAlert
 from fleet_service.ingest.inbox import Message
 from schemas import grid
@@ -27,7 +27,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.thresholds import NS
 from schemas.wire import JSON, Kind
-from tests.fleet_service.cits.interchange import free_url, interchange
+from tests.fleet_service.client.cits.interchange import free_url, interchange
 from tests.fleet_service.examples import START
 from tests.waiting import until
 
@@ -178,7 +178,7 @@ def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_
     def keep(body: bytes, _: Mapping[str, Any]) -> None:
         came.append(body)
 
-    link = AmqpLink(url, "deliveries", "subscriptions", "", settled.append, keep).open()
+    link = AmqpLink(url, "deliveries", "subscriptions", on_accepted=settled.append, on_message=keep).open()
     run = Run(tmp_path / "cits.json", settles=False)
     run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))
     for parcel in run.sent:

@@ -33,7 +33,7 @@ class Parcel(NamedTuple):
     properties: Mapping[str, Any]
 
 
-class _Handler(MessagingHandler):
+class _AmqpEvents(MessagingHandler):
     """Events of the connection; everything here runs on the thread of the container."""
 
     def __init__(self, link: AmqpLink) -> None:
@@ -124,6 +124,7 @@ class AmqpLink:
         url: str,
         target: str = "",
         source: str = "",
+        *,
         selector: str = "",
         on_accepted: Callable[[str], None] = lambda _: None,
         on_message: Callable[[bytes, Mapping[str, Any]], None] = lambda *_: None,
@@ -135,7 +136,7 @@ class AmqpLink:
         self.queue: deque[Parcel] = deque()
         self.is_connected, self.rejected = False, 0
         self.injector = EventInjector()
-        self._container = Container(_Handler(self))
+        self._container = Container(_AmqpEvents(self))
         self._thread = threading.Thread(target=self._container.run, name="amqp", daemon=True)
 
     def open(self) -> AmqpLink:

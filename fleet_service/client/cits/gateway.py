@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from fleet_service.cits.amqp import AmqpLink
-from fleet_service.cits.denm import decode
-from fleet_service.cits.foreign import reports
-from fleet_service.cits.output import DenmOutput
-from fleet_service.cits.properties import Originator
+from fleet_service.client.cits.amqp import AmqpLink
+from fleet_service.client.cits.denm import decode
+from fleet_service.client.cits.foreign import reports
+from fleet_service.client.cits.output import DenmOutput
+from fleet_service.client.cits.properties import Originator
 from fleet_service.client.datex_feed import DatexFeed, publish
 from schemas import keys
 from schemas.config import ZenohSettings
@@ -94,9 +94,9 @@ def run(
         url,
         "" if sending is None else sending.target,
         "" if receiving is None else receiving.source,
-        "" if receiving is None else receiving.selector,
-        lambda name: settled[0](name),
-        (lambda *_: None) if witness is None else witness.take,
+        selector="" if receiving is None else receiving.selector,
+        on_accepted=lambda name: settled[0](name),
+        on_message=(lambda *_: None) if witness is None else witness.take,
     )
     output = None
     if sending is not None:
