@@ -1,4 +1,5 @@
-"""Reference pages of the documentation site, generated from the code: commands, settings, tables, metrics.
+"""Reference pages of the documentation site, generated from the code: commands, settings, tables, metrics,
+elements of the papers.
 
 `deploy/docs/conf.py` writes them when the site is built, so they cannot lag behind the code. They are not committed.
 
@@ -21,6 +22,7 @@ from pydantic import BaseModel
 import edge_agent.cli
 import fleet_service.cli
 from edge_agent.app import metrics as agent_metrics
+from edge_agent.lab.evaluation.papers.elements_page import elements_page
 from fleet_service.app import metrics as service_metrics
 from fleet_service.app.engine import Engine
 from schemas import tables
@@ -165,6 +167,7 @@ def write(folder: Path) -> None:
     pages = {f"cli-{program}": command_page(program) for program in COMMAND_LINES}
     pages["configuration"] = settings_page()
     pages["tables"] = tables_page()
+    pages["paper-elements"] = elements_page()
     with tempfile.TemporaryDirectory() as root:
         pages["metrics"] = metrics_page(all_metrics(Path(root)))
     for name, text in pages.items():

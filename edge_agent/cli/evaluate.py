@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs", "ahead", "detection")
+ONLY: Final = ("inputs", "ahead", "detection", "searches")
+PAPERS: Final = ("000", "001", "002", "003", "004")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
@@ -39,7 +40,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=ONLY,
         help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources; "
         "ahead: warnings, their cost and delay, the map as a prior; "
-        "detection: slippery road found, missed and falsely reported, in short and long drives",
+        "detection: slippery road found, missed and falsely reported, in short and long drives; "
+        "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets",
+    )
+    parser.add_argument(
+        "--paper",
+        choices=PAPERS,
+        help="one paper under its own conditions: its figures and tables next to ours, as index.html and report.md; "
+        "ends with 1 if a matched number misses the printed one",
     )
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
@@ -63,12 +71,18 @@ def run(args: argparse.Namespace) -> int:
     count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
     if count < 2:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
+    if args.paper and args.only:
+        raise InputError("paper", f"not with --only {args.only}", "leave one of them out")
     if not args.no_plots and args.only in (None, "detection") and importlib.util.find_spec("matplotlib") is None:
         raise InputError("plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
+    if args.paper:
+        return _paper(args, count)
+    if args.only == "searches":
+        return _searches(args, count)
     if args.only == "ahead":
         return _ahead(args, count)
     if args.only == "detection":
@@ -90,6 +104,30 @@ def run(args: argparse.Namespace) -> int:
 
         draw(results, figures, args.out, seed=seeds[0], form=args.plots)
     print(text.partition("## The papers' figures")[0].rstrip())
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _paper(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.evaluation.papers.page import markdown_tables, summary
+    from edge_agent.lab.evaluation.papers.reproductions import write_paper
+    from edge_agent.lab.seeds import FIGURES
+
+    done = write_paper(args.paper, range(FIGURES, FIGURES + count), args.out, plots=not args.no_plots)
+    print(f"{markdown_tables(done.tables)}\n\n{summary(done)}")
+    return 1 if done.missed else 0
+
+
+def _searches(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.seeds import FIGURES
+    from edge_agent.lab.tuning.search_comparison import compare_searches, comparison_markdown
+    from schemas.runtime.figures import write
+
+    seeds = range(FIGURES, FIGURES + count)
+    figures = compare_searches(seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True))
+    write(args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures)
+    text = comparison_markdown(figures)
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 

@@ -13,6 +13,7 @@ from edge_agent.dynamics.slip import slips, wheel_position
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
+from schemas.thresholds import GRAVITY
 
 DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
@@ -34,6 +35,18 @@ def _slips(radius: float, ahead: float, aside: float, cos: float, sin: float, om
     return (0.0 if math.isnan(omega) else slip_x), slip_y
 
 
+@inlined
+def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, float]:
+    """Return the slip stiffness (along [N], across [N/rad]) of a tyre under `load` [N] on friction `mu`.
+
+    It is in proportion to load alone, unless the row says otherwise: PROPORTIONAL, QUADRATIC, REAR_SLOPE.
+    """
+    by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
+    share = (1.0 + body.proportional * (mu - 1.0)) * by_load
+    behind = body.rear_slope if rear else 1.0
+    return share * (body.slope_x * load), share * behind * (body.slope_y * load)
+
+
 @compiled
 def tyre_forces(
     row: FloatArray,
@@ -49,16 +62,17 @@ def tyre_forces(
     wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of the Magic Formula
     (e = 0), or DUGOFF.
     """
-    loads = wheel_loads(body(row), motion[3], motion[4])
+    parameters = body(row)
+    loads = wheel_loads(parameters, motion[3], motion[4])
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
         slip = _slips(row[Parameter.RADIUS], ahead, aside, wheels[wheel, 0], wheels[wheel, 1], wheels[wheel, 2])
-        stiffness = row[Parameter.SLOPE_X] * loads[wheel], row[Parameter.SLOPE_Y] * loads[wheel]
+        slopes = stiffness(parameters, loads[wheel], mu[wheel], wheel >= 2)
         if shape == DUGOFF:
-            force = combined_dugoff(slip, stiffness, mu[wheel], loads[wheel])
+            force = combined_dugoff(slip, slopes, mu[wheel], loads[wheel])
         else:
-            force = combined_magic(slip, stiffness, mu[wheel], loads[wheel], shape, 0.0)
+            force = combined_magic(slip, slopes, mu[wheel], loads[wheel], shape, 0.0)
         force_x[wheel], force_y[wheel] = force
 
 
@@ -93,11 +107,11 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
     fl, fr, rl, rr = wheel_loads(body, ax, ay)
     a, b, front, rear = body.to_front, body.to_rear, 0.5 * body.track_front, 0.5 * body.track_rear
     aside = vy + a * rate
-    x_fl, y_fl = _pull(body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]))
-    x_fr, y_fr = _pull(body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]))
+    x_fl, y_fl = _pull(body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]), False)
+    x_fr, y_fr = _pull(body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]), False)
     aside = vy - b * rate
-    x_rl, y_rl = _pull(body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]))
-    x_rr, y_rr = _pull(body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]))
+    x_rl, y_rl = _pull(body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]), True)
+    x_rr, y_rr = _pull(body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]), True)
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
     per_mass, per_inertia = 1.0 / body.mass, 1.0 / body.yaw_inertia
     return (x_fl + x_fr + x_rl + x_rr) * per_mass, (y_fl + y_fr + y_rl + y_rr) * per_mass, moment * per_inertia
@@ -105,11 +119,11 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
 
 @inlined
 def _pull(
-    body: Body, ahead: float, aside: float, wheel: tuple[float, float, float, float, float, float]
+    body: Body, ahead: float, aside: float, wheel: tuple[float, float, float, float, float, float], rear: bool
 ) -> tuple[float, float]:
     """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given longitudinal force."""
     load, mu, cos, sin, omega, given_x = wheel
     slip = _slips(body.radius, ahead, aside, cos, sin, omega)
-    force_x, force_y = combined_dugoff(slip, (body.slope_x * load, body.slope_y * load), mu, load)
+    force_x, force_y = combined_dugoff(slip, stiffness(body, load, mu, rear), mu, load)
     force_x = force_x if math.isnan(given_x) else given_x
     return cos * force_x - sin * force_y, sin * force_x + cos * force_y

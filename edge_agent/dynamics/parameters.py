@@ -29,10 +29,14 @@ class Parameter(IntEnum):
     SLOPE_X = 9  # longitudinal slip stiffness per wheel load [1]
     SLOPE_Y = 10  # cornering stiffness per wheel load [1/rad]
     DRIVE_FRONT = 11  # share of the driving force on the front axle [1]; NaN where unknown
+    # how stiffness depends on load and friction, as papers print it; 0, 0 and 1: not at all
+    PROPORTIONAL = 12  # 1: slip stiffness is proportional to friction (000, 003, 004 as printed)
+    QUADRATIC = 13  # e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
+    REAR_SLOPE = 14  # cornering stiffness per load of the rear tyres over that of the front ones (002, table 1)
 
 
 def parameter_row(vehicle: Vehicle) -> FloatArray:
-    """The parameters of `vehicle`, shape (12,), indexed by `Parameter`.
+    """The parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
     Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per newton of load makes
     them valid for the lightly and the heavily loaded wheel alike. Where the file has a rear stiffness of its own, that
@@ -57,12 +61,15 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
             vehicle.longitudinal_stiffness / static_load,
             vehicle.cornering_stiffness / static_load if rear is None else rear / rear_load,
             np.nan if drive is None else drive,
+            0.0,
+            0.0,
+            1.0,
         ]
     )
 
 
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
-    """Return one row per vehicle, shape (N, 12); a repeated vehicle is converted once."""
+    """Return one row per vehicle, shape (N, 15); a repeated vehicle is converted once."""
     models = {id(vehicle): vehicle for vehicle in vehicles}
     place = {model: k for k, model in enumerate(models)}
     rows = np.stack([parameter_row(vehicle) for vehicle in models.values()])
@@ -82,15 +89,19 @@ class Body(NamedTuple):
     radius: float
     slope_x: float
     slope_y: float
+    proportional: float
+    quadratic: float
+    rear_slope: float
 
 
 @inlined
 def body(row: FloatArray) -> Body:
-    """The body of a row (12,)."""
+    """The body of a row (15,)."""
     p = Parameter
     return Body(
         row[p.MASS], row[p.YAW_INERTIA], row[p.TO_FRONT], row[p.TO_REAR], row[p.TRACK_FRONT], row[p.TRACK_REAR],
         row[p.CG_HEIGHT], row[p.RADIUS], row[p.SLOPE_X], row[p.SLOPE_Y],
+        row[p.PROPORTIONAL], row[p.QUADRATIC], row[p.REAR_SLOPE],
     )  # fmt: skip
 
 

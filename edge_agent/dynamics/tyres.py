@@ -47,6 +47,12 @@ def brush(theta: float) -> float:
 
 
 @compiled
+def dugoff(theta: float) -> float:
+    """Dugoff curve of theta >= 0: theta up to one half, then 1 - 1/(4*theta)."""
+    return theta if theta <= 0.5 else 1.0 - 0.25 / theta
+
+
+@compiled
 def combined_magic(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float, c: float, e: float
 ) -> tuple[float, float]:

@@ -83,6 +83,10 @@ class EstimatorBank:
         in_shares(lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads)
         return _estimates(values, evidence, closes)
 
+    def memory(self, name: str) -> FloatArray:
+        """Return a copy of the field `name` of all filters, (N, ...): for figures of a filter's inside."""
+        return np.array(self._filters[name])
+
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
         """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N, 32) each, maximum 0.
 

@@ -6,19 +6,17 @@ mu_fr, mu_rl, mu_rr], random walk (28), measurements [a_x, a_y, r] and [a_y, r] 
 fused (51), (52). The motion goes to the friction filter and the friction to the motion filter's tyres (figure 3).
 Shares by (54).
 
-Departures, after the errata: signs of the rear axle in (4) to (6), slip angles (7), wheel speeds (8), loads (9), Dugoff
-force by similarity (11), (13); stiffness in proportion to load instead of table 1; P_f, not its inverse, in (50) and
-(52); shares begin at one half and go by information, the smaller trace getting more, where (54) gives it less; a_y and
-r, used by both sub-filters, count half in each. Q = 1 and R = 10 000 (57) say nothing of friction: here R is sensor
-noise and model error, and friction returns to the prior over the metres driven, so that what is not observable is as
-wide as the prior.
+The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to friction: see
+`literal.federated_friction`, which holds the friction filter as printed. On a real tyre it is not, so here R is sensor
+noise and model error, and friction returns to the prior over the metres driven: what is not observable is as wide as
+the prior. ELEMENTS lists each element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -35,8 +33,17 @@ from edge_agent.estimators.common.output import (
     write_states,
 )
 from edge_agent.estimators.common.run import kernel_of, new_filters
+from edge_agent.estimators.common.tyre_option import TyreOption
+from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
-from edge_agent.estimators.gaussian.federated_motion import LEAST_BETA, FederatedMemory, begin_motion, step_motion
+from edge_agent.estimators.gaussian.federated_motion import (
+    LEAST_BETA,
+    FederatedMemory,
+    MotionSetting,
+    begin_motion,
+    set_motion,
+    step_motion,
+)
 from edge_agent.estimators.gaussian.planar import PlanarState
 from edge_agent.estimators.gaussian.wheel_friction import PRIOR_ROOT, dependence, mean_friction, return_to_prior
 from edge_agent.filters.cholesky import variance
@@ -68,9 +75,15 @@ class JointMemory(FederatedMemory):
     yaw_rate: float  # of the master at the sample before
 
 
-def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
-    """N of these filters."""
-    return EstimatorBank(new_filters(JointMemory, vehicles), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS)
+def bank(
+    vehicles: Sequence[Vehicle],
+    tyre: TyreOption | None = None,
+    motion: MotionSetting | None = None,
+) -> EstimatorBank:
+    """Return N of these filters, with the paper's tyre and motion setting if they are given."""
+    filters = new_filters(JointMemory, vehicles, tyre)
+    set_motion(filters, MotionSetting() if motion is None else motion)
+    return EstimatorBank(filters, records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS)
 
 
 @compiled
@@ -168,3 +181,101 @@ def _report(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> fl
 
 
 KERNEL = kernel_of(_begin, _step, _report)
+
+ELEMENTS: Final[tuple[Element, ...]] = (
+    Element("(1) to (3)", "3-DOF model, four steered wheels", "as printed", where="dynamics.chassis"),
+    Element(
+        "(4) to (6)",
+        "accelerations from wheel forces",
+        "corrected",
+        "rear axle: a_x takes -F_y*sin(delta), a_y takes +F_x*sin(delta) + F_y*cos(delta), arms accordingly",
+        "dynamics.chassis.response",
+    ),
+    Element(
+        "(7)",
+        "slip angles",
+        "corrected",
+        "rear arm is -b*r; half a track times r is reversed on the left",
+        "dynamics.slip",
+    ),
+    Element("(8)", "wheel-centre speeds", "corrected", "r is missing beside half the track", "dynamics.slip"),
+    Element(
+        "(9)",
+        "wheel loads",
+        "corrected",
+        "static loads need b/l in front, a/l behind; sign of lateral transfer",
+        "dynamics.loads",
+    ),
+    Element("(10)", "F_x from wheel torque", "as printed", where="common.inputs.wheel_force"),
+    Element(
+        "(11) to (13)",
+        "Dugoff lateral force, proportional to mu",
+        "option",
+        "mu*F_z*C_y counts the load twice; 1/2 and mu*F_z are missing in (13). By default stiffness does not depend "
+        "on mu, because that of a real tyre does not",
+        "common.tyre_option, literal.wheel_forces",
+    ),
+    Element(
+        "table 1",
+        "stiffness over load",
+        "corrected",
+        "two entries are not monotone; here in proportion to load",
+        "dynamics.parameters",
+    ),
+    Element("(14)", "longitudinal slip", "as printed", where="dynamics.slip"),
+    Element("(15) to (20)", "information shares of the sub-filters", "as printed", where="filters.federated.share"),
+    Element("(21), (22), (26), (27)", "cubature points by singular values", "as printed", where="filters.points"),
+    Element(
+        "(28)",
+        "friction as a random walk",
+        "option",
+        "by default it returns to the prior over 190 m, so that it is not believed where nothing shows it; as "
+        "printed in the literal filter",
+        "gaussian.wheel_friction, literal.federated_friction",
+    ),
+    Element("(29) to (48)", "time and measurement updates", "as printed", where="filters.householder"),
+    Element(
+        "(49) to (52)",
+        "fusion in the master",
+        "corrected",
+        "P_f, printed is its inverse; a_y and r, used by both sub-filters, have twice the variance in each",
+        "filters.federated.fuse",
+    ),
+    Element(
+        "(53)",
+        "states, measurements and inputs",
+        "corrected",
+        "sub-filter 1 also measures the wheels' speed: nothing printed observes u. Off by wheel_speed=False",
+        "gaussian.federated_motion",
+    ),
+    Element(
+        "(54)",
+        "shares beta_i by traces",
+        "option",
+        "printed, the worse filter gets more, and beta = 0 divides by zero: turned round, from one half; as "
+        "printed from one half in the literal filter",
+        "share_by_information, literal.federated_friction",
+    ),
+    Element(
+        "(55), (56)",
+        "P_0, Q, R of the motion",
+        "left out",
+        "u is lost with them (error 14 m/s), whichever way (54) is read; MotionSetting takes any others",
+    ),
+    Element(
+        "(57)",
+        "P_0 = Q = I, R = 10^4*diag(.009, 1, 1), 10^4*I, mu_0 = 1",
+        "as printed",
+        where="literal.federated_friction.AS_PRINTED",
+    ),
+    Element("table 2", "vehicle", "as printed", where="lab.evaluation.scenarios.LIGHT"),
+    Element(
+        "section IV",
+        "two lane changes at 30 km/h, .5 for 110 m, then .3; 10 ms",
+        "as printed",
+        where="lab.simulation.manoeuvres",
+    ),
+    Element("figure 4", "sensor signals", "as printed", where="lab.evaluation.papers"),
+    Element("figure 5", "v_x, v_y, sideslip beta, mu of four wheels", "as printed", where="lab.evaluation.papers"),
+)
+"""Elements of the paper."""

@@ -8,12 +8,9 @@ State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of fre
 measurements: F_x = (T - J*omega')/R. With them each driven wheel is observable; with the paper's a_x, a_y, r alone two
 of four frictions are, at most (errata).
 
-Departures: v_x, v_y, r are estimated, where the paper takes them from the simulator; a_x and a_y are inputs of the
-kinematics, and the wheel torques stand for a_x in the measurement, with a_y, r and the speed of the wheels freed of
-slip; alpha = 1, where .001 gives the centre a weight of -10^6; a downdate that would lose a positive covariance
-refuses, and an orthogonal update takes its place, where the paper clips singular values; friction returns to the prior
-over the metres driven, and counts only as far as it is used, so that the bounds of a wheel that is not observable are
-the prior's.
+The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This one is for a car, where
+nobody gives v_x and v_y: they are states, a_x and a_y are inputs of the kinematics, and the wheel torques stand for
+a_x. ELEMENTS lists each element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -41,6 +38,8 @@ from edge_agent.estimators.common.output import (
 )
 from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
+from edge_agent.estimators.common.tyre_option import TyreOption
+from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
 from edge_agent.estimators.gaussian.federated_motion import doubted, mean_wheel_velocity, slip_free_speed
 from edge_agent.estimators.gaussian.wheel_friction import (
@@ -92,10 +91,10 @@ class UnscentedMemory(PaperMemory):
     refused: float  # downdates
 
 
-def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
-    """N of these filters."""
+def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
+    """Return N of these filters."""
     return EstimatorBank(
-        new_filters(UnscentedMemory, vehicles), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS
+        new_filters(UnscentedMemory, vehicles, tyre), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS
     )
 
 
@@ -215,3 +214,96 @@ def _report(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -
 
 
 KERNEL = kernel_of(_begin, _step, _report)
+
+ELEMENTS: Final[tuple[Element, ...]] = (
+    Element(
+        "section 2",
+        "7-DOF model: planar body and four turning wheels",
+        "as printed",
+        where="literal.wheel_forces, dynamics.chassis",
+    ),
+    Element(
+        "section 2",
+        "Dugoff tyre, proportional to mu",
+        "option",
+        "on a real tyre stiffness does not depend on mu; printed in the literal filter and by TyreOption",
+        "literal.wheel_forces, common.tyre_option",
+    ),
+    Element("section 2", "loads, wheel-centre speeds, slip, slip angles", "as printed", where="dynamics.loads, slip"),
+    Element("3.1", "state mu_fl, mu_fr, mu_rl, mu_rr", "as printed", where="literal.wheel_friction_ukf"),
+    Element(
+        "3.1",
+        "v_x, v_y from the simulator",
+        "option",
+        "a car does not know them: sr-ukf estimates them; given in the literal filter",
+        "literal.given_motion",
+    ),
+    Element(
+        "3.1",
+        "measurement [a_x, a_y, r]",
+        "option",
+        "of rank 2 at most straight on; the wheels' torque balances make each driven wheel visible",
+        "literal.wheel_friction_ukf.Setting.torque_rows",
+    ),
+    Element(
+        "3.1",
+        "unscented points, alpha .001, kappa 0, beta 2",
+        "option",
+        "alpha = .001 gives the centre a weight of -10^6; sr-ukf uses 1. Both give the same result in double precision",
+        "literal.wheel_friction_ukf.Setting.alpha",
+    ),
+    Element("3.1", "UKF in covariance form, the comparator", "as printed", where="literal.wheel_friction_ukf"),
+    Element(
+        "3.2",
+        "square roots by singular values, clipped at zero; gain by singular values",
+        "as printed",
+        where="literal.wheel_friction_ukf; sr-ukf: filters.downdate",
+    ),
+    Element(
+        "3.2",
+        "Q, R and P_0",
+        "corrected",
+        "their values are lost in the text; AS_PRINTED has values of the size that the text describes",
+        "literal.wheel_friction_ukf.AS_PRINTED",
+    ),
+    Element(
+        "4.1",
+        "Magic Formula in the plant, Dugoff in the filter",
+        "option",
+        "shown as a row of its own: the mismatch costs .025, stiffness that does not depend on mu costs .3",
+        "lab.evaluation.papers.reproduction_003",
+    ),
+    Element("4.1", "permanent-magnet motor in d-q axes", "as printed", where="lab.simulation.motor.turn_motor"),
+    Element(
+        "4.1",
+        "PID control of speed, equal torque to the wheels",
+        "as printed",
+        where="lab.simulation.motor.speed_demand",
+    ),
+    Element(
+        "table 2",
+        "vehicle",
+        "corrected",
+        "its values are lost in the text: the vehicle of paper 004",
+        "lab.evaluation.scenarios.SEDAN",
+    ),
+    Element("4.2.1", "acceleration from 20 km/h, throttle .3, mu .85", "as printed", where="manoeuvres.throttle"),
+    Element("4.2.2", "turn at 40 km/h on mu .35, 60 degrees within .3 s", "as printed", where="manoeuvres.low_turn"),
+    Element("4.2.3", "split .3 and .85 at constant speed", "as printed", where="lab.evaluation.papers.conditions"),
+    Element("4.2.4", ".85 for 4 s, then .5, in time, under all wheels", "as printed", where="manoeuvres.TimedFriction"),
+    Element(
+        "4.3",
+        "constant speed on .2, .25, .3, .35, .4, .45; table 7, figure 9",
+        "as printed",
+        where="lab.evaluation.papers.reproduction_003",
+    ),
+    Element("tables 3 to 6", "MAE of SR-UKF and UKF", "as printed", where="lab.evaluation.papers.reproduction_003"),
+    Element(
+        "figures 5 to 8",
+        "mu of four wheels, SR-UKF and UKF",
+        "as printed",
+        where="lab.evaluation.papers.reproduction_003",
+    ),
+    Element("figures 1 to 4", "sketches of model, tyre, filter and simulation", "left out", "no results"),
+)
+"""Elements of the paper."""

@@ -101,7 +101,8 @@ ELSEWHERE = {
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS, "--plots": CAMPAIGN,
                  "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
-                 "--only": "test_only_the_inputs_are_evaluated_where_so_asked"},
+                 "--only": "test_only_the_inputs_are_evaluated_where_so_asked",
+                 "--paper": "test_paper_is_reproduced_and_written"},
 }  # fmt: skip
 # agent configuration: setting -> another value; those of sending are shown where things are sent
 OBSERVED = {

@@ -15,6 +15,7 @@ from edge_agent.estimators.bank import Kernel, Part
 from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take
 from edge_agent.estimators.common.motion import sliding
 from edge_agent.estimators.common.output import write_quality, write_unknown
+from edge_agent.estimators.common.tyre_option import TyreOption, fit_tyres
 from edge_agent.estimators.estimates import Column
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import nogil
@@ -80,8 +81,9 @@ def kernel_of(
     return advance
 
 
-def new_filters(kind: type[PaperMemory], vehicles: Sequence[Vehicle]) -> RecordArray:
-    """A record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
+def new_filters(kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> RecordArray:
+    """Return a record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)
+    fit_tyres(filters, TyreOption() if tyre is None else tyre)
     return filters

@@ -28,7 +28,7 @@ YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 def mixture_bank(
     rows: FloatArray, design: MixtureDesign, spreads: FloatArray | None = None, means: FloatArray | None = None
 ) -> EstimatorBank:
-    """Friction mixtures of vehicles with parameters `rows` (N, 12).
+    """Friction mixtures of vehicles with parameters `rows` (N, 15).
 
     `spreads` and `means` (N, STATES) are standard deviations and means of their states' priors, where they are not
     those of the design.

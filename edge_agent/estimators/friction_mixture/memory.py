@@ -160,7 +160,7 @@ class MixtureMemory:
 
 
 def new_filters(rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray) -> RecordArray:
-    """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample.
+    """Filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
 
     The prior of their states is `nominal`, with the means and standard deviations `means`, `spreads` (N, STATES).
     """

@@ -30,6 +30,7 @@ from edge_agent.filters.points import axis_points, deviations, weighted_mean
 from edge_agent.filters.sigma import cubature
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.records import RecordArray
 from schemas.signals import S
 
 STATES, ROWS = 6, 4
@@ -40,16 +41,29 @@ STEP_S = 0.02  # process variances are per so much time
 # error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
 PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
 START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
-# variances of a_x, a_y, r with some model error; the papers set theirs by hand for each manoeuvre
-NOISE = np.array([0.01, 0.01, 1e-4])
 SPEED_STD, SPEED_SHARE, SLIP_SHARE = 0.03, 0.003, 0.3  # [m/s], radius, and how wrong the slip of a force is
 FARTHEST = 2.0  # innovations in standard deviations beyond which the wheels' speed is trusted less
 LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
 
 
-class FederatedMotion:
-    """The master's state of one filter, its shares, and how the step's innovations were."""
+class MotionSetting(NamedTuple):
+    """Variances of the motion filter: process per STEP_S, at the start, and noise of each sub-filter's rows."""
 
+    process: tuple[float, ...] = tuple(map(float, PROCESS**2))
+    start: tuple[float, ...] = tuple(map(float, START**2))
+    # with some model error; a_y and r, which both use, with twice the variance. The papers set theirs by manoeuvre
+    first: tuple[float, float, float] = (0.01, 0.02, 2e-4)  # a_x, a_y, r
+    second: tuple[float, float] = (0.02, 2e-4)  # a_y, r
+    wheel_speed: bool = True  # whether sub-filter 1 also measures the speed of the wheels
+
+
+class FederatedMotion:
+    """Setting and master's state of one filter, its shares, and the innovations of the step."""
+
+    process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
+    start: Annotated[FloatArray, STATES]  # standard deviations
+    noise: Annotated[FloatArray, 2, 3]  # variances of a_x, a_y, r, by sub-filter
+    wheel_speed: bool
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
     beta: float  # share of sub-filter 1
@@ -76,6 +90,18 @@ class SubFilter(NamedTuple):
     work: FloatArray
 
 
+def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
+    """Write the setting into the filters, once, before their first sample."""
+    motion = filters["motion"]
+    # of the rounded squares: the square roots are those of before, bit for bit, where nothing is set
+    usual = MotionSetting()
+    motion["process"] = PROCESS if setting.process == usual.process else np.sqrt(setting.process)
+    motion["start"] = START if setting.start == usual.start else np.sqrt(setting.start)
+    motion["noise"][:, 0] = setting.first
+    motion["noise"][:, 1, 1:] = setting.second
+    motion["wheel_speed"] = setting.wheel_speed
+
+
 @compiled
 def begin_motion(memory: FederatedMemory) -> None:
     """Begin at the speed of the wheels."""
@@ -89,7 +115,7 @@ def begin_motion(memory: FederatedMemory) -> None:
     mean[PlanarState.YAW_RATE] = use[S.YAW_RATE]
     root[:, :] = 0.0
     for i in range(STATES):
-        root[i, i] = START[i]
+        root[i, i] = motion.start[i]
     if not known:
         root[PlanarState.VX, PlanarState.VX] = UNKNOWN_V_STD
     motion.beta, motion.factor[:], motion.gamma[:] = 0.5, 1.0, 1.0
@@ -112,7 +138,7 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
         carry(row, columns, friction, track, dt, True)
         points[:] = columns.T
         for i in range(STATES):
-            process[i, i] = PROCESS[i] * math.sqrt(dt / STEP_S / beta)
+            process[i, i] = motion.process[i] * math.sqrt(dt / STEP_S / beta)
         predict(points, WEIGHT, WEIGHT, process, mean, root, work)
         _measure(memory, SubFilter(sub, mean, root, points, work), dt)
         if sub == 0:
@@ -136,13 +162,14 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
     deviations(points, mean, WEIGHT, state, 0)
     deviations(outcomes, predicted, WEIGHT, measured, 0)
     innovation = motion.innovation[sub]
-    twice = np.array([1.0, 2.0, 2.0])
     for r in range(3):
         innovation[r] = track.now[r] - predicted[r]
-        std[r] = math.sqrt(twice[r] * motion.factor[sub] * NOISE[r])
+        std[r] = math.sqrt(motion.factor[sub] * motion.noise[sub, r])
     speed, std[3] = slip_free_speed(row, track, dt)
     innovation[3] = speed - predicted[3]
     std[3] = doubted(std[3], innovation[3])
+    if not motion.wheel_speed:
+        innovation[3] = math.nan
     if sub == 1:
         innovation[0] = innovation[3] = math.nan
     for r in range(ROWS):
@@ -156,7 +183,7 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
     motion.size[sub] = 0.0
     for i in range(STATES):
         for j in range(i + 1):
-            motion.size[sub] += (root[i, j] / START[i]) ** 2
+            motion.size[sub] += (root[i, j] / motion.start[i]) ** 2
 
 
 @compiled

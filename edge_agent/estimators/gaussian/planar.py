@@ -15,7 +15,8 @@ import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
-from edge_agent.dynamics.parameters import Body, Four, body, four
+from edge_agent.dynamics.dual_motor import axle_force, midpoint_speed
+from edge_agent.dynamics.parameters import Body, Four, Parameter, body, four
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
@@ -59,13 +60,20 @@ def substeps(speed: float, dt: float) -> int:
 
 @inlined
 def carry(
-    row: FloatArray, columns: FloatArray, friction: FloatArray, track: InputTrack, dt: float, by_torque: bool
-) -> None:  # fmt: skip
+    row: FloatArray,
+    columns: FloatArray,
+    friction: FloatArray,
+    track: InputTrack,
+    dt: float,
+    by_torque: bool,
+    by_motor: bool = False,
+) -> None:
     """Move the states `columns` (6, POINTS) on by `dt` [s], in place; inputs run straight from before to now.
 
     by_torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and friction (4,) is given;
     the velocity follows a_x and a_y of the state alone, which measurements correct for drag and slopes. Else forces
     come from slip and z is the friction of all wheels.
+    by_motor: longitudinal forces come from the torque of each axle's motor, half to each wheel; z is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
@@ -73,6 +81,8 @@ def carry(
     times = substeps(slowest, dt)
     unknown = (math.nan, math.nan, math.nan, math.nan)
     force_x = _forces(row, track, dt) if by_torque else unknown
+    if by_motor:
+        force_x = _motor_forces(row, track, dt)
     mu = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if by_torque else unknown
     before, use = track.inputs_before, track.inputs
     cos, sin = four(track.steering_before[0]), four(track.steering_before[1])
@@ -138,6 +148,26 @@ def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelI
         force_x,
         mu,
     )
+
+
+@inlined
+def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
+    """Longitudinal forces [N] from one motor per axle, (4) to (6) of paper 004."""
+    front = _axle(row, track, 0, dt)
+    rear = _axle(row, track, 2, dt)
+    return front, front, rear, rear
+
+
+@inlined
+def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
+    """Half of the force [N] of the axle whose left wheel is `first`."""
+    use, before, omega = track.inputs, track.inputs_before, S.OMEGA + first
+    now = midpoint_speed(use[omega], use[omega + 1])
+    then = midpoint_speed(before[omega], before[omega + 1])
+    turning = (now - then) / dt
+    turning = 0.0 if math.isnan(turning) else turning
+    torque = use[S.TORQUE + first] + use[S.TORQUE + first + 1]
+    return 0.5 * axle_force(torque, turning, row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS])
 
 
 @inlined

@@ -1,7 +1,8 @@
 """The two experiments of paper 004, as it did them: noise on a_x, a_y, r only, exact inputs, start at the truth.
 
 They show that the filter is implemented as meant. They show nothing about estimating friction, which is known at the
-start: the bars and the printed tables are for v_x, v_y and the yaw rate.
+start: the bars and the printed tables are for v_x, v_y and the yaw rate. The plant's curve is a Magic Formula, and the
+variable noise is on all three channels; `papers.reproduction_004` has Dugoff tyres and the paper's noise on a_y alone.
 """
 
 from __future__ import annotations

@@ -98,25 +98,24 @@ def names() -> list[str]:
 
 
 WHY_NOT: Final = """\
-Where a printed figure is not reproducible, and why:
+"Ours" of 000 to 003 is measured on the simulator's own plant: drag, lagging loads, and tyres whose slip stiffness does
+not depend on μ. `edge-agent evaluate --paper NUMBER` sets up the papers' conditions, and there every printed error is
+reached. What the difference is made of:
 
-- **004, μ.** MAE .0095 needs a start at the truth with hardly any doubt; with the covariance printed the filter wanders
-  off within its own noise, and with μ unknown at the start it reads noise of slip as low friction (realistic).
-  Its tables shrink by the same ratio in MAE and RMSE from one filter to the other, which two noisy runs do not do.
-- **004, before the ants.** Where R is right and constant, ours is as good untuned as tuned; under variable noise the
-  colony gains a third in v_x and a tenth in v_y. The paper's gap of two to five is not one of memberships.
-- **004, start.** "Ours" begins at the truth as the paper does, with exact inputs and vehicle: it shows the
-  implementation. Its tyres are not given: those of the plant are as steep in the middle as Dugoff's. On the simulator's
-  own plant, which drags, rolls and has rounder tyres, v_y still meets the printed figure (its row).
-- **003.** Constant speed straight on shows no friction at all: there the interval is the prior's, and no figure of that
-  case (.0037, table 7) can be reproduced with tyres whose slip stiffness does not know μ, nor with noise: its rows show
-  the prior's error. Split friction is measured under acceleration instead. Convergence within .2 s
-  and errors of .001 are those of a filter without noise whose tyre is the simulator's.
-- **000.** "Within 3 s" holds only where stiffness is proportional to μ: at 30 km/h half of the grip is used, and an
-  honest interval stays wide. The paper prints no number for it.
-- **001.** β is printed in degrees, and is in radians if it is that of the v_y beside it. Its drives on the simulator
-  (variable speed) and 002's serpentine are driven here, but no number is printed for them.
-- **001, 002.** Friction is set by hand and not estimated: both tell the prior. 002's tables 6 and 7 (road test) repeat
-  tables 2 and 3 (simulation) digit for digit; 002's motor constants are not those of one machine, and signals have no
-  current or voltage: wheel torque stands for them. R is set by hand per manoeuvre in 001; here once.
+- **004.** The printed μ errors need Dugoff tyres in the plant. "Ours" here has a Magic Formula that is as steep in the
+  middle. With P₀ = .2·I and Q = .1·I as printed, read as .1·T² per step, v_x, v_y and yaw rate reach the printed MAE.
+  The paper begins at the truth, so its μ is no evidence that friction is found.
+- **004, before the ants.** Where R is right and the start known, untuned sets are as good as tuned ones. With the
+  printed P₀ and Q untuned sets are worse than leaving R alone, and the colony on likelihood gets part of that back. The
+  printed objective (33) makes the filter worse.
+- **003.** Needs slip stiffness proportional to μ, the wheels' torque balances as measurements, given motion and no
+  noise. On real tyres constant speed straight on shows no friction at all: its rows show the prior's error. The UKF
+  column of the paper is an artefact of single precision with α = .001.
+- **000.** With stiffness proportional to μ the printed Q = I, R = 10⁴·I and μ₀ = 1 give "about 3 s". On a tyre whose
+  stiffness does not depend on μ they say nothing of friction: at 30 km/h half of the grip is used.
+- **001.** v_y is almost nothing with the rear wheels steered by (53): "always zero" has an error of .0059. β is printed
+  in degrees, and is in radians if it is that of the v_y next to it.
+- **001, 002.** Friction is set by hand and not estimated: both report the prior. 002's tables 6 and 7 (road test)
+  repeat tables 2 and 3 (simulation) digit for digit. R is set by hand per manoeuvre in 001; here once. With drag 002's
+  WCKF-B is worse than WCKF-A in v_x.
 """

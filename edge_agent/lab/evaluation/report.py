@@ -15,8 +15,9 @@ from schemas.runtime.figures import Figure, markdown
 PAPERS_HEAD: Final = """\
 ## The papers' figures
 
-Printed; ours, the paper's estimator under the paper's conditions; the same and the default with ordinary sensors, a
-vehicle known to a few per cent and μ unknown at the start (mean ± sd over seeds)."""
+Printed; ours, the paper's estimator with sensors without error: 004 with the paper's noise on a matched plant, the
+others on the simulator's own plant; the same and the default with ordinary sensors, a vehicle known to a few per cent
+and μ unknown at the start (mean ± sd over seeds). `edge-agent evaluate --paper` has the papers' own conditions."""
 VEHICLES_HEAD: Final = """\
 ## The default on other vehicles
 

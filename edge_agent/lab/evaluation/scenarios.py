@@ -108,7 +108,7 @@ VEHICLES: Final = {
 
 # tyres that are not of the estimators' family or shape; "all scenarios" are driven with each in turn
 FOREIGN: Final = {
-    "brush": {"brush": True},
+    "brush": {"curve": "brush"},
     "sharp": {"shape": 1.65, "curvature": -0.6},
     "round": {"shape": 1.30, "curvature": 0.1},
     "softening": {"softening": 0.3},

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
+from edge_agent.lab.simulation.motor import Pmsm, speed_demand
 from schemas.thresholds import GRAVITY
 
 WHEELBASE: Final = 2.7  # [m] every driver knows his own near enough
@@ -20,7 +21,11 @@ LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 @dataclass(frozen=True)
 class Moment:
-    """What a driver knows: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s]."""
+    """What a driver knows: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s].
+
+    Speed control by hub motors also knows `lost` [m], the integral of the error of speed, and `gain` [m/s^2], the
+    acceleration.
+    """
 
     t: float
     x: float
@@ -28,11 +33,28 @@ class Moment:
     yaw: float
     vx: float
     speed: float
+    lost: float = 0.0
+    gain: float = 0.0
+    motors: Pmsm | None = None
 
 
 Control = Callable[[Moment], tuple[float, float]]
-Friction = float | Callable[[float, float], float]
-"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each wheel."""
+
+
+class TimedFriction(NamedTuple):
+    """Friction that changes in time, under all wheels at once (paper 003, section 4.2.4)."""
+
+    before: float
+    after: float
+    at_s: float
+
+    def value(self, t: float) -> float:
+        """Return the friction at `t` [s]."""
+        return self.before if t < self.at_s else self.after
+
+
+Friction = float | Callable[[float, float], float] | TimedFriction
+"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each wheel, or of time."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +80,10 @@ def split(left: float, right: float) -> Callable[[float, float], float]:
 
 def hold(now: Moment, speed: float | None = None) -> float:
     """Acceleration that brings the vehicle back to `speed`, or to the one that was asked for."""
-    return SPEED_GAIN * ((now.speed if speed is None else speed) - now.vx)
+    error = (now.speed if speed is None else speed) - now.vx
+    if now.motors is not None:
+        return speed_demand(now.motors, error, now.lost if speed is None else 0.0, now.gain)
+    return SPEED_GAIN * error
 
 
 def steer_to(now: Moment, target_x: float, target_y: float) -> float:
@@ -201,6 +226,11 @@ def stop_and_go(now: Moment) -> tuple[float, float]:
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
 
 
+def throttle(_now: Moment) -> tuple[float, float]:
+    """3 m/s^2 from the first sample on, wheels straight: "throttle opening of 0.3" of paper 003."""
+    return 0.0, 3.0
+
+
 def kmh(speed: float) -> float:
     """[m/s] of a speed in km/h."""
     return speed / 3.6
@@ -224,6 +254,7 @@ MANOEUVRES: Final = {
     "gaining-slalom": Manoeuvre(gaining_slalom, kmh(4.68), 20.0, 0.90, "slalom, faster: paper 001"),
     "low-turn": Manoeuvre(low_turn, kmh(40), 8.0, 0.35, "a turn on snow: paper 003"),
     "firm-acceleration": Manoeuvre(firm_acceleration, kmh(20), 5.0, 0.85, "0.6 g: paper 003"),
+    "throttle": Manoeuvre(throttle, kmh(20), 10.0, 0.85, "3 m/s^2 from the start: paper 003"),
     "brisk-acceleration": Manoeuvre(brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"),
     "moderate-braking": Manoeuvre(moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"),
     "standing": Manoeuvre(standing, 0.0, 60.0, 0.85, "at rest, the foot on the brake: level or on a slope"),

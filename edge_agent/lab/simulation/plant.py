@@ -37,7 +37,7 @@ from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
-from edge_agent.dynamics.tyres import TINY, brush, magic_formula
+from edge_agent.dynamics.tyres import TINY, brush, dugoff, magic_formula
 from edge_agent.lab.simulation.controllers import control_slip, slip_limit
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.numeric import FloatArray
@@ -123,16 +123,19 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
             slip_y = DIRECT * slip_y + (1.0 - DIRECT) * x[Motion.SLIP_Y + i]
         slope_x = stiffness_per_load(p[Parameter.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
         slope_y = stiffness_per_load(p[Parameter.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        if i >= 2:
+            slope_y *= p[Parameter.REAR_SLOPE]
         if p[TrueParameter.SOFTENING] > 0.0:
             soft = (u[Control.MU, i] / FIRM) ** p[TrueParameter.SOFTENING]
             slope_x, slope_y = soft * slope_x, soft * slope_y
         theta_x, theta_y = slope_x * slip_x / u[Control.MU, i], slope_y * slip_y / u[Control.MU, i]
         theta = math.hypot(theta_x, theta_y)
-        curve = (
-            brush(theta)
-            if p[TrueParameter.BRUSH] > 0.0
-            else magic_formula(theta, p[TrueParameter.SHAPE], p[TrueParameter.CURVATURE])
-        )
+        if p[TrueParameter.CURVE] == 0.0:
+            curve = magic_formula(theta, p[TrueParameter.SHAPE], p[TrueParameter.CURVATURE])
+        elif p[TrueParameter.CURVE] == 1.0:
+            curve = brush(theta)
+        else:
+            curve = dugoff(theta)
         secant = curve / theta if theta > TINY else 1.0
         pull = secant * u[Control.MU, i] * load
         drive, brake = wheel_torques(x, p, u, i, raw_slip)

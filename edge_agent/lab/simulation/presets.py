@@ -7,11 +7,15 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import parameter_row
+from edge_agent.dynamics.parameters import Parameter, parameter_row
+from edge_agent.lab.simulation.motor import Pmsm
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
+
+CURVES: Final = {"magic-formula": 0.0, "brush": 1.0, "dugoff": 2.0}  # name -> TrueParameter.CURVE
+STIFFNESSES: Final = {"proportional-to-friction": 1.0}  # name -> TrueParameter.SOFTENING
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,11 @@ class TrueVehicle:
     slip_limit: float = 0.08
     brake_front: float = 0.70
     power: float = 90e3
-    brush: bool = False  # the brush model's curve in place of the Magic Formula's
+    curve: str = "magic-formula"  # a key of CURVES
     softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
+    stiffness: str = "similarity"  # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
+    rear_slope: float = 1.0  # cornering stiffness per load of the rear tyres over that of the front ones
+    motors: Pmsm | None = None  # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
     rear_steer: float = 0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
     relaxation: float = 0.0  # [m] in which the tyres build up slip
     abs_hz: float = 0.0  # cycles per second of anti-lock control; 0: smooth slip control that is not reported
@@ -43,14 +50,22 @@ class TrueVehicle:
     esc: float = 0.0  # 1: stability control, likewise
     regeneration: float = 0.0  # [m/s^2] of braking by engine or generator, at the driven wheels
 
+    def __post_init__(self) -> None:
+        for field, known in (("curve", CURVES), ("stiffness", ("similarity", *STIFFNESSES))):
+            if getattr(self, field) not in known:
+                raise InputError(field, f"there is no {getattr(self, field)!r}", f"choose one of {', '.join(known)}")
+        if self.stiffness != "similarity" and self.softening:
+            raise InputError("softening", "the stiffness is proportional to friction", "leave one of them out")
+
     def row(self) -> FloatArray:
-        """The parameters for `plant`, shape (PARAMETERS,), in the order of `P` and `TrueParameter`."""
+        """The parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and `TrueParameter`."""
         drive = self.vehicle.drive_split_front
         nominal = parameter_row(self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive}))
+        nominal[Parameter.REAR_SLOPE] = self.rear_slope
         own = (self.shape, self.curvature, self.degression, self.lag, self.roll_leak, self.pitch_leak)
         return np.array([
             *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
-            float(self.brush), self.softening, self.rear_steer,
+            CURVES[self.curve], STIFFNESSES.get(self.stiffness, self.softening), self.rear_steer,
             self.relaxation, self.abs_hz, self.tcs, self.esc, self.regeneration,
         ])  # fmt: skip
 
@@ -118,6 +133,12 @@ def matched(vehicle: TrueVehicle) -> TrueVehicle:
     The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
     """
     return replace(vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0)
+
+
+def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
+    """Return the `matched` vehicle with Dugoff tyres; proportional: stiffness is proportional to friction."""
+    stiffness = "proportional-to-friction" if proportional else "similarity"
+    return replace(matched(vehicle), curve="dugoff", stiffness=stiffness)
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:

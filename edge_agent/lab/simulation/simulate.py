@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ import pyarrow as pa
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation.counter_rng import checked_seed
 from edge_agent.lab.simulation.faults import Fault, apply_faults
-from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment
+from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment, TimedFriction
+from edge_agent.lab.simulation.motor import at_rest, turn_motor
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.plant import (
     advance,
@@ -99,18 +101,20 @@ def _check(**positive: float | None) -> None:
             raise InputError(name, f"{value} is not possible", "give a positive number")
 
 
-def _friction(mu: Friction) -> Callable[[float, float], float]:
+def _friction(mu: Friction) -> Callable[[float, float, float], float]:
+    if isinstance(mu, TimedFriction):
+        return lambda t, _x, _y: mu.value(t)
     if callable(mu):
-        return mu
+        return lambda _t, x, y: mu(x, y)
     if not 0.0 < mu <= 2.0:
         raise InputError("mu", f"{mu} is not a friction", "give a number in (0, 2]")
-    return lambda _x, _y: mu
+    return lambda _t, _x, _y: mu
 
 
 class ProvingGround(NamedTuple):
-    """The test track: friction at (x, y) [m], and the table of its relief."""
+    """The test track: friction at t [s] and (x, y) [m], and the table of its relief."""
 
-    friction: Callable[[float, float], float]
+    friction: Callable[[float, float, float], float]
     relief: FloatArray
 
 
@@ -123,22 +127,32 @@ def _drive(
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     across = cross_slope(world.relief, 0.0)
-    steer = force = 0.0
+    steer = force = lost = 0.0
+    currents = at_rest()
     for k in range(samples):
         east, north = gradient(world.relief, (x[Motion.X], x[Motion.Y]), (1.0, 0.0), across)
         u[Control.TILT, :2] = tilt(east, north, x[Motion.YAW])
-        wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
+        now = replace(_moment(k * dt, x, speed), lost=lost, motors=truth.motors)
+        now = replace(now, gain=float(records[k - 1, RecordColumn.AX]) if k else 0.0)
+        lost += dt * (speed - now.vx)
+        wish, acceleration = manoeuvre.control(now)
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
             force = float(p[Parameter.MASS]) * acceleration  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
-        force += (float(p[Parameter.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
+        wanted = float(p[Parameter.MASS]) * acceleration
+        force += (wanted - force) * (1.0 if truth.motors else -math.expm1(-dt / PEDAL_LAG_S))
         force = min(force, strongest_pull(p, float(x[Motion.VX])))
         command(p, u, steer, force)
         if p[TrueParameter.REGENERATION] > 0.0:
             regenerate(x, p, u)
+        if truth.motors is not None:
+            for i in range(4):
+                asked = float(u[Control.DRIVE, i] - u[Control.BRAKE, i])
+                u[Control.DRIVE, i] = turn_motor(currents[i], truth.motors, asked, float(x[Motion.OMEGA + i]), dt)
+                u[Control.BRAKE, i] = 0.0
         for i in range(4):
-            u[Control.MU, i] = world.friction(*wheel_place(x, p, i))
+            u[Control.MU, i] = world.friction(k * dt, *wheel_place(x, p, i))
         observe(x, p, u, w, records[k])
         advance(x, p, u, w, dt / substeps, substeps)
     return records

@@ -54,7 +54,7 @@ class TrueParameter(IntEnum):
     SLIP_LIMIT = len(Parameter) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
     BRAKE_FRONT = len(Parameter) + 9  # share of the braking torque at the front axle
     POWER = len(Parameter) + 10  # [W]
-    BRUSH = len(Parameter) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
+    CURVE = len(Parameter) + 11  # of the tyre: 0 Magic Formula, 1 brush model, 2 Dugoff
     SOFTENING = (
         len(Parameter) + 12
     )  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction

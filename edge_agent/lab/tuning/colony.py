@@ -19,7 +19,7 @@ Deposits go by rank and to the best path so far, and pheromone stays inside boun
 objective does not matter and the colony cannot stagnate (rank-based, elitist and max-min ant systems).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,7 @@ class Habits:
     elite: float = 0.25  # share of the ants of an iteration that deposit
     memory: float = 0.4  # share of the deposit that the best path so far receives
     retrace: float = 0.3  # chance that an ant of a converged colony walks the best path again
+    trace: Callable[[FloatArray], None] | None = None  # called with the pheromone (V, K) after each iteration
 
     def __post_init__(self) -> None:
         """Refuse habits for which (31) or (32) lose their meaning."""
@@ -144,6 +145,8 @@ def optimise(
             evaporation=habits.evaporation,
             retrace=habits.retrace,
         )
+        if habits.trace is not None:
+            habits.trace(pheromone.copy())
     return ledger.result()
 
 

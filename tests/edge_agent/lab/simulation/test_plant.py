@@ -9,6 +9,7 @@ import pytest
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation.motor import Pmsm
 from edge_agent.lab.simulation.plant import advance, body_accelerations, command, start_at, substeps_of, wheel_forces
 from edge_agent.lab.simulation.presets import TrueVehicle
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
@@ -208,12 +209,18 @@ def test_a_sample_is_cut_into_steps_of_a_millisecond_at_most(rate: float) -> Non
     assert 1.0 / (rate * substeps_of(rate)) <= 1e-3 * (1 + ROUNDING)
 
 
+OTHER_OPTIONS = {"curve": "dugoff", "stiffness": "proportional-to-friction", "motors": Pmsm()}
+
+
 @pytest.mark.parametrize("name", [f.name for f in fields(TrueVehicle) if f.name != "vehicle"])
 def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
     of_controllers = name in ("tcs", "esc")  # which only vehicles with modulated slip control have
     usual = replace(PRESETS["van"], abs_hz=8.0) if of_controllers else PRESETS["van"]
     mu = 0.3 if of_controllers else None
-    changed = replace(usual, **{name: getattr(usual, name) * 0.8 + 0.01})
+    if name in OTHER_OPTIONS:
+        changed = replace(usual, **{name: OTHER_OPTIONS[name]})
+    else:
+        changed = replace(usual, **{name: getattr(usual, name) * 0.8 + 0.01})
     logs = []
     for vehicle in (usual, changed):
         drives = [

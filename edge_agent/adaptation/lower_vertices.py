@@ -1,0 +1,122 @@
+"""Triangular fuzzy sets whose lower vertices are free: the sets that paper 004 tunes (section III.C, figures 2 and 3).
+
+Legend
+    peaks       upper vertices of the five sets of the mismatch [1] (5,)
+    feet        their lower vertices between the peaks: right foot of set k, left foot of set k + 1 [1] (8,)
+    out_peaks   upper vertices of the five sets of the step, ln of the factor on R [nat] (5,)
+    out_feet    their lower vertices [nat] (8,)
+    w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output set
+
+The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks they hold with full weight. With
+the feet at the neighbouring peaks and out_feet at the neighbouring out_peaks these are almost the sets of
+`memberships.Memberships`, whose feet are tied to the peaks; there the output sets are points.
+Where no set holds, because feet leave a gap, the step is zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+SETS: Final = 5
+FEET: Final = 2 * (SETS - 1)
+LEAST_OVERLAP: Final = 0.02  # share of the distance of two peaks by which their sets overlap at least
+
+
+@dataclass(frozen=True)
+class LowerVertices:
+    """Sets of mismatch and step with free feet, as shares of the way between neighbouring peaks.
+
+    Attributes:
+        feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k [1], 1 at the peak.
+        out_feet: the same of the sets of the step.
+
+    Raises:
+        InputError: a share leaves its range, or peaks do not rise.
+    """
+
+    feet: tuple[float, ...] = (1.0,) * FEET
+    out_feet: tuple[float, ...] = (1.0,) * FEET
+    peaks: tuple[float, ...] = (-0.8, -0.4, 0.0, 1.0, 4.0)
+    out_peaks: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
+
+    def __post_init__(self) -> None:
+        for name in ("feet", "out_feet"):
+            shares = np.asarray(getattr(self, name), float)
+            if shares.shape != (FEET,) or not ((shares > 0.0) & (shares <= 2.0)).all():
+                raise InputError(f"lower_vertices.{name}", "out of range", f"give {FEET} shares in (0, 2]")
+        for name in ("peaks", "out_peaks"):
+            peaks = np.asarray(getattr(self, name), float)
+            if peaks.shape != (SETS,) or not (np.diff(peaks) > 0.0).all():
+                raise InputError(f"lower_vertices.{name}", "do not rise", f"give {SETS} numbers in order")
+        pairs = np.asarray(self.feet).reshape(-1, 2)
+        if (pairs.sum(axis=1) < 1.0 + LEAST_OVERLAP).any():
+            raise InputError("lower_vertices.feet", "two neighbours leave a gap", "let a pair sum to more than 1")
+
+    def triangles(self) -> tuple[FloatArray, FloatArray]:
+        """Return the sets of mismatch and of step, (5, 3) each: left foot, peak, right foot."""
+        return _triangles(self.peaks, self.feet), _triangles(self.out_peaks, self.out_feet)
+
+    def step(self, mismatch: float) -> float:
+        """Return ln of the factor on R [nat] for a mismatch [1]."""
+        inputs, outputs = self.triangles()
+        weight = _memberships(inputs, mismatch)
+        total = float(weight.sum())
+        return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
+
+    def table(self, knots: int) -> tuple[FloatArray, FloatArray]:
+        """Return mismatches and steps, (knots,) each, between which the filter interpolates linearly."""
+        inputs, _ = self.triangles()
+        corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
+        even = np.linspace(self.peaks[0], self.peaks[-1], knots - len(corners) + 2)
+        at = np.unique(np.concatenate([corners, even]))[:knots]
+        at = np.append(at, np.full(knots - len(at), at[-1]))
+        return at, np.array([self.step(float(value)) for value in at])
+
+    def to_vector(self) -> FloatArray:
+        """Return the free numbers, (16,): shares of the input sets, then of the output sets."""
+        return np.array([*self.feet, *self.out_feet])
+
+    @classmethod
+    def from_vector(cls, vector: FloatArray) -> LowerVertices:
+        """Return the sets of a vector (16,); a pair that would leave a gap is widened evenly."""
+        shares = np.asarray(vector, float).copy()
+        pairs = shares[:FEET].reshape(-1, 2)
+        lack = np.maximum(1.0 + LEAST_OVERLAP - pairs.sum(axis=1), 0.0)
+        pairs += 0.5 * lack[:, None]
+        return cls(tuple(map(float, shares[:FEET])), tuple(map(float, shares[FEET:])))
+
+    @staticmethod
+    def bounds() -> tuple[FloatArray, FloatArray]:
+        """Return the lower and upper ends of the vector, (16,) each."""
+        return np.full(2 * FEET, 0.3), np.full(2 * FEET, 1.8)
+
+
+def _triangles(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
+    """Left foot, peak and right foot of each set, (5, 3); outer sets end at their peaks."""
+    sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
+    for k in range(SETS - 1):
+        gap = peaks[k + 1] - peaks[k]
+        sets[k, 2] += feet[2 * k] * gap
+        sets[k + 1, 0] -= feet[2 * k + 1] * gap
+    return sets
+
+
+def _memberships(sets: FloatArray, mismatch: float) -> FloatArray:
+    """Memberships (5,) of a mismatch; the outer sets are shoulders."""
+    weight = np.zeros(SETS)
+    for k, (left, peak, right) in enumerate(sets):
+        if mismatch <= peak:
+            shoulder = k == 0
+            rising = (mismatch - left) / (peak - left) if peak > left else 0.0
+            weight[k] = 1.0 if shoulder or mismatch == peak else max(rising, 0.0)
+        else:
+            shoulder = k == SETS - 1
+            falling = (right - mismatch) / (right - peak) if right > peak else 0.0
+            weight[k] = 1.0 if shoulder else max(falling, 0.0)
+    return weight

@@ -1,0 +1,40 @@
+"""One motor per axle with a differential: paper 004, equations (4) to (6).
+
+Legend: omega_1, omega_2 speeds of an axle's wheels and omega_c of its midpoint [rad/s], T_m motor torque [N m], i_t
+transmission ratio, eta_t its efficiency, F_x longitudinal force of the axle [N], J_w inertia of a wheel, R radius.
+
+    J_w*omega_i' = T_di - F_xi*R                    (4)
+    2*J_w*omega_c' = T_m*i_t*eta_t - F_x*R          (5), (6)
+
+The paper takes the larger of two wheel speeds for the midpoint's; that is the outer wheel, so the mean is used here.
+Signals hold the torque at the wheels, so T_m*i_t*eta_t is the sum of an axle's two torques. The paper does not give i_t
+and eta_t.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from schemas.runtime.jit import inlined
+
+RATIO: Final = 9.0  # i_t of an ordinary electric car
+EFFICIENCY: Final = 0.95  # eta_t
+
+
+@inlined
+def midpoint_speed(left: float, right: float) -> float:
+    """Return omega_c [rad/s] of an axle from the speeds of its wheels."""
+    return 0.5 * (left + right)
+
+
+@inlined
+def axle_force(torque: float, turning: float, inertia: float, radius: float) -> float:
+    """Return F_x [N] of an axle from the sum of its wheel torques [N m] and omega_c' [rad/s^2]."""
+    return (torque - 2.0 * inertia * turning) / radius
+
+
+@inlined
+def motor_torque(torque: float, ratio: float, efficiency: float) -> float:
+    """Return T_m [N m] from the sum of an axle's wheel torques; a motor that brakes gains by the losses."""
+    share = efficiency if torque >= 0.0 else 1.0 / efficiency
+    return torque / (ratio * share)

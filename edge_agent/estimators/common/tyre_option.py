@@ -1,0 +1,49 @@
+"""Options of the papers' tyres: how slip stiffness depends on friction, on load and on the axle.
+
+Legend: K slip stiffness, F_z load, mu friction, F_0 = m*g/4, k the vehicle file's stiffness over F_0 [1].
+
+    similarity                 K = k*F_z                        as on a real tyre
+    proportional-to-friction   K = mu*k*F_z                     as papers 000, 003 and 004 print it
+    quadratic e                K = k*F_z*(1 + e - e*F_z/F_0)    the polynomial m*F_z - n*F_z^2, (14) of paper 001
+    rear_slope q               K of the rear tyres is q times as large per load (C_f and C_r of paper 002)
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from edge_agent.dynamics.parameters import Parameter
+from schemas.errors import InputError
+from schemas.runtime.records import RecordArray
+
+STIFFNESSES: Final = {"similarity": 0.0, "proportional-to-friction": 1.0}
+
+
+class TyreOption(NamedTuple):
+    """The tyre that a paper's filter takes for true."""
+
+    stiffness: str = "similarity"  # a key of STIFFNESSES
+    quadratic: float = 0.0  # e
+    rear_slope: float = 1.0  # q
+
+
+PROPORTIONAL: Final = TyreOption("proportional-to-friction")
+
+
+def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
+    """Write the option into the rows of the filters.
+
+    Raises:
+        InputError: the stiffness is unknown, or a number is out of range.
+    """
+    if tyre.stiffness not in STIFFNESSES:
+        choices = ", ".join(STIFFNESSES)
+        raise InputError("tyre.stiffness", f"there is no {tyre.stiffness!r}", f"choose {choices}")
+    if not 0.0 <= tyre.quadratic < 1.0:
+        raise InputError("tyre.quadratic", f"{tyre.quadratic} is out of range", "use 0 to 1")
+    if not tyre.rear_slope > 0.0:
+        raise InputError("tyre.rear_slope", f"{tyre.rear_slope} is not positive", "use the ratio")
+    rows = filters["row"]
+    rows[:, Parameter.PROPORTIONAL] = STIFFNESSES[tyre.stiffness]
+    rows[:, Parameter.QUADRATIC] = tyre.quadratic
+    rows[:, Parameter.REAR_SLOPE] = tyre.rear_slope

@@ -1,0 +1,98 @@
+"""The friction filter of paper 000 as printed: two cubature sub-filters and a master, given motion.
+
+State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53); F_x from wheel
+torque (10); shares by (54), which gives more information to the worse filter, from one half because zero divides by
+zero. P_f, not its inverse, in (52). Cubature points by singular values (40), (41).
+
+Legend: beta_i share of sub-filter i; P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.estimators.literal.given_motion import GivenMotion
+from edge_agent.estimators.literal.wheel_forces import WheelForces
+from edge_agent.estimators.literal.wheel_friction_ukf import FrictionRun
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+STATES: Final = 4
+LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
+
+
+class Setting(NamedTuple):
+    """Variances of the filter, and its tyre."""
+
+    process: float = 1.0  # Q of each friction per sample
+    start: float = 1.0  # P_0
+    first: tuple[float, float, float] = (90.0, 1e4, 1e4)  # R of sub-filter 1: a_x, a_y, r
+    second: tuple[float, float] = (1e4, 1e4)  # R of sub-filter 2: a_y, r
+    mu: float = 1.0
+    proportional: bool = True
+
+
+AS_PRINTED: Final = Setting()
+"""(57)."""
+
+
+def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
+    """Run the filter over a drive."""
+    forces = WheelForces.of(given, proportional=setting.proportional, single=False)
+    given_x = given.wheel_forces()
+    signals = given.signals
+    noise = (np.diag(setting.first), np.diag(setting.second))
+    mu = np.empty((len(given.t), STATES))
+    mean = np.full(STATES, setting.mu)
+    covariance = setting.start * np.eye(STATES)
+    shares = np.array([0.5, 0.5])
+    mu[0] = mean
+    for k in range(1, len(given.t)):
+        inverse = np.zeros((STATES, STATES))
+        information = np.zeros(STATES)
+        sizes = np.empty(2)
+        for sub in range(2):
+            predicted = (covariance + setting.process * np.eye(STATES)) / shares[sub]
+            points = _points(mean, predicted)
+            force = forces.tyre(k, points)
+            force[..., 0] = given_x[k]
+            outcomes = forces.accelerations(k, force)
+            outcomes[:, 2] = signals[k - 1, S.YAW_RATE] + given.step * outcomes[:, 2]
+            reading = signals[k, [S.AX, S.AY, S.YAW_RATE]]
+            local, spread = _update(mean, predicted, points, outcomes[:, sub:], reading[sub:], noise[sub])
+            sizes[sub] = np.trace(spread)
+            part = np.linalg.inv(spread)
+            inverse += part
+            information += part @ local
+        covariance = np.linalg.inv(inverse)
+        mean = covariance @ information
+        shares = np.clip(sizes / sizes.sum(), LEAST_SHARE, 1.0 - LEAST_SHARE)
+        mu[k] = mean
+    return FrictionRun(mu, 0.0)
+
+
+def _points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Cubature points (8, 4) by singular values."""
+    axes, sizes, _ = np.linalg.svd(covariance)
+    spread = np.sqrt(STATES) * (axes * np.sqrt(sizes)).T
+    return np.concatenate([mean + spread, mean - spread])
+
+
+def _update(
+    mean: FloatArray,
+    covariance: FloatArray,
+    points: FloatArray,
+    outcomes: FloatArray,
+    reading: FloatArray,
+    noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance after a sub-filter's measurement (42) to (48)."""
+    predicted = outcomes.mean(axis=0)
+    apart = outcomes - predicted
+    off = points - mean
+    count = len(points)
+    expected = apart.T @ apart / count + noise
+    gain = np.linalg.solve(expected, apart.T @ off / count).T
+    return mean + gain @ (reading - predicted), covariance - gain @ expected @ gain.T

@@ -1,0 +1,79 @@
+"""Tyre forces of one sample for many values of friction at once, in double or single precision.
+
+Legend: s_x, s_y slip along and across; k_x, k_y slip stiffness over load [1]; f Dugoff's curve; F_z load; mu friction.
+
+    proportional   F = mu*F_z*f(theta)*direction, theta = |(k_x*s_x, k_y*s_y)|      stiffness mu*k*F_z, as printed
+    similarity     the same with theta over mu                                      stiffness k*F_z
+
+With the printed tyre the force is linear in friction, so friction below zero is allowed between two samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.slip import SLOWEST_M_S
+from edge_agent.estimators.literal.given_motion import GivenMotion
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+TINY = 1e-12  # below it a slip has no direction and no force
+LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction needs one
+
+
+@dataclass(frozen=True)
+class WheelForces:
+    """What a drive gives to the tyres of each sample, and whether stiffness is proportional to friction."""
+
+    free: FloatArray  # (T, 4, 2) k*s of the wheels
+    loads: FloatArray  # (T, 4) [N]
+    turned: FloatArray  # (T, 4, 2) cosine and sine of the steering
+    places: FloatArray  # (4, 2) x and y of the wheels [m]
+    mass: FloatArray  # (2,) mass [kg] and yaw inertia [kg m^2]
+    air: FloatArray  # (T,) deceleration by the air [m/s^2]
+    proportional: bool
+
+    @classmethod
+    def of(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
+        """Prepare the drive; single: in single precision."""
+        kind = np.float32 if single else np.float64
+        row, p = given.row, Parameter
+        half_front, half_rear = 0.5 * row[p.TRACK_FRONT], 0.5 * row[p.TRACK_REAR]
+        front, rear = row[p.TO_FRONT], -row[p.TO_REAR]
+        places = np.array([[front, half_front], [front, -half_front], [rear, half_rear], [rear, -half_rear]])
+        delta = given.signals[:, S.DELTA : S.DELTA + 4]
+        omega = given.signals[:, S.OMEGA : S.OMEGA + 4]
+        rate = given.signals[:, S.YAW_RATE, None]
+        ahead = given.vx[:, None] - places[:, 1] * rate
+        left = given.vy[:, None] + places[:, 0] * rate
+        turned = np.stack([np.cos(delta), np.sin(delta)], axis=-1)
+        along = turned[..., 0] * ahead + turned[..., 1] * left
+        across = turned[..., 0] * left - turned[..., 1] * ahead
+        speed = np.maximum(np.abs(along), SLOWEST_M_S)
+        slip_x = (row[p.RADIUS] * omega - along) / speed
+        free = np.stack([row[p.SLOPE_X] * slip_x, -row[p.SLOPE_Y] * across / speed], axis=-1)
+        mass = np.array([row[p.MASS], row[p.YAW_INERTIA]])
+        air = given.drag * given.vx * np.abs(given.vx) / row[p.MASS]
+        arrays = (free, given.loads(), turned, places, mass, air)
+        return cls(*(np.asarray(array, kind) for array in arrays), proportional)
+
+    def tyre(self, k: int, mu: FloatArray) -> FloatArray:
+        """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P, 4)."""
+        free = self.free[k]
+        size = np.maximum(np.hypot(free[:, 0], free[:, 1]), TINY)
+        theta = size if self.proportional else size / np.maximum(mu, LEAST_MU)
+        curve = np.where(theta <= 0.5, theta, 1.0 - 0.25 / np.maximum(theta, 0.5)).astype(free.dtype)
+        pull = mu * self.loads[k] * curve / size
+        return np.asarray(pull[..., None] * free)
+
+    def accelerations(self, k: int, force: FloatArray) -> FloatArray:
+        """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at sample `k`."""
+        cos, sin = self.turned[k, :, 0], self.turned[k, :, 1]
+        ahead = cos * force[..., 0] - sin * force[..., 1]
+        left = sin * force[..., 0] + cos * force[..., 1]
+        moment = (self.places[:, 0] * left - self.places[:, 1] * ahead).sum(axis=-1)
+        ax = ahead.sum(axis=-1) / self.mass[0] - self.air[k]
+        return np.stack([ax, left.sum(axis=-1) / self.mass[0], moment / self.mass[1]], axis=-1)

@@ -1,0 +1,176 @@
+"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and its comparator.
+
+State mu_fl, mu_fr, mu_rl, mu_rr, a random walk. Measurement [a_x, a_y, r] (section 3.1): yaw rate over a sample, so the
+row is its difference r' [rad/s^2]. With `torque_rows` the torque balances of the wheels follow, F_x of each wheel:
+without them two of four frictions are visible straight on.
+
+Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0, d = sum of w*e_i.
+
+Square root (section 3.2): roots by singular values. With the printed alpha = .001 the centre has a weight of -10^6,
+which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta - alpha^2)*d*d' exactly, and there all
+weights are positive. That is the form used here, in either precision.
+
+Covariance (section 3.1, "UKF"): the textbook sums with weights of 10^6, whose digits cancel. In single precision the
+covariance then loses its Cholesky factor, and the last one that existed is used instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.estimators.literal.given_motion import GivenMotion
+from edge_agent.estimators.literal.wheel_forces import WheelForces
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+STATES: Final = 4
+
+
+class Setting(NamedTuple):
+    """Variances and options of the filter."""
+
+    alpha: float = 0.001
+    beta: float = 2.0
+    kappa: float = 0.0
+    process: float = 1e-4  # Q of each friction per sample: "a slight noise variance"
+    noise: tuple[float, float, float] = (1e-3, 1e-3, 1e-4)  # R of a_x, a_y, r'
+    torque_noise: float = 1.0  # R of the wheels' forces [N^2]
+    start: float = 0.25  # P_0
+    mu: float = 0.8  # at the start
+    torque_rows: bool = True
+    proportional: bool = True  # stiffness to friction
+    square_root: bool = True
+    single: bool = False
+
+
+AS_PRINTED: Final = Setting()
+"""The printed alpha, kappa and beta; Q, R and P_0 are lost in the text and of the size that it describes."""
+UKF: Final = Setting(square_root=False)
+UKF_SINGLE: Final = Setting(square_root=False, single=True)
+
+
+@dataclass(frozen=True)
+class FrictionRun:
+    """Friction of the wheels over a drive (T, 4), and the share of the steps whose covariance had no factor."""
+
+    mu: FloatArray
+    lost: float
+
+
+def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
+    """Run the filter over a drive."""
+    model = _Model(given, setting)
+    steps = len(given.t)
+    mu = np.empty((steps, STATES))
+    mean = np.full(STATES, setting.mu, model.kind)
+    root = np.eye(STATES, dtype=model.kind) * np.sqrt(setting.start).astype(model.kind)
+    mu[0] = mean
+    lost = 0
+    step = _square_root_step if setting.square_root else _covariance_step
+    covariance = root @ root.T
+    for k in range(1, steps):
+        mean, covariance, root, failed = step(model, k, mean, covariance, root)
+        lost += failed
+        mu[k] = mean
+    return FrictionRun(mu, lost / (steps - 1))
+
+
+class _Model:
+    """Measurements of a drive and their model, in the precision of the filter."""
+
+    def __init__(self, given: GivenMotion, setting: Setting) -> None:
+        self.setting = setting
+        self.kind = np.float32 if setting.single else np.float64
+        self.forces = WheelForces.of(given, proportional=setting.proportional, single=setting.single)
+        signals = given.signals
+        turning = np.diff(signals[:, S.YAW_RATE], prepend=signals[0, S.YAW_RATE]) / given.step
+        rows = [signals[:, S.AX], signals[:, S.AY], turning]
+        noise = list(setting.noise)
+        if setting.torque_rows:
+            rows += list(given.wheel_forces().T)
+            noise += [setting.torque_noise] * 4
+        self.readings = np.stack(rows, axis=1).astype(self.kind)
+        self.noise_root = np.diag(np.sqrt(noise)).astype(self.kind)
+        self.process_root = np.eye(STATES, dtype=self.kind) * self.kind(np.sqrt(setting.process))
+        scale = setting.alpha**2 * (STATES + setting.kappa)
+        self.spread = self.kind(np.sqrt(scale))
+        self.side = self.kind(0.5 / scale)
+        centre = (scale - STATES) / scale
+        self.mean_weights = np.full(2 * STATES + 1, self.side)
+        self.cov_weights = self.mean_weights.copy()
+        self.mean_weights[0] = centre
+        self.cov_weights[0] = centre + 1.0 - setting.alpha**2 + setting.beta
+        self.bend = self.kind(np.sqrt(setting.beta - setting.alpha**2))
+
+    def points(self, mean: FloatArray, root: FloatArray) -> FloatArray:
+        """Points (9, 4) of the state."""
+        spread = self.spread * root.T
+        return np.concatenate([mean[None], mean + spread, mean - spread])
+
+    def outcomes(self, k: int, points: FloatArray) -> FloatArray:
+        """Measurements (9, rows) of the points at sample `k`."""
+        force = self.forces.tyre(k, points)
+        felt = self.forces.accelerations(k, force)
+        if not self.setting.torque_rows:
+            return felt
+        return np.concatenate([felt, force[..., 0]], axis=1)
+
+
+def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are never negative."""
+    axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return axes, sizes
+
+
+def _square_root_step(
+    model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """One step in square-root form; the covariance is not used."""
+    axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
+    points = model.points(mean, axes * sizes)
+    outcomes = model.outcomes(k, points)
+    side = np.sqrt(model.side)
+    state = side * (points[1:] - points[0]).T
+    bent = (outcomes[1:] - outcomes[0]).T
+    deviation = model.side * bent.sum(axis=1)
+    measured = np.concatenate([side * bent, model.bend * deviation[:, None]], axis=1)
+    state = np.concatenate([state, np.zeros((STATES, 1), model.kind)], axis=1)
+    axes, sizes = _root_of(np.concatenate([measured, model.noise_root], axis=1))
+    gain = (state @ measured.T) @ (axes / sizes**2) @ axes.T
+    innovation = model.readings[k] - outcomes[0] - deviation
+    after, lengths = _root_of(np.concatenate([state - gain @ measured, gain @ model.noise_root], axis=1))
+    return mean + gain @ innovation, covariance, after * lengths, False
+
+
+def _factor(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
+    """(Cholesky factor, False), or (the last one, True) where there is none."""
+    try:
+        return np.linalg.cholesky(covariance), False
+    except np.linalg.LinAlgError:
+        return last, True
+
+
+def _covariance_step(
+    model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """One step of the textbook filter."""
+    root, lost = _factor(covariance, root)
+    points = model.points(mean, root)
+    mean = model.mean_weights @ points
+    off = points - mean
+    covariance = (model.cov_weights[:, None] * off).T @ off + model.process_root**2
+    root, lost_again = _factor(covariance, root)
+    points = model.points(mean, root)
+    outcomes = model.outcomes(k, points)
+    predicted = model.mean_weights @ outcomes
+    off, apart = points - mean, outcomes - predicted
+    weighted = model.cov_weights[:, None] * apart
+    expected = weighted.T @ apart + model.noise_root**2
+    cross = (model.cov_weights[:, None] * off).T @ apart
+    gain = np.linalg.solve(expected, cross.T).T
+    innovation = model.readings[k] - predicted
+    after = covariance - gain @ expected @ gain.T
+    return mean + gain @ innovation, after, root, lost or lost_again

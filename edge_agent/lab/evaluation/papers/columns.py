@@ -1,0 +1,37 @@
+"""Columns of the papers' tables: the same drive matched, on the simulator's own plant, and with realistic sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates, EstimatorBank
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal, realistic
+from edge_agent.lab.evaluation.measures import measures
+from edge_agent.lab.evaluation.papers.outcome import Values
+from edge_agent.lab.evaluation.scenarios import PAPERS
+from schemas.vehicle import Vehicle
+
+DEFAULT: Final = "aco-fckf"
+BankMaker: TypeAlias = Callable[[Sequence[Vehicle]], EstimatorBank]
+
+
+def means(batch: DriveSet, reported: Estimates) -> Values:
+    """Return all measures of an estimator, mean over the drives."""
+    return {name: float(np.mean(value)) for name, value in measures(batch, reported).items()}
+
+
+def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates]:
+    """Drive with perfect sensors, and let an estimator read them."""
+    batch = ideal(spec)
+    return batch, estimates(make(batch.vehicles), batch)
+
+
+def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
+    """Return the measures of a paper's estimator and of the default, on drives with ordinary sensors."""
+    batch = realistic(PAPERS[name], seeds)
+    found = [means(batch, estimates(bank_of(each, batch.vehicles), batch)) for each in (estimator, DEFAULT)]
+    return found[0], found[1]

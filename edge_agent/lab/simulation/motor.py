@@ -1,0 +1,90 @@
+"""Permanent-magnet synchronous motors at the wheels, and the PID speed control of paper 003 (section 4.1).
+
+Legend, in the rotor's d-q axes
+    u, i        voltage [V] and current [A] of an axis           L, R   inductance [H], resistance [ohm] of the stator
+    psi         flux of the magnets [Wb]                         p      pole pairs
+    omega_e     electrical speed p*omega_m [rad/s]               G      gear from motor to wheel
+
+    L_d*i_d' = u_d - R*i_d + omega_e*L_q*i_q                     voltage of the d axis
+    L_q*i_q' = u_q - R*i_q - omega_e*(L_d*i_d + psi)             voltage of the q axis
+    T = 1.5*p*(psi*i_q + (L_d - L_q)*i_d*i_q)                    torque
+
+The inverter's current control is proportional-integral with the motor's own terms fed forward, i_d is kept at zero, and
+the voltage is limited. The paper gives no constants: these are of an ordinary hub motor. The equation of mechanical
+motion is the wheel's own in `plant`, whose inertia holds the rotor; viscous friction is left out, because the filters
+take the torque at the wheel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+STEP_S: Final = 1e-4  # of the motor's equations; its electrical time constant is L/R = 3 ms
+D, Q, D_SUM, Q_SUM = 0, 1, 2, 3  # columns of a motor's state: currents [A], integrals of their errors [A s]
+
+
+class Pmsm(NamedTuple):
+    """Constants of one motor, and of the speed control."""
+
+    resistance: float = 0.10  # R [ohm]
+    inductance_d: float = 3.0e-4  # L_d [H]
+    inductance_q: float = 3.0e-4  # L_q [H]
+    flux: float = 0.12  # psi [Wb]
+    pole_pairs: float = 8.0  # p
+    gear: float = 4.0  # G
+    voltage: float = 600.0  # most that the inverter gives [V]
+    bandwidth: float = 600.0  # of the current control [rad/s]
+    proportional: float = 1.5  # of the speed control: [1/s] of an error of speed
+    integral: float = 0.3  # [1/s^2]
+    derivative: float = 0.05  # [1] of the acceleration
+
+
+def speed_demand(motor: Pmsm, error: float, summed: float, acceleration: float) -> float:
+    """Return the acceleration [m/s^2] that the PID asks for.
+
+    Args:
+        error: speed that is wanted less the true one [m/s].
+        summed: its integral over time [m].
+        acceleration: true one [m/s^2]; it stands for the derivative of the error.
+    """
+    return motor.proportional * error + motor.integral * summed - motor.derivative * acceleration
+
+
+def at_rest() -> FloatArray:
+    """Return the state (4, 4) of four motors without current."""
+    return np.zeros((4, 4))
+
+
+@compiled
+def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: float) -> float:
+    """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque at the wheel [N m].
+
+    wanted: torque at the wheel that is asked for [N m].
+    """
+    per_ampere = 1.5 * motor.pole_pairs * motor.flux
+    aim = wanted / (motor.gear * per_ampere)
+    electrical = motor.pole_pairs * motor.gear * omega
+    count = max(1, math.ceil(dt / STEP_S - 1e-9))
+    step = dt / count
+    for _ in range(count):
+        back_d = electrical * motor.inductance_q * state[Q]
+        back_q = electrical * (motor.inductance_d * state[D] + motor.flux)
+        error_d, error_q = -state[D], aim - state[Q]
+        control = motor.bandwidth * motor.resistance
+        voltage_d = motor.bandwidth * motor.inductance_d * error_d + control * state[D_SUM] - back_d
+        voltage_q = motor.bandwidth * motor.inductance_q * error_q + control * state[Q_SUM] + back_q
+        size = math.hypot(voltage_d, voltage_q)
+        share = min(1.0, motor.voltage / size) if size > 0.0 else 1.0
+        if share == 1.0:  # an integral that grows while the voltage is at its limit would overshoot
+            state[D_SUM] += step * error_d
+            state[Q_SUM] += step * error_q
+        state[D] += step * (share * voltage_d - motor.resistance * state[D] + back_d) / motor.inductance_d
+        state[Q] += step * (share * voltage_q - motor.resistance * state[Q] - back_q) / motor.inductance_q
+    reluctance = (motor.inductance_d - motor.inductance_q) * state[D] * state[Q]
+    return float(motor.gear * 1.5 * motor.pole_pairs * (motor.flux * state[Q] + reluctance))

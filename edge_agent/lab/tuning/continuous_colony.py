@@ -1,0 +1,153 @@
+"""Ant colony over continuous variables, ACO_R (Socha and Dorigo, European J. of Operational Research 2008), pure.
+
+The graph of `colony` gives each vertex a short list of positions. Vertices of fuzzy sets are continuous, so here an
+archive of the k best vectors stands for the pheromone. An ant takes vector l of the archive with a weight that falls
+with its rank, and draws each variable from a normal distribution about it.
+
+Legend
+    l           rank in the archive, 1 is best
+    w_l         weight exp(-(l - 1)^2/(2*q^2*k^2))
+    sigma_v     xi times the mean distance of the archive's variable v to that of the chosen vector
+    q, xi       how greedy the choice is, and how slowly the spread shrinks
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from edge_agent.lab.tuning.search import Iteration, Problem, Progress, Result
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+LEAST_SPREAD: Final = 1e-3  # of the range of a variable: an archive of equal vectors would draw itself for ever
+REDRAWS: Final = 32  # of a vector that is not admissible
+
+
+@dataclass(frozen=True)
+class ArchiveHabits:
+    """Constants of the colony."""
+
+    archive: int = 10  # k
+    greed: float = 0.3  # q
+    spread: float = 0.85  # xi
+
+    def __post_init__(self) -> None:
+        if self.archive < 2:
+            raise InputError("archive", f"{self.archive} has no spread", "keep at least two vectors")
+        for name in ("greed", "spread"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(name, "not positive", "use a positive number")
+
+
+class Tally:
+    """Vectors evaluated so far, the best of them, and the history; for searches over continuous variables."""
+
+    def __init__(self, problem: Problem) -> None:
+        """Begin without any evaluation."""
+        if not problem.choices or any(len(choice) == 0 for choice in problem.choices):
+            raise InputError("choices", "a vertex has no position", "give every vertex at least one")
+        self.problem = problem
+        self.lower = np.array([float(np.min(choice)) for choice in problem.choices])
+        self.upper = np.array([float(np.max(choice)) for choice in problem.choices])
+        self.best = self.lower
+        self.value = -np.inf
+        self.count = 0
+        self.history: list[Iteration] = []
+
+    def evaluate(self, vector: FloatArray) -> float:
+        """Return the objective at a vector; a value that is not a number counts as the worst."""
+        value = float(self.problem.objective(vector))
+        value = value if np.isfinite(value) else -np.inf
+        self.count += 1
+        if value > self.value or self.count == 1:
+            self.best = vector.copy()
+            self.value = value
+        return value
+
+    def fit(self, vector: FloatArray) -> FloatArray:
+        """Return the vector within the ranges of the variables."""
+        return np.asarray(np.clip(vector, self.lower, self.upper))
+
+    def uniform(self, rng: np.random.Generator) -> FloatArray:
+        """Return an admissible vector from the whole range.
+
+        Raises:
+            InputError: none of the drawn vectors is admissible.
+        """
+        for _ in range(REDRAWS):
+            vector = np.asarray(rng.uniform(self.lower, self.upper))
+            if self.problem.admissible(vector):
+                return vector
+        raise InputError("choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices")
+
+    def record(self, values: list[float], progress: Progress | None) -> None:
+        """Close an iteration: append it to the history and report it."""
+        finite = [value for value in values if np.isfinite(value)]
+        mean = float(np.mean(finite)) if finite else -np.inf
+        self.history.append(Iteration(len(self.history) + 1, self.value, mean, self.count))
+        if progress is not None:
+            progress(self.history[-1])
+
+    def result(self) -> Result:
+        """Return the best vector; InputError before the first evaluation."""
+        if self.count == 0:
+            raise InputError("ants, iterations", "nothing was evaluated", "use at least one of each")
+        return Result(self.best, self.value, tuple(self.history))
+
+
+def optimise(
+    problem: Problem,
+    *,
+    ants: int,
+    iterations: int,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    habits: ArchiveHabits | None = None,
+) -> Result:
+    """Search the vector with the largest objective, with ants·iterations evaluations.
+
+    The archive is filled first, from the whole range and the start. Variables range over their choices.
+    """
+    habits = habits or ArchiveHabits()
+    tally = Tally(problem)
+    vectors: list[FloatArray] = []
+    values: list[float] = []
+    for _ in range(iterations):
+        found = []
+        for _ant in range(ants):
+            vector = _next_vector(tally, vectors, values, rng, habits)
+            value = tally.evaluate(vector)
+            found.append(value)
+            vectors.append(vector)
+            values.append(value)
+            if len(values) > habits.archive:
+                keep = np.argsort(-np.array(values), kind="stable")[: habits.archive]
+                vectors = [vectors[k] for k in keep]
+                values = [values[k] for k in keep]
+        tally.record(found, progress)
+    return tally.result()
+
+
+def _next_vector(
+    tally: Tally, vectors: list[FloatArray], values: list[float], rng: np.random.Generator, habits: ArchiveHabits
+) -> FloatArray:
+    """The next vector: the start, then any until the archive is full, then one about a vector of the archive."""
+    if tally.count == 0 and tally.problem.start is not None:
+        return tally.fit(np.asarray(tally.problem.start, float))
+    if len(vectors) < habits.archive:
+        return tally.uniform(rng)
+    order = np.argsort(-np.array(values), kind="stable")
+    ranked = np.array([vectors[k] for k in order])
+    scale = habits.greed * habits.archive
+    weight = np.exp(-0.5 * (np.arange(len(ranked)) / scale) ** 2)
+    chosen = int(rng.choice(len(ranked), p=weight / weight.sum()))
+    apart = np.abs(ranked - ranked[chosen]).sum(axis=0) / (len(ranked) - 1)
+    sigma = np.maximum(habits.spread * apart, LEAST_SPREAD * (tally.upper - tally.lower))
+    for _ in range(REDRAWS):
+        vector = tally.fit(rng.normal(ranked[chosen], sigma))
+        if tally.problem.admissible(vector):
+            return vector
+    return ranked[chosen]

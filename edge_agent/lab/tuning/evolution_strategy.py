@@ -1,0 +1,53 @@
+"""(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), pure: a control of the ant colonies."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from edge_agent.lab.tuning.continuous_colony import REDRAWS, Tally
+from edge_agent.lab.tuning.search import Problem, Progress, Result
+from schemas.numeric import FloatArray
+
+FIRST_STEP: Final = 0.2  # standard deviation over the range of a variable
+GROWTH: Final = 1.5  # of the step after a success; its fourth root is what a failure takes back
+
+
+def optimise(
+    problem: Problem,
+    *,
+    ants: int,
+    iterations: int,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> Result:
+    """Search with ants·iterations evaluations, one after the other; arguments and result as those of the colonies."""
+    tally = Tally(problem)
+    begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)
+    parent = tally.fit(begin)
+    value = -np.inf
+    step = FIRST_STEP
+    for _ in range(iterations):
+        found = []
+        for _one in range(ants):
+            child = parent if tally.count == 0 else _mutated(tally, parent, step, rng)
+            got = tally.evaluate(child)
+            found.append(got)
+            success = got >= value
+            if success:
+                parent = child
+                value = got
+            step *= GROWTH if success else GROWTH**-0.25
+            step = min(step, 1.0)
+        tally.record(found, progress)
+    return tally.result()
+
+
+def _mutated(tally: Tally, parent: FloatArray, step: float, rng: np.random.Generator) -> FloatArray:
+    """An admissible child; the parent where none is found."""
+    for _ in range(REDRAWS):
+        child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))
+        if tally.problem.admissible(child):
+            return child
+    return parent

@@ -1,0 +1,140 @@
+"""The tuning of paper 004 as the paper did it: sixteen lower vertices, three noise levels, its objective as a choice.
+
+The double lane change at 80 km/h on the printed tyre, P_0 = .2*I, Q = .1*T^2; noise variance and R are .1, .05 and .01
+in turn (section IV.A). Objectives, larger is better:
+
+    mismatch     1/(1 + |e|), e the mean difference of actual and theoretical innovation variance (33)
+    likelihood   mean log-likelihood of the innovations [nat per sample], which no inflation of R wins
+    error        less the mean of RMSE over the printed one, of v_x, v_y, yaw rate and mu: it needs the truth
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from edge_agent.adaptation.lower_vertices import LowerVertices
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.estimators import Estimates
+from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, Setting, bank
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, repeated
+from edge_agent.lab.simulation.white import add_white
+from edge_agent.lab.tuning.colony import Habits, optimise
+from edge_agent.lab.tuning.search import Problem, Result
+from schemas.numeric import FloatArray
+
+LEVELS: Final = (0.1, 0.05, 0.01)  # variances of noise and R
+POSITIONS: Final = np.array([0.3, 0.55, 0.8, 1.0, 1.25, 1.5, 1.8])  # of a lower vertex; 1 is the neighbour's peak
+PREFERENCE: Final = 0.6  # spread of the visibility about the untuned position
+CHUNK: Final = 25  # samples after which windows of variances are read: .5 s
+WORST: Final = -1e3  # [nat] of a sample whose log-likelihood is lower or no number
+SCALES: Final = {"vx": 0.0813, "vy": 0.0212, "yaw_rate": 0.0063, "mu": 0.0259}  # printed RMSE
+
+Sets = Memberships | LowerVertices
+
+
+@dataclass(frozen=True)
+class LevelDrive:
+    """The drive at one noise level, one copy per seed, and the setting whose R is right for it."""
+
+    batch: DriveSet
+    setting: Setting
+
+
+def record_levels(spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED) -> list[LevelDrive]:
+    """Drive without error, and add the noise of every level."""
+    exact = ideal(spec)
+    levels = []
+    for level in LEVELS:
+        batch = repeated(exact, len(seeds))
+        variance = np.full(len(batch.t), level)
+        for n, seed in enumerate(seeds):
+            add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 6]))
+        levels.append(LevelDrive(batch, setting._replace(noise=(level,) * 3)))
+    return levels
+
+
+def likelihood(sets: Sets, drive: LevelDrive) -> float:
+    """Mean log-likelihood of the innovations [nat per sample]."""
+    reported = _reported(sets, drive)
+    value = np.nan_to_num(reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
+    return float(np.maximum(value, WORST).mean())
+
+
+def mismatch(sets: Sets, drive: LevelDrive) -> float:
+    """Equation (33) with |e|."""
+    batch = drive.batch
+    filters = bank(batch.vehicles, sets, drive.setting)
+    differences = []
+    for first in range(0, len(batch.t), CHUNK):
+        part = slice(first, first + CHUNK)
+        filters.advance(batch.t[part], batch.signals[part])
+        differences.append(np.abs(filters.memory("actual") - filters.memory("theoretical")).mean())
+    return float(1.0 / (1.0 + np.mean(differences)))
+
+
+def accuracy(sets: Sets, drive: LevelDrive) -> float:
+    """Less the mean of RMSE over the printed RMSE."""
+    reported = _reported(sets, drive)
+    batch = drive.batch
+    truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {"mu": batch.mu}
+    ratios = [np.sqrt(np.mean((getattr(reported, name) - truth[name]) ** 2)) / scale for name, scale in SCALES.items()]
+    return -float(np.mean(ratios))
+
+
+OBJECTIVES: Final[dict[str, Callable[[Sets, LevelDrive], float]]] = {
+    "likelihood": likelihood,
+    "mismatch": mismatch,
+    "error": accuracy,
+}
+
+
+def _reported(sets: Sets, drive: LevelDrive) -> Estimates:
+    return bank(drive.batch.vehicles, sets, drive.setting).advance(drive.batch.t, drive.batch.signals)
+
+
+def visibility() -> list[FloatArray]:
+    """Return eta of every position at every vertex: positions near the untuned one are preferred (31)."""
+    preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
+    return [preferred] * len(LowerVertices().to_vector())
+
+
+@dataclass(frozen=True)
+class PaperTuning:
+    """The tuned sets, how the search came there, and the pheromone at its end (16, 7)."""
+
+    sets: LowerVertices
+    result: Result
+    pheromone: FloatArray
+
+
+def tune(
+    drives: Sequence[LevelDrive],
+    objective: str,
+    *,
+    ants: int,
+    iterations: int,
+    seed: int,
+    habits: Habits | None = None,
+) -> PaperTuning:
+    """Tune the lower vertices with the colony, over all levels."""
+    score = OBJECTIVES[objective]
+    laid: list[FloatArray] = []
+
+    def value(vector: FloatArray) -> float:
+        sets = LowerVertices.from_vector(vector)
+        return float(np.mean([score(sets, drive) for drive in drives]))
+
+    start = LowerVertices().to_vector()
+    result = optimise(
+        Problem(value, [POSITIONS] * len(start), start),
+        ants=ants,
+        iterations=iterations,
+        rng=np.random.default_rng([seed, 7]),
+        visibility=visibility(),
+        habits=replace(habits or Habits(), trace=laid.append),
+    )
+    return PaperTuning(LowerVertices.from_vector(result.best), result, laid[-1])
