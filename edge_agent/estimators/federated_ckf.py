@@ -198,7 +198,13 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "rear arm is -b*r; half a track times r is reversed on the left",
         "dynamics.slip",
     ),
-    Element("(8)", "wheel-centre speeds", "corrected", "r is missing beside half the track", "dynamics.slip"),
+    Element(
+        "(8)",
+        "wheel-centre speeds",
+        "corrected",
+        "r is missing beside half the track",
+        "dynamics.slip",
+    ),
     Element(
         "(9)",
         "wheel loads",
@@ -223,8 +229,18 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "dynamics.parameters",
     ),
     Element("(14)", "longitudinal slip", "as printed", where="dynamics.slip"),
-    Element("(15) to (20)", "information shares of the sub-filters", "as printed", where="filters.federated.share"),
-    Element("(21), (22), (26), (27)", "cubature points by singular values", "as printed", where="filters.points"),
+    Element(
+        "(15) to (20)",
+        "information shares of the sub-filters",
+        "as printed",
+        where="filters.federated.share",
+    ),
+    Element(
+        "(21), (22), (26), (27)",
+        "cubature points by singular values",
+        "as printed",
+        where="filters.points",
+    ),
     Element(
         "(28)",
         "friction as a random walk",
@@ -276,6 +292,11 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         where="lab.simulation.manoeuvres",
     ),
     Element("figure 4", "sensor signals", "as printed", where="lab.evaluation.papers"),
-    Element("figure 5", "v_x, v_y, sideslip beta, mu of four wheels", "as printed", where="lab.evaluation.papers"),
+    Element(
+        "figure 5",
+        "v_x, v_y, sideslip beta, mu of four wheels",
+        "as printed",
+        where="lab.evaluation.papers",
+    ),
 )
 """Elements of the paper."""

@@ -46,7 +46,7 @@ def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
     noise = (np.diag(setting.first), np.diag(setting.second))
     mu = np.empty((len(given.t), STATES))
     mean = np.full(STATES, setting.mu)
-    covariance = setting.start * np.eye(STATES)
+    covariance: FloatArray = setting.start * np.eye(STATES)
     shares = np.array([0.5, 0.5])
     mu[0] = mean
     for k in range(1, len(given.t)):
@@ -66,7 +66,7 @@ def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
             part = np.linalg.inv(spread)
             inverse += part
             information += part @ local
-        covariance = np.linalg.inv(inverse)
+        covariance = np.asarray(np.linalg.inv(inverse), float)
         mean = covariance @ information
         shares = np.clip(sizes / sizes.sum(), LEAST_SHARE, 1.0 - LEAST_SHARE)
         mu[k] = mean

@@ -11,6 +11,7 @@ With the printed tyre the force is linear in friction, so friction below zero is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class WheelForces:
     @classmethod
     def of(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
         """Prepare the drive; single: in single precision."""
-        kind = np.float32 if single else np.float64
+        kind: Any = np.float32 if single else np.float64
         row, p = given.row, Parameter
         half_front, half_rear = 0.5 * row[p.TRACK_FRONT], 0.5 * row[p.TRACK_REAR]
         front, rear = row[p.TO_FRONT], -row[p.TO_REAR]
@@ -57,8 +58,15 @@ class WheelForces:
         free = np.stack([row[p.SLOPE_X] * slip_x, -row[p.SLOPE_Y] * across / speed], axis=-1)
         mass = np.array([row[p.MASS], row[p.YAW_INERTIA]])
         air = given.drag * given.vx * np.abs(given.vx) / row[p.MASS]
-        arrays = (free, given.loads(), turned, places, mass, air)
-        return cls(*(np.asarray(array, kind) for array in arrays), proportional)
+        return cls(
+            np.asarray(free, kind),
+            np.asarray(given.loads(), kind),
+            np.asarray(turned, kind),
+            np.asarray(places, kind),
+            np.asarray(mass, kind),
+            np.asarray(air, kind),
+            proportional,
+        )
 
     def tyre(self, k: int, mu: FloatArray) -> FloatArray:
         """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P, 4)."""

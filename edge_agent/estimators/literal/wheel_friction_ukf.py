@@ -17,7 +17,7 @@ covariance then loses its Cholesky factor, and the last one that existed is used
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class _Model:
 
     def __init__(self, given: GivenMotion, setting: Setting) -> None:
         self.setting = setting
-        self.kind = np.float32 if setting.single else np.float64
+        self.kind: Any = np.float32 if setting.single else np.float64
         self.forces = WheelForces.of(given, proportional=setting.proportional, single=setting.single)
         signals = given.signals
         turning = np.diff(signals[:, S.YAW_RATE], prepend=signals[0, S.YAW_RATE]) / given.step
@@ -92,9 +92,10 @@ class _Model:
         if setting.torque_rows:
             rows += list(given.wheel_forces().T)
             noise += [setting.torque_noise] * 4
-        self.readings = np.stack(rows, axis=1).astype(self.kind)
-        self.noise_root = np.diag(np.sqrt(noise)).astype(self.kind)
-        self.process_root = np.eye(STATES, dtype=self.kind) * self.kind(np.sqrt(setting.process))
+        self.readings: FloatArray = np.stack(rows, axis=1).astype(self.kind)
+        self.noise_root: FloatArray = np.diag(np.sqrt(noise)).astype(self.kind)
+        process = np.sqrt(setting.process) * np.eye(STATES)
+        self.process_root: FloatArray = process.astype(self.kind)
         scale = setting.alpha**2 * (STATES + setting.kappa)
         self.spread = self.kind(np.sqrt(scale))
         self.side = self.kind(0.5 / scale)
@@ -148,7 +149,7 @@ def _square_root_step(
 def _factor(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
     """(Cholesky factor, False), or (the last one, True) where there is none."""
     try:
-        return np.linalg.cholesky(covariance), False
+        return np.asarray(np.linalg.cholesky(covariance)), False
     except np.linalg.LinAlgError:
         return last, True
 

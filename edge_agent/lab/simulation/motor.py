@@ -26,7 +26,12 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 STEP_S: Final = 1e-4  # of the motor's equations; its electrical time constant is L/R = 3 ms
-D, Q, D_SUM, Q_SUM = 0, 1, 2, 3  # columns of a motor's state: currents [A], integrals of their errors [A s]
+D, Q, D_SUM, Q_SUM = (
+    0,
+    1,
+    2,
+    3,
+)  # columns of a motor's state: currents [A], integrals of their errors [A s]
 
 
 class Pmsm(NamedTuple):

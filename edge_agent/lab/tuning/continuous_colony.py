@@ -132,7 +132,11 @@ def optimise(
 
 
 def _next_vector(
-    tally: Tally, vectors: list[FloatArray], values: list[float], rng: np.random.Generator, habits: ArchiveHabits
+    tally: Tally,
+    vectors: list[FloatArray],
+    values: list[float],
+    rng: np.random.Generator,
+    habits: ArchiveHabits,
 ) -> FloatArray:
     """The next vector: the start, then any until the archive is full, then one about a vector of the archive."""
     if tally.count == 0 and tally.problem.start is not None:
@@ -150,4 +154,4 @@ def _next_vector(
         vector = tally.fit(rng.normal(ranked[chosen], sigma))
         if tally.problem.admissible(vector):
             return vector
-    return ranked[chosen]
+    return np.asarray(ranked[chosen], float)

@@ -19,7 +19,13 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import SETS, Memberships
-from edge_agent.lab.tuning import colony, continuous_colony, evolution_strategy, random_search, study
+from edge_agent.lab.tuning import (
+    colony,
+    continuous_colony,
+    evolution_strategy,
+    random_search,
+    study,
+)
 from edge_agent.lab.tuning.continuous_colony import Tally
 from edge_agent.lab.tuning.objectives import choices
 from edge_agent.lab.tuning.search import Problem, Progress, Result
@@ -43,7 +49,12 @@ PAIRS: Final = (
 
 
 def uniform_search(
-    problem: Problem, *, ants: int, iterations: int, rng: np.random.Generator, progress: Progress | None = None
+    problem: Problem,
+    *,
+    ants: int,
+    iterations: int,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
 ) -> Result:
     """Best of ants·iterations uniform draws from the whole range."""
     tally = Tally(problem)
@@ -84,7 +95,12 @@ def compare_searches(
             searched.setdefault(name, []).append(study.overall(sets, train))
             judged.setdefault(name, []).append(study.overall(sets, held_out))
         for place, (name, search) in enumerate(SEARCHES.items()):
-            result = search(_problem(train), ants=ants, iterations=iterations, rng=np.random.default_rng([seed, place]))
+            result = search(
+                _problem(train),
+                ants=ants,
+                iterations=iterations,
+                rng=np.random.default_rng([seed, place]),
+            )
             searched.setdefault(name, []).append(result.value)
             judged.setdefault(name, []).append(study.overall(study.memberships_of(result.best), held_out))
         log_line(f"seed {seed}: " + ", ".join(f"{name} {values[-1]:.2f}" for name, values in judged.items()))
@@ -133,7 +149,11 @@ def comparison_markdown(figures: Sequence[Figure]) -> str:
         f"| {name} | {cell(f'searches.train.{name}')} | {cell(f'searches.held_out.{name}')} |"
         for name in (*GIVEN, *SEARCHES)
     ]
-    lines += ["", "| paired difference, held out | mean ± standard error | share of seeds |", "|---|---|---|"]
+    lines += [
+        "",
+        "| paired difference, held out | mean ± standard error | share of seeds |",
+        "|---|---|---|",
+    ]
     for over, under in PAIRS:
         name = f"searches.{over}_over_{under}"
         lines.append(f"| {over} over {under} | {cell(name)} | {values[f'{name}.wins']:.2f} |")

@@ -15,7 +15,7 @@ from edge_agent.estimators import (
     sr_ukf,
 )
 from edge_agent.estimators.elements import VERDICTS, Element, unexplained
-from tests.house import ROOT
+from tests.structure import ROOT
 
 LISTS = {
     "000": federated_ckf.ELEMENTS,

@@ -53,7 +53,9 @@ def test_tyres_are_those_of_the_compiled_model(proportional: bool) -> None:
     assert found[:, 1] == pytest.approx(y, rel=1e-12)
 
 
-def test_turn_reaches_the_printed_error_and_three_signals_do_not(turn: tuple[GivenMotion, FloatArray]) -> None:
+def test_turn_reaches_the_printed_error_and_three_signals_do_not(
+    turn: tuple[GivenMotion, FloatArray],
+) -> None:
     given, truth = turn
     found = wheel_friction_ukf.estimate(given, AS_PRINTED).mu
     assert np.abs(found[50:] - truth[50:]).mean() < 0.0011

@@ -74,10 +74,14 @@ MATCHED: Final[dict[str, DriveSpec]] = {
     ),
     "003.accel": DriveSpec("throttle", as_printed(MOTORED, proportional=True), 0.85, kmh(20)),
     "003.turn": replace(
-        PAPERS["003.turn"], vehicle=with_losses(as_printed(MOTORED, proportional=True)), duration_s=10.0
+        PAPERS["003.turn"],
+        vehicle=with_losses(as_printed(MOTORED, proportional=True)),
+        duration_s=10.0,
     ),
     "003.split": replace(
-        CONSTANT_003, vehicle=with_losses(as_printed(MOTORED, proportional=True)), mu=split(0.30, 0.85)
+        CONSTANT_003,
+        vehicle=with_losses(as_printed(MOTORED, proportional=True)),
+        mu=split(0.30, 0.85),
     ),
     "003.jump": DriveSpec("throttle", as_printed(MOTORED, proportional=True), TimedFriction(0.85, 0.50, 4.0), kmh(20)),
     **{

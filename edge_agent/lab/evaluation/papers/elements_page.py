@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
+from edge_agent.estimators import (
+    adaptive_federated_ckf,
+    compensated_wckf,
+    federated_ckf,
+    paper_aco_fckf,
+    sr_ukf,
+)
 from edge_agent.estimators.elements import VERDICTS, Element
 from edge_agent.lab.evaluation.papers.page import markdown_elements
 

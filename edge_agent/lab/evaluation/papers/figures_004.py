@@ -50,7 +50,10 @@ def _torques(run: NoisyRun) -> PaperPlot:
         for name, total in axles.items()
     )
     force = given_motion(run.batch, MATCHED["004.dlc"].vehicle).wheel_forces()
-    forces = (Curve("front", t, force[:, :2].sum(axis=1)), Curve("rear", t, force[:, 2:].sum(axis=1)))
+    forces = (
+        Curve("front", t, force[:, :2].sum(axis=1)),
+        Curve("rear", t, force[:, 2:].sum(axis=1)),
+    )
     panels = (
         Panel("motors", "t [s]", "torque [N·m]", motors),
         Panel("axles", "t [s]", "F_x [N]", forces),

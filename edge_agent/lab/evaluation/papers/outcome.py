@@ -140,7 +140,11 @@ class Reproduction:
         listed = []
         for row in self.rows:
             listed.append(row.figure(f"papers.{self.paper}"))
-            for column, value in (("own", row.own), ("realistic", row.realistic), ("default", row.default)):
+            for column, value in (
+                ("own", row.own),
+                ("realistic", row.realistic),
+                ("default", row.default),
+            ):
                 if not math.isnan(value):
                     listed.append(Figure(f"papers.{self.paper}.{column}.{row.name}", value, row.unit))
         return listed + self.figures

@@ -126,7 +126,10 @@ def _table(table: PaperTable) -> str:
     for row in table.rows:
         found = cells(row)
         verdict = "" if row.limit is None else " held" if row.holds else " missed"
-        body = [f'<td class="number">{found[0]}</td>', f'<td class="number{verdict}">{found[1]}</td>']
+        body = [
+            f'<td class="number">{found[0]}</td>',
+            f'<td class="number{verdict}">{found[1]}</td>',
+        ]
         body += [f'<td class="number">{cell}</td>' for cell in found[2:]]
         lines.append(f"<tr><td>{escape(row.what)}</td>{''.join(body)}<td>{limit_text(row)}</td></tr>")
     return "\n".join(lines) + "</table>"

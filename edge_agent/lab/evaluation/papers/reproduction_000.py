@@ -142,7 +142,12 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         ("(c)", "sideslip β [rad]", beta, joint.sideslip[:, 0]),
     )
     panels = [
-        Panel(part, "t [s]", label, (Curve("true", t, true, "truth"), Curve("joint filter", t, found, "improved")))
+        Panel(
+            part,
+            "t [s]",
+            label,
+            (Curve("true", t, true, "truth"), Curve("joint filter", t, found, "improved")),
+        )
         for part, label, true, found in states
     ]
     wheels = tuple(
@@ -151,7 +156,12 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     true_mu = Curve("true, mean", t, batch.mu[:, 0], "truth")
     panels.append(Panel("(d) as printed", "t [s]", "μ", (true_mu, *wheels), (0.0, 1.2)))
     done.plots = [
-        PaperPlot("states", "Figure 5: motion by the joint filter, friction by the printed filter", tuple(panels), 2),
+        PaperPlot(
+            "states",
+            "Figure 5: motion by the joint filter, friction by the printed filter",
+            tuple(panels),
+            2,
+        ),
         _signals(batch),
         _path(batch),
     ]

@@ -78,7 +78,10 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
     matched = drives[SCENARIO]
     done.tables = [
-        PaperTable("Table 3: double lane change, improved filter", _rows("improved", matched, own, real, default)),
+        PaperTable(
+            "Table 3: double lane change, improved filter",
+            _rows("improved", matched, own, real, default),
+        ),
         PaperTable("Table 3: double lane change, comparator FKF", _rows("FKF", matched, own, {}, {})),
         PaperTable("What v_y is worth", _lateral(matched)),
         PaperTable("Options of the filter", _options()),
@@ -153,8 +156,14 @@ def _options() -> tuple[PaperRow, ...]:
     polynomial = Setting(tyre=TyreOption(quadratic=QUADRATIC))
     runs = {
         "printed": ("Q, R of section 4.3, no wheel speed", run_drive(spec, {"it": AS_PRINTED})),
-        "polynomial": ("stiffness polynomial (14), in plant and filter", run_drive(bent, {"it": polynomial})),
-        "proportional_to_load": ("polynomial in the plant alone", run_drive(bent, {"it": Setting()})),
+        "polynomial": (
+            "stiffness polynomial (14), in plant and filter",
+            run_drive(bent, {"it": polynomial}),
+        ),
+        "proportional_to_load": (
+            "polynomial in the plant alone",
+            run_drive(bent, {"it": Setting()}),
+        ),
     }
     return tuple(
         PaperRow(

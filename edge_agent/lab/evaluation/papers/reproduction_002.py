@@ -122,7 +122,11 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
     stage_b = {name: compensated[:, wheel] for wheel, name in enumerate(FORCES)}
     truth |= {"v_x": true["true_vx"][:, 0], "v_y": true["true_vy"][:, 0]}
     truth["β"] = np.arctan2(truth["v_y"], truth["v_x"])
-    stage_a |= {"v_x": a[:, x.VX], "v_y": a[:, x.VY], "β": np.arctan2(a[:, x.VY], np.maximum(a[:, x.VX], 1.0))}
+    stage_a |= {
+        "v_x": a[:, x.VX],
+        "v_y": a[:, x.VY],
+        "β": np.arctan2(a[:, x.VY], np.maximum(a[:, x.VX], 1.0)),
+    }
     stage_b |= {"v_x": b[:, Column.VX], "v_y": b[:, Column.VY], "β": b[:, Column.SIDESLIP]}
     return ForceRun(batch, truth, stage_a, stage_b)
 
@@ -134,7 +138,10 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     own = {drive: run_drive(PAPERS[f"002.{drive}"], None) for drive in PRINTED}
     real = {drive: with_sensors(f"002.{drive}", ESTIMATOR, seeds) for drive in PRINTED}
     for drive in PRINTED:
-        for measure, number in (("erms", "3" if drive == "sine" else "5"), ("pre", "2" if drive == "sine" else "4")):
+        for measure, number in (
+            ("erms", "3" if drive == "sine" else "5"),
+            ("pre", "2" if drive == "sine" else "4"),
+        ):
             title = f"Table {number}: {'ERMS' if measure == 'erms' else 'PRE'}, {TITLES[drive]}"
             done.tables.append(PaperTable(title, _rows(drive, measure, runs[drive], own[drive], real[drive])))
     dragged = run_drive(MATCHED["002.sine.drag"], IN_WHEEL_TYRE)
@@ -200,7 +207,10 @@ def _rows(drive: str, measure: str, run: ForceRun, own: ForceRun, real: tuple[Va
 def _with_drag(run: ForceRun) -> tuple[PaperRow, ...]:
     return tuple(
         PaperRow(
-            f"sine.drag.wckf-{stage.lower()}.erms_{short}", f"WCKF-{stage}, {name} [m/s]", NONE, run.erms(stage)[name]
+            f"sine.drag.wckf-{stage.lower()}.erms_{short}",
+            f"WCKF-{stage}, {name} [m/s]",
+            NONE,
+            run.erms(stage)[name],
         )
         for stage in ("A", "B")
         for name, short in (("v_x", "vx"), ("v_y", "vy"))

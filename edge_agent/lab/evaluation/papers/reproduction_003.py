@@ -57,7 +57,15 @@ class Case:
 CASES: Final = (
     Case("accel", "acceleration, μ .85", 0.0031, 0.0430, 0.4, "figure 5", "003.accel"),
     Case("turn", "turn at 40 km/h, μ .35", 0.0011, 0.0061, 0.3, "figure 6", "003.turn"),
-    Case("split", "split .3 and .85, constant speed", 0.0037, 0.0924, NONE, "figure 7", "003.straight.split"),
+    Case(
+        "split",
+        "split .3 and .85, constant speed",
+        0.0037,
+        0.0924,
+        NONE,
+        "figure 7",
+        "003.straight.split",
+    ),
     Case("jump", "acceleration, .85 to .5 at 4 s", 0.0059, 0.1922, 0.2, "figure 8", "003.jump"),
 )
 FILTERS: Final[dict[str, Setting]] = {
@@ -84,7 +92,8 @@ class CaseRuns:
         truth = self.batch.mu_wheel[:, 0]
         changes = np.flatnonzero(np.abs(np.diff(truth, axis=0)).max(axis=1) > NEAR)
         first = int(changes[-1]) + 1 if len(changes) else 0
-        near = (np.abs(self.runs[name].mu[first:] - truth[first:]) <= NEAR).all(axis=1)
+        off = np.abs(self.runs[name].mu[first:] - truth[first:])
+        near = np.asarray((off <= NEAR).all(axis=1))
         last = int(np.argmax(near)) if near.any() else len(near) - 1
         return float(self.batch.t[first + last, 0] - self.batch.t[first, 0])
 
@@ -104,7 +113,10 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     real = {case.name: with_sensors(case.realistic, ESTIMATOR, seeds) for case in CASES}
     done.tables = [
         PaperTable("Tables 3 to 6: mean absolute error of friction", _errors(cases, real)),
-        PaperTable("Seconds until every wheel is within .02, from the start or the change", _arrivals(cases)),
+        PaperTable(
+            "Seconds until every wheel is within .02, from the start or the change",
+            _arrivals(cases),
+        ),
         PaperTable("Table 7 and figure 9: constant speed on low friction, mean absolute error", _low(lows)),
         PaperTable("Comparator UKF: double and single precision", _comparators(cases)),
         PaperTable("What the conditions are worth: the same filter without one of them", _ablations()),
@@ -118,7 +130,11 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         Figure("papers.003.default.accel.mu_error", real["accel"][1]["mu_error"], "1", 0.12, "less"),
         Figure("papers.003.default.accel.coverage90", real["accel"][1]["coverage90"], "1", 0.85, "more"),
     ]
-    done.plots = [*(friction_plot(case, cases[case.name]) for case in CASES), _low_plot(lows), _inputs(cases["accel"])]
+    done.plots = [
+        *(friction_plot(case, cases[case.name]) for case in CASES),
+        _low_plot(lows),
+        _inputs(cases["accel"]),
+    ]
     done.notes = list(NOTES)
     return done
 
@@ -201,7 +217,13 @@ def _comparators(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
         ):
             printed = case.printed if name.startswith("sr") else case.ukf
             rows.append(
-                PaperRow(f"{case.name}.{name}.mae_mu", f"{case.what}: {title}", printed, runs.error(name), bar=NONE)
+                PaperRow(
+                    f"{case.name}.{name}.mae_mu",
+                    f"{case.what}: {title}",
+                    printed,
+                    runs.error(name),
+                    bar=NONE,
+                )
             )
         share = runs.runs["ukf-single"].lost
         what = f"{case.what}: UKF, single precision, share of steps without a factor"
@@ -285,7 +307,12 @@ def _low_plot(lows: dict[float, CaseRuns]) -> PaperPlot:
 def _inputs(runs: CaseRuns) -> PaperPlot:
     t, signals = runs.batch.t[:, 0], runs.batch.signals[:, 0]
     panels = (
-        Panel("", "t [s]", "v_x [m/s]", (Curve("true", t, runs.batch.truth["true_vx"][:, 0], "truth"),)),
+        Panel(
+            "",
+            "t [s]",
+            "v_x [m/s]",
+            (Curve("true", t, runs.batch.truth["true_vx"][:, 0], "truth"),),
+        ),
         Panel("", "t [s]", "a_x [m/s²]", (Curve("measured", t, signals[:, S.AX]),)),
         Panel("", "t [s]", "torque of wheel fl [N·m]", (Curve("motor", t, signals[:, S.TORQUE]),)),
     )

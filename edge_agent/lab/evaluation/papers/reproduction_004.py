@@ -18,7 +18,13 @@ from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, idea
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import MATCHED
 from edge_agent.lab.evaluation.papers.figures_004 import plots
-from edge_agent.lab.evaluation.papers.outcome import NONE, PaperRow, PaperTable, Reproduction, Values
+from edge_agent.lab.evaluation.papers.outcome import (
+    NONE,
+    PaperRow,
+    PaperTable,
+    Reproduction,
+    Values,
+)
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.simulation.white import add_white, on_ay
 from edge_agent.lab.tuning.paper_004_tuning import PaperTuning, record_levels, tune
@@ -175,7 +181,11 @@ def _peaks(run: NoisyRun) -> tuple[PaperRow, ...]:
     values = run.values("ACOFCKF")
     return tuple(
         PaperRow(
-            f"constant.peak_{key}", f"peak of {STATES[key].partition(' [')[0]}", share, values[f"peak_{key}"], bar=NONE
+            f"constant.peak_{key}",
+            f"peak of {STATES[key].partition(' [')[0]}",
+            share,
+            values[f"peak_{key}"],
+            bar=NONE,
         )
         for key, share in PEAKS.items()
     )
@@ -199,7 +209,15 @@ def _options(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
     for name, (what, run) in runs.items():
         values = run.values("it")
         for number, (key, label) in zip(PRINTED["constant", "mae"][1], STATES.items(), strict=True):
-            rows.append(PaperRow(f"{name}.mae_{key}", f"{what}: MAE {label}", number, values[f"mae_{key}"], bar=NONE))
+            rows.append(
+                PaperRow(
+                    f"{name}.mae_{key}",
+                    f"{what}: MAE {label}",
+                    number,
+                    values[f"mae_{key}"],
+                    bar=NONE,
+                )
+            )
     return tuple(rows)
 
 
@@ -227,5 +245,13 @@ def _tuning(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...]]:
             values = run.values(name)
             for number, (key, title) in zip(PRINTED[noise, "mae"][1], STATES.items(), strict=True):
                 what = f"{noise} noise, {name}: MAE {title}"
-                rows.append(PaperRow(f"tuning.{noise}.{label}.mae_{key}", what, number, values[f"mae_{key}"], bar=NONE))
+                rows.append(
+                    PaperRow(
+                        f"tuning.{noise}.{label}.mae_{key}",
+                        what,
+                        number,
+                        values[f"mae_{key}"],
+                        bar=NONE,
+                    )
+                )
     return found["likelihood"], tuple(rows)

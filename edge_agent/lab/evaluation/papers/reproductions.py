@@ -42,7 +42,12 @@ def write_paper(paper: str, seeds: Sequence[int], folder: Path, *, plots: bool =
         Figure(f"papers.{paper}.elements.missing_unsaid", unsaid, "1", 0.0, "less"),
         Figure(f"papers.{paper}.seconds", seconds, "s", LONGEST_S, "less"),
     ]
-    write(folder / "figures.json", f"edge-agent evaluate --paper {paper}", list(seeds), done.all_figures())
+    write(
+        folder / "figures.json",
+        f"edge-agent evaluate --paper {paper}",
+        list(seeds),
+        done.all_figures(),
+    )
     (folder / "report.md").write_text(report_markdown(done), encoding="utf-8")
     if plots:
         (folder / "index.html").write_text(report_html(done, seconds), encoding="utf-8")

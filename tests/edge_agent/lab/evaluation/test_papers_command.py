@@ -36,7 +36,11 @@ from edge_agent.lab.simulation.presets import PRESETS
 HELD = PaperRow("mae_vx", "MAE v_x [m/s]", 0.02, 0.01, 0.03)
 MISSED = PaperRow("mae_vy", "MAE v_y [m/s]", 0.02, 0.021)
 SHOWN = PaperRow("mae_mu", "MAE μ", NONE, 0.5)
-PLOT = PaperPlot("path", "Path", (Panel("", "x", "y", (Curve("true", np.arange(3.0), np.arange(3.0), "truth"),)),))
+PLOT = PaperPlot(
+    "path",
+    "Path",
+    (Panel("", "x", "y", (Curve("true", np.arange(3.0), np.arange(3.0), "truth"),)),),
+)
 
 
 def made_up(*rows: PaperRow) -> Reproduction:
@@ -116,7 +120,10 @@ def test_plot_of_numbers_and_a_map_is_drawn() -> None:
 
 
 def test_dugoff_tyres_in_the_plant_reach_the_printed_friction_error() -> None:
-    filters = {"it": (shipped("paper-aco-fckf"), AT_THE_TRUTH), "printed": (shipped("paper-aco-fckf"), AS_PRINTED)}
+    filters = {
+        "it": (shipped("paper-aco-fckf"), AT_THE_TRUTH),
+        "printed": (shipped("paper-aco-fckf"), AS_PRINTED),
+    }
     run = run_noise(MATCHED["004.dlc"], "constant", filters, range(3))
     assert run.values("it")["mae_mu"] <= 0.0095
     assert run.values("it")["mae_vy"] <= 0.0131
@@ -145,7 +152,12 @@ def test_vehicle_of_002_has_the_printed_axle_stiffness_and_inertia() -> None:
 
 def test_default_plant_is_as_it_was() -> None:
     sedan = PRESETS["sedan"]
-    assert (sedan.curve, sedan.stiffness, sedan.rear_slope, sedan.motors) == ("magic-formula", "similarity", 1.0, None)
+    assert (sedan.curve, sedan.stiffness, sedan.rear_slope, sedan.motors) == (
+        "magic-formula",
+        "similarity",
+        1.0,
+        None,
+    )
 
 
 def test_reference_page_lists_every_paper() -> None:

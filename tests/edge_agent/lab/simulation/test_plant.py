@@ -218,7 +218,7 @@ def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
     usual = replace(PRESETS["van"], abs_hz=8.0) if of_controllers else PRESETS["van"]
     mu = 0.3 if of_controllers else None
     if name in OTHER_OPTIONS:
-        changed = replace(usual, **{name: OTHER_OPTIONS[name]})
+        changed = replace(usual, **{name: OTHER_OPTIONS[name]})  # type: ignore[arg-type]
     else:
         changed = replace(usual, **{name: getattr(usual, name) * 0.8 + 0.01})
     logs = []

@@ -203,7 +203,7 @@ def test_weight_of_visibility_matters_where_visibility_is_given() -> None:
 @pytest.mark.parametrize("name", ["evaporation", "elite", "memory", "retrace", "alpha", "theta"])
 def test_habits_outside_their_range_are_refused_by_name(name: str) -> None:
     with pytest.raises(InputError, match=name):
-        Habits(**{name: -0.1})
+        Habits(**{name: -0.1})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("search", [colony, random_search])
