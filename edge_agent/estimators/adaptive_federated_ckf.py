@@ -63,7 +63,7 @@ class AdaptiveDesign:
     levels: Annotated[FloatArray, 5, 7]  # of the rules
 
 
-class Setting(NamedTuple):
+class AdaptiveSetting(NamedTuple):
     """Options of the filter."""
 
     adaptive: bool = True  # False: R and shares stay as they are, which is the comparator FKF
@@ -71,8 +71,8 @@ class Setting(NamedTuple):
     motion: MotionSetting = MotionSetting()
 
 
-FKF: Final = Setting(adaptive=False)
-AS_PRINTED: Final = Setting(
+FKF: Final = AdaptiveSetting(adaptive=False)
+AS_PRINTED: Final = AdaptiveSetting(
     motion=MotionSetting(
         process=(0.01 * STEP_S**2,) * 6,
         start=(1e-6,) * 6,
@@ -88,9 +88,9 @@ measures, by decimetres per second.
 """
 
 
-def bank(vehicles: Sequence[Vehicle], friction: float = DRY, setting: Setting | None = None) -> EstimatorBank:
+def bank(vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None) -> EstimatorBank:
     """Return N of these filters on a road whose friction is set."""
-    chosen = Setting() if setting is None else setting
+    chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
     design["friction"] = friction
     design["adaptive"] = chosen.adaptive

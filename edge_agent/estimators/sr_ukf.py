@@ -248,14 +248,14 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "measurement [a_x, a_y, r]",
         "option",
         "of rank 2 at most straight on; the wheels' torque balances make each driven wheel visible",
-        "literal.wheel_friction_ukf.Setting.torque_rows",
+        "literal.wheel_friction_ukf.UnscentedSetting.torque_rows",
     ),
     Element(
         "3.1",
         "unscented points, alpha .001, kappa 0, beta 2",
         "option",
         "alpha = .001 gives the centre a weight of -10^6; sr-ukf uses 1. Both give the same result in double precision",
-        "literal.wheel_friction_ukf.Setting.alpha",
+        "literal.wheel_friction_ukf.UnscentedSetting.alpha",
     ),
     Element(
         "3.1",

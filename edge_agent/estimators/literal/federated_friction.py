@@ -23,7 +23,7 @@ STATES: Final = 4
 LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
 
 
-class Setting(NamedTuple):
+class FederatedSetting(NamedTuple):
     """Variances of the filter, and its tyre."""
 
     process: float = 1.0  # Q of each friction per sample
@@ -34,11 +34,11 @@ class Setting(NamedTuple):
     proportional: bool = True
 
 
-AS_PRINTED: Final = Setting()
+AS_PRINTED: Final = FederatedSetting()
 """(57)."""
 
 
-def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
+def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
     """Run the filter over a drive."""
     forces = WheelForces.of(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()

@@ -29,7 +29,7 @@ from schemas.signals import S
 STATES: Final = 4
 
 
-class Setting(NamedTuple):
+class UnscentedSetting(NamedTuple):
     """Variances and options of the filter."""
 
     alpha: float = 0.001
@@ -46,10 +46,10 @@ class Setting(NamedTuple):
     single: bool = False
 
 
-AS_PRINTED: Final = Setting()
+AS_PRINTED: Final = UnscentedSetting()
 """The printed alpha, kappa and beta; Q, R and P_0 are lost in the text and of the size that it describes."""
-UKF: Final = Setting(square_root=False)
-UKF_SINGLE: Final = Setting(square_root=False, single=True)
+UKF: Final = UnscentedSetting(square_root=False)
+UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class FrictionRun:
     lost: float
 
 
-def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
+def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
     """Run the filter over a drive."""
     model = _Model(given, setting)
     steps = len(given.t)
@@ -81,7 +81,7 @@ def estimate(given: GivenMotion, setting: Setting) -> FrictionRun:
 class _Model:
     """Measurements of a drive and their model, in the precision of the filter."""
 
-    def __init__(self, given: GivenMotion, setting: Setting) -> None:
+    def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting
         self.kind: Any = np.float32 if setting.single else np.float64
         self.forces = WheelForces.of(given, proportional=setting.proportional, single=setting.single)

@@ -42,7 +42,7 @@ class ArchiveHabits:
                 raise InputError(name, "not positive", "use a positive number")
 
 
-class Tally:
+class SearchTally:
     """Vectors evaluated so far, the best of them, and the history; for searches over continuous variables."""
 
     def __init__(self, problem: Problem) -> None:
@@ -112,7 +112,7 @@ def optimise(
     The archive is filled first, from the whole range and the start. Variables range over their choices.
     """
     habits = habits or ArchiveHabits()
-    tally = Tally(problem)
+    tally = SearchTally(problem)
     vectors: list[FloatArray] = []
     values: list[float] = []
     for _ in range(iterations):
@@ -132,7 +132,7 @@ def optimise(
 
 
 def _next_vector(
-    tally: Tally,
+    tally: SearchTally,
     vectors: list[FloatArray],
     values: list[float],
     rng: np.random.Generator,

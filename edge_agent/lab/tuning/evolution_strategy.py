@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.lab.tuning.continuous_colony import REDRAWS, Tally
+from edge_agent.lab.tuning.continuous_colony import REDRAWS, SearchTally
 from edge_agent.lab.tuning.search import Problem, Progress, Result
 from schemas.numeric import FloatArray
 
@@ -23,7 +23,7 @@ def optimise(
     progress: Progress | None = None,
 ) -> Result:
     """Search with ants·iterations evaluations, one after the other; arguments and result as those of the colonies."""
-    tally = Tally(problem)
+    tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)
     parent = tally.fit(begin)
     value = -np.inf
@@ -44,7 +44,7 @@ def optimise(
     return tally.result()
 
 
-def _mutated(tally: Tally, parent: FloatArray, step: float, rng: np.random.Generator) -> FloatArray:
+def _mutated(tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator) -> FloatArray:
     """An admissible child; the parent where none is found."""
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))

@@ -26,7 +26,7 @@ from edge_agent.lab.tuning import (
     random_search,
     study,
 )
-from edge_agent.lab.tuning.continuous_colony import Tally
+from edge_agent.lab.tuning.continuous_colony import SearchTally
 from edge_agent.lab.tuning.objectives import choices
 from edge_agent.lab.tuning.search import Problem, Progress, Result
 from schemas.numeric import FloatArray
@@ -57,7 +57,7 @@ def uniform_search(
     progress: Progress | None = None,
 ) -> Result:
     """Best of ants·iterations uniform draws from the whole range."""
-    tally = Tally(problem)
+    tally = SearchTally(problem)
     for _ in range(iterations):
         found = []
         for _ant in range(ants):

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_agent.estimators import federated_ckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
-from edge_agent.estimators.literal.federated_friction import AS_PRINTED, Setting, estimate
+from edge_agent.estimators.literal.federated_friction import AS_PRINTED, FederatedSetting, estimate
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
 from edge_agent.lab.evaluation.papers.columns import means, with_sensors, without_noise
 from edge_agent.lab.evaluation.papers.conditions import MATCHED, given_motion
@@ -44,7 +44,7 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def _friction(spec: DriveSpec, setting: Setting) -> tuple[DriveSet, FloatArray]:
+def _friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
     """The drive, and the friction of the wheels (T, 4) by the printed filter with given motion."""
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu

@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_agent.adaptation.rules import ALPHA, RATE
 from edge_agent.estimators import Estimates, adaptive_federated_ckf
-from edge_agent.estimators.adaptive_federated_ckf import AS_PRINTED, FKF, Setting
+from edge_agent.estimators.adaptive_federated_ckf import AS_PRINTED, FKF, AdaptiveSetting
 from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal
 from edge_agent.lab.evaluation.papers.columns import means, with_sensors
@@ -56,7 +56,7 @@ class MotionRun:
         return means(self.batch, self.reported[name])
 
 
-def run_drive(spec: DriveSpec, settings: dict[str, Setting]) -> MotionRun:
+def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRun:
     """Drive, and run the filters with the true friction of the start."""
     batch = ideal(spec)
     friction = float(batch.mu[0, 0])
@@ -67,7 +67,7 @@ def run_drive(spec: DriveSpec, settings: dict[str, Setting]) -> MotionRun:
     return MotionRun(batch, reported)
 
 
-BOTH: Final = {"improved": Setting(), "FKF": FKF}
+BOTH: Final = {"improved": AdaptiveSetting(), "FKF": FKF}
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
@@ -153,7 +153,7 @@ def _lateral(matched: MotionRun) -> tuple[PaperRow, ...]:
 def _options() -> tuple[PaperRow, ...]:
     spec = MATCHED[SCENARIO]
     bent = replace(spec, vehicle=replace(spec.vehicle, degression=QUADRATIC))
-    polynomial = Setting(tyre=TyreOption(quadratic=QUADRATIC))
+    polynomial = AdaptiveSetting(tyre=TyreOption(quadratic=QUADRATIC))
     runs = {
         "printed": ("Q, R of section 4.3, no wheel speed", run_drive(spec, {"it": AS_PRINTED})),
         "polynomial": (
@@ -162,7 +162,7 @@ def _options() -> tuple[PaperRow, ...]:
         ),
         "proportional_to_load": (
             "polynomial in the plant alone",
-            run_drive(bent, {"it": Setting()}),
+            run_drive(bent, {"it": AdaptiveSetting()}),
         ),
     }
     return tuple(

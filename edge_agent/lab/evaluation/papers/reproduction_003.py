@@ -14,7 +14,7 @@ from edge_agent.estimators.literal.wheel_friction_ukf import (
     UKF,
     UKF_SINGLE,
     FrictionRun,
-    Setting,
+    UnscentedSetting,
     estimate,
 )
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
@@ -42,7 +42,7 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
 
 
 @dataclass(frozen=True)
-class Case:
+class FrictionCase:
     """One experiment: the printed errors of SR-UKF and UKF, and seconds to convergence as printed."""
 
     name: str
@@ -55,9 +55,9 @@ class Case:
 
 
 CASES: Final = (
-    Case("accel", "acceleration, μ .85", 0.0031, 0.0430, 0.4, "figure 5", "003.accel"),
-    Case("turn", "turn at 40 km/h, μ .35", 0.0011, 0.0061, 0.3, "figure 6", "003.turn"),
-    Case(
+    FrictionCase("accel", "acceleration, μ .85", 0.0031, 0.0430, 0.4, "figure 5", "003.accel"),
+    FrictionCase("turn", "turn at 40 km/h, μ .35", 0.0011, 0.0061, 0.3, "figure 6", "003.turn"),
+    FrictionCase(
         "split",
         "split .3 and .85, constant speed",
         0.0037,
@@ -66,9 +66,9 @@ CASES: Final = (
         "figure 7",
         "003.straight.split",
     ),
-    Case("jump", "acceleration, .85 to .5 at 4 s", 0.0059, 0.1922, 0.2, "figure 8", "003.jump"),
+    FrictionCase("jump", "acceleration, .85 to .5 at 4 s", 0.0059, 0.1922, 0.2, "figure 8", "003.jump"),
 )
-FILTERS: Final[dict[str, Setting]] = {
+FILTERS: Final[dict[str, UnscentedSetting]] = {
     "sr-ukf": AS_PRINTED,
     "ukf": UKF,
     "ukf-single": UKF_SINGLE,
@@ -98,7 +98,7 @@ class CaseRuns:
         return float(self.batch.t[first + last, 0] - self.batch.t[first, 0])
 
 
-def run_case(spec: DriveSpec, filters: dict[str, Setting]) -> CaseRuns:
+def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
     """Drive an experiment with perfect sensors and given motion, and run the filters."""
     batch = ideal(spec)
     given = given_motion(batch, spec.vehicle)
@@ -277,7 +277,7 @@ def _scaled(signals: FloatArray) -> FloatArray:
     return changed
 
 
-def friction_plot(case: Case, runs: CaseRuns) -> PaperPlot:
+def friction_plot(case: FrictionCase, runs: CaseRuns) -> PaperPlot:
     """Return the friction of the four wheels by SR-UKF and by UKF in single precision."""
     t = runs.batch.t[:, 0]
     panels = []
