@@ -27,7 +27,7 @@ LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction ne
 
 @dataclass(frozen=True)
 class WheelForces:
-    """What a drive gives to the tyres of each sample, and whether stiffness is proportional to friction."""
+    """Slips, loads and angles of each sample of a drive, and the kind of stiffness."""
 
     free: FloatArray  # (T, 4, 2) k*s of the wheels
     loads: FloatArray  # (T, 4) [N]

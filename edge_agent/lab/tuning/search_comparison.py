@@ -8,7 +8,7 @@
 
 Objective: mean log-likelihood of the innovations over four conditions of R [nat/s] (`study`), on four drives. Each seed
 is one search of each kind, and one set of held-out drives with noise of its own on which all are judged, with the
-untuned sets and without sets beside them. Differences are paired by seed; `.se` is the standard error over seeds.
+untuned sets and without sets for comparison. Differences are paired by seed; `.se` is the standard error over seeds.
 """
 
 from __future__ import annotations

@@ -24,25 +24,25 @@ FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 def plots(constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning) -> list[PaperPlot]:
     """Return all figures, of the first noise seed."""
     return [
-        _path(constant),
-        _torques(constant),
-        _states(constant, "constant", "Figures 10 to 13: constant noise"),
+        _path_plot(constant),
+        _torque_plot(constant),
+        _state_plot(constant, "constant", "Figures 10 to 13: constant noise"),
         _noisy_ay(variable),
-        _states(variable, "variable", "Figures 15 to 18: variable noise on a_y"),
-        _peaks(tuned),
+        _state_plot(variable, "variable", "Figures 15 to 18: variable noise on a_y"),
+        _set_plot(tuned),
         _lower_vertices(tuning.sets),
-        _search(tuning),
+        _search_plot(tuning),
         pheromone_plot(tuning),
     ]
 
 
-def _path(run: NoisyRun) -> PaperPlot:
+def _path_plot(run: NoisyRun) -> PaperPlot:
     truth = run.batch.truth
     line = Curve("", truth["true_x"][:, 0], truth["true_y"][:, 0], "truth")
     return PaperPlot("path", "Figure 8: path", (Panel("", "x [m]", "y [m]", (line,)),))
 
 
-def _torques(run: NoisyRun) -> PaperPlot:
+def _torque_plot(run: NoisyRun) -> PaperPlot:
     t, torque = run.batch.t[:, 0], run.batch.signals[:, 0, S.TORQUE : S.TORQUE + 4]
     axles = {"front": torque[:, :2].sum(axis=1), "rear": torque[:, 2:].sum(axis=1)}
     motors = tuple(
@@ -61,7 +61,7 @@ def _torques(run: NoisyRun) -> PaperPlot:
     return PaperPlot("torques", "Figure 9: torque of the front and rear motor, and the axles' force", panels)
 
 
-def _states(run: NoisyRun, name: str, title: str) -> PaperPlot:
+def _state_plot(run: NoisyRun, name: str, title: str) -> PaperPlot:
     truth, t = run.batch.truth, run.batch.t[:, 0]
     beta = np.arctan2(truth["true_vy"], truth["true_vx"])[:, 0]
     quantities = (
@@ -90,7 +90,7 @@ def _noisy_ay(run: NoisyRun) -> PaperPlot:
     return PaperPlot("noisy-ay", "Figure 14: lateral acceleration with variable noise", (panel,))
 
 
-def _peaks(tuned: Memberships) -> PaperPlot:
+def _set_plot(tuned: Memberships) -> PaperPlot:
     panels = []
     for title, sets in (("before", Memberships()), ("after", tuned)):
         for label, peaks in (("mismatch [1]", sets.inputs), ("step of ln R [1]", sets.outputs)):
@@ -105,7 +105,7 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
     for title, sets in (("before", LowerVertices()), ("after", tuned)):
         for label, triangles in zip(("mismatch [1]", "step of ln R [1]"), sets.triangles(), strict=True):
             curves = tuple(
-                Curve("", triangle, np.array([0.0, 1.0, 0.0]) if k not in (0, 4) else _shoulder(k))
+                Curve("", triangle, np.array([0.0, 1.0, 0.0]) if k not in (0, 4) else _shoulder_values(k))
                 for k, triangle in enumerate(triangles)
             )
             panels.append(Panel(title, label, "membership [1]", curves))
@@ -113,12 +113,12 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
     return PaperPlot("lower-vertices", title, tuple(panels), 2)
 
 
-def _shoulder(k: int) -> FloatArray:
+def _shoulder_values(k: int) -> FloatArray:
     """Memberships at left foot, peak and right foot of an outer set."""
     return np.array([1.0, 1.0, 0.0]) if k == 0 else np.array([0.0, 1.0, 1.0])
 
 
-def _search(tuning: PaperTuning) -> PaperPlot:
+def _search_plot(tuning: PaperTuning) -> PaperPlot:
     history = tuning.result.history
     at = np.array([line.iteration for line in history], float)
     curves = (

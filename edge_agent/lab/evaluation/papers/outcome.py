@@ -121,7 +121,7 @@ class Reproduction:
     title: str
     elements: tuple[Element, ...]
     tables: list[PaperTable] = field(default_factory=list)
-    figures: list[Figure] = field(default_factory=list)  # beside those of the tables
+    figures: list[Figure] = field(default_factory=list)  # in addition to those of the tables
     plots: list[PaperPlot] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

@@ -90,7 +90,7 @@ def report_markdown(done: Reproduction) -> str:
 
 
 def report_html(done: Reproduction, seconds: float) -> str:
-    """Return the report as one HTML page that shows the SVG files beside it; `seconds` it took."""
+    """Return the report as one HTML page that shows the SVG files of its folder; `seconds` it took."""
     counts = ", ".join(
         f"{sum(element.verdict == verdict for element in done.elements)} {verdict}" for verdict in VERDICTS
     )

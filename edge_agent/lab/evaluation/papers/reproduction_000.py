@@ -44,7 +44,7 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def _friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
+def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
     """The drive, and the friction of the wheels (T, 4) by the printed filter with given motion."""
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu
@@ -53,11 +53,11 @@ def _friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, Flo
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run the experiment of the paper; `seeds`: of the drives with ordinary sensors."""
     done = Reproduction("000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS)
-    batch, mu = _friction(MATCHED[SCENARIO], AS_PRINTED)
+    batch, mu = _run_friction(MATCHED[SCENARIO], AS_PRINTED)
     first, after = seconds_near(batch, mu.mean(axis=1))
-    own_batch, own_mu = _friction(PAPERS[SCENARIO], AS_PRINTED)
+    own_batch, own_mu = _run_friction(PAPERS[SCENARIO], AS_PRINTED)
     own_first, own_after = seconds_near(own_batch, own_mu.mean(axis=1))
-    similar_batch, similar_mu = _friction(MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False))
+    similar_batch, similar_mu = _run_friction(MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False))
     joint_batch, joint = without_noise(MATCHED[SCENARIO], lambda vehicles: federated_ckf.bank(vehicles, PROPORTIONAL))
     matched = means(joint_batch, joint)
     own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.bank))
@@ -162,8 +162,8 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             tuple(panels),
             2,
         ),
-        _signals(batch),
-        _path(batch),
+        _signal_plot(batch),
+        _path_plot(batch),
     ]
     done.notes = list(NOTES)
     return done
@@ -187,7 +187,7 @@ NOTES: Final = (
 )
 
 
-def _signals(batch: DriveSet) -> PaperPlot:
+def _signal_plot(batch: DriveSet) -> PaperPlot:
     t, signals = batch.t[:, 0], batch.signals[:, 0]
     groups = (
         ("(a)", "a_x [m/s²]", S.AX, 1),
@@ -210,6 +210,6 @@ def _signals(batch: DriveSet) -> PaperPlot:
     return PaperPlot("signals", "Figure 4: signals of the sensors", panels, 2)
 
 
-def _path(batch: DriveSet) -> PaperPlot:
+def _path_plot(batch: DriveSet) -> PaperPlot:
     line = Curve("", batch.truth["true_x"][:, 0], batch.truth["true_y"][:, 0], "truth")
     return PaperPlot("path", "Path of the car", (Panel("", "x [m]", "y [m]", (line,)),))

@@ -46,7 +46,7 @@ QUADRATIC: Final = 0.15  # e of the stiffness polynomial (14), as degressive as 
 
 @dataclass(frozen=True)
 class MotionRun:
-    """One drive with perfect sensors and what the improved filter and FKF make of it."""
+    """One drive with perfect sensors with the estimates of the improved filter and of FKF."""
 
     batch: DriveSet
     reported: dict[str, Estimates]
@@ -80,14 +80,14 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     done.tables = [
         PaperTable(
             "Table 3: double lane change, improved filter",
-            _rows("improved", matched, own, real, default),
+            _table_rows("improved", matched, own, real, default),
         ),
-        PaperTable("Table 3: double lane change, comparator FKF", _rows("FKF", matched, own, {}, {})),
-        PaperTable("What v_y is worth", _lateral(matched)),
-        PaperTable("Options of the filter", _options()),
+        PaperTable("Table 3: double lane change, comparator FKF", _table_rows("FKF", matched, own, {}, {})),
+        PaperTable("What v_y is worth", _lateral_rows(matched)),
+        PaperTable("Options of the filter", _option_rows()),
         PaperTable("The five drives, improved filter and FKF", _all_drives(drives)),
     ]
-    done.plots = [*(_plot(name, drives[name]) for name in DRIVES), _sets()]
+    done.plots = [*(_state_plot(name, drives[name]) for name in DRIVES), _set_plot()]
     done.notes = list(NOTES)
     return done
 
@@ -111,7 +111,7 @@ NOTES: Final = (
 )
 
 
-def _rows(name: str, matched: MotionRun, own: MotionRun, real: Values, default: Values) -> tuple[PaperRow, ...]:
+def _table_rows(name: str, matched: MotionRun, own: MotionRun, real: Values, default: Values) -> tuple[PaperRow, ...]:
     rows = []
     place = 0 if name == "improved" else 1
     prefix = "" if name == "improved" else "fkf."
@@ -133,7 +133,7 @@ def _rows(name: str, matched: MotionRun, own: MotionRun, real: Values, default: 
     return tuple(rows)
 
 
-def _lateral(matched: MotionRun) -> tuple[PaperRow, ...]:
+def _lateral_rows(matched: MotionRun) -> tuple[PaperRow, ...]:
     front = run_drive(MATCHED["001.dlc.front"], BOTH)
     rows = []
     for name, what, run in (
@@ -150,7 +150,7 @@ def _lateral(matched: MotionRun) -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _options() -> tuple[PaperRow, ...]:
+def _option_rows() -> tuple[PaperRow, ...]:
     spec = MATCHED[SCENARIO]
     bent = replace(spec, vehicle=replace(spec.vehicle, degression=QUADRATIC))
     polynomial = AdaptiveSetting(tyre=TyreOption(quadratic=QUADRATIC))
@@ -195,7 +195,7 @@ def _all_drives(drives: dict[str, MotionRun]) -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _plot(name: str, run: MotionRun) -> PaperPlot:
+def _state_plot(name: str, run: MotionRun) -> PaperPlot:
     truth, t = run.batch.truth, run.batch.t[:, 0]
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], 1.0))[:, 0]
     quantities = (
@@ -219,7 +219,7 @@ def _plot(name: str, run: MotionRun) -> PaperPlot:
     return PaperPlot(f"states-{name.removeprefix('001.')}", DRIVES[name], tuple(panels))
 
 
-def _sets() -> PaperPlot:
+def _set_plot() -> PaperPlot:
     panels = []
     for title, label, peaks in (
         ("Figure 3: sets of the mismatch", "α [1]", ALPHA),

@@ -143,12 +143,12 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             ("pre", "2" if drive == "sine" else "4"),
         ):
             title = f"Table {number}: {'ERMS' if measure == 'erms' else 'PRE'}, {TITLES[drive]}"
-            done.tables.append(PaperTable(title, _rows(drive, measure, runs[drive], own[drive], real[drive])))
+            done.tables.append(PaperTable(title, _table_rows(drive, measure, runs[drive], own[drive], real[drive])))
     dragged = run_drive(MATCHED["002.sine.drag"], IN_WHEEL_TYRE)
     done.tables.append(PaperTable("The same sine with drag in the plant, which no filter knows", _with_drag(dragged)))
     vx = real["sine"][1]["rmse_vx"]
     done.figures = [Figure("papers.002.default.sine.rmse_vx", vx, "m/s", 0.04, "less")]
-    done.plots = [plot for drive in PRINTED for plot in _plots(drive, runs[drive])]
+    done.plots = [plot for drive in PRINTED for plot in _drive_plots(drive, runs[drive])]
     done.notes = list(NOTES)
     return done
 
@@ -176,7 +176,9 @@ NOTES: Final = (
 )
 
 
-def _rows(drive: str, measure: str, run: ForceRun, own: ForceRun, real: tuple[Values, Values]) -> tuple[PaperRow, ...]:
+def _table_rows(
+    drive: str, measure: str, run: ForceRun, own: ForceRun, real: tuple[Values, Values]
+) -> tuple[PaperRow, ...]:
     rows = []
     units = {"v_x": " [m/s]", "v_y": " [m/s]", "β": " [rad]"} if measure == "erms" else {}
     for stage, place in (("B", 1), ("A", 0)):
@@ -217,7 +219,7 @@ def _with_drag(run: ForceRun) -> tuple[PaperRow, ...]:
     )
 
 
-def _plots(drive: str, run: ForceRun) -> list[PaperPlot]:
+def _drive_plots(drive: str, run: ForceRun) -> list[PaperPlot]:
     t, signals = run.batch.t[:, 0], run.batch.signals[:, 0]
     numbers = {"sine": ("4", "5", "6"), "jturn": ("7", "8", "9")}[drive]
     steering = Curve("front left wheel", t, signals[:, S.DELTA])
@@ -226,11 +228,11 @@ def _plots(drive: str, run: ForceRun) -> list[PaperPlot]:
         Panel("", "t [s]", "wheel angle [rad]", (steering,)),
     )
     forces = tuple(
-        Panel(f"wheel {place.removeprefix('_')}", "t [s]", "F_x [N]", _lines(run, t, name, "TFC"))
+        Panel(f"wheel {place.removeprefix('_')}", "t [s]", "F_x [N]", _stage_curves(run, t, name, "TFC"))
         for name, place in zip(FORCES, per_wheel(""), strict=True)
     )
     motion = tuple(
-        Panel("", "t [s]", label, _lines(run, t, name, "WCKF-B"))
+        Panel("", "t [s]", label, _stage_curves(run, t, name, "WCKF-B"))
         for name, label in (("v_x", "v_x [m/s]"), ("v_y", "v_y [m/s]"), ("β", "sideslip β [rad]"))
     )
     title = TITLES[drive]
@@ -241,7 +243,7 @@ def _plots(drive: str, run: ForceRun) -> list[PaperPlot]:
     ]
 
 
-def _lines(run: ForceRun, t: FloatArray, name: str, second: str) -> tuple[Curve, ...]:
+def _stage_curves(run: ForceRun, t: FloatArray, name: str, second: str) -> tuple[Curve, ...]:
     return (
         Curve("true", t, run.truth[name], "truth"),
         Curve("WCKF-A", t, run.first[name], "comparator"),

@@ -112,14 +112,14 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     lows = {mu: run_case(MATCHED[f"003.low.{mu:g}"], {"sr-ukf": AS_PRINTED}) for mu in LOW}
     real = {case.name: with_sensors(case.realistic, ESTIMATOR, seeds) for case in CASES}
     done.tables = [
-        PaperTable("Tables 3 to 6: mean absolute error of friction", _errors(cases, real)),
+        PaperTable("Tables 3 to 6: mean absolute error of friction", _error_rows(cases, real)),
         PaperTable(
             "Seconds until every wheel is within .02, from the start or the change",
-            _arrivals(cases),
+            _arrival_rows(cases),
         ),
-        PaperTable("Table 7 and figure 9: constant speed on low friction, mean absolute error", _low(lows)),
-        PaperTable("Comparator UKF: double and single precision", _comparators(cases)),
-        PaperTable("What the conditions are worth: the same filter without one of them", _ablations()),
+        PaperTable("Table 7 and figure 9: constant speed on low friction, mean absolute error", _low_rows(lows)),
+        PaperTable("Comparator UKF: double and single precision", _comparator_rows(cases)),
+        PaperTable("What the conditions are worth: the same filter without one of them", _ablation_rows()),
         PaperTable("Constant speed straight on, split friction: errors of sensors", _sensor_errors()),
     ]
     lost = float(np.mean([each.runs["ukf-single"].lost for each in cases.values()]))
@@ -133,7 +133,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     done.plots = [
         *(friction_plot(case, cases[case.name]) for case in CASES),
         _low_plot(lows),
-        _inputs(cases["accel"]),
+        _input_plot(cases["accel"]),
     ]
     done.notes = list(NOTES)
     return done
@@ -168,7 +168,7 @@ NOTES: Final = (
 )
 
 
-def _errors(cases: dict[str, CaseRuns], real: dict[str, tuple[Values, Values]]) -> tuple[PaperRow, ...]:
+def _error_rows(cases: dict[str, CaseRuns], real: dict[str, tuple[Values, Values]]) -> tuple[PaperRow, ...]:
     rows = []
     for case in CASES:
         own = run_case(replace(PAPERS[case.realistic], duration_s=10.0), {"sr-ukf": AS_PRINTED})
@@ -186,7 +186,7 @@ def _errors(cases: dict[str, CaseRuns], real: dict[str, tuple[Values, Values]]) 
     return tuple(rows)
 
 
-def _arrivals(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
+def _arrival_rows(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
     return tuple(
         PaperRow(
             f"{case.name}.seconds_to_within_0.02",
@@ -199,14 +199,14 @@ def _arrivals(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
     )
 
 
-def _low(lows: dict[float, CaseRuns]) -> tuple[PaperRow, ...]:
+def _low_rows(lows: dict[float, CaseRuns]) -> tuple[PaperRow, ...]:
     return tuple(
         PaperRow(f"low.{mu:g}.mae_mu", f"μ {mu:g}", NONE, each.error("sr-ukf"), bar=0.0037, shown="small")
         for mu, each in lows.items()
     )
 
 
-def _comparators(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
+def _comparator_rows(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
     rows = []
     for case in CASES:
         runs = cases[case.name]
@@ -231,7 +231,7 @@ def _comparators(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _ablations() -> tuple[PaperRow, ...]:
+def _ablation_rows() -> tuple[PaperRow, ...]:
     rows = []
     for case in CASES:
         spec = MATCHED[f"003.{case.name}"]
@@ -253,8 +253,8 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
     given = given_motion(batch, spec.vehicle)
     rows = []
     for name, what, omega in (
-        ("noise", f"wheel speed noise {WHEEL_SPEED_NOISE:g} rad/s, MAE μ", _noisy(given.signals)),
-        ("radius", f"wheel radius off by {WHEEL_RADIUS_ERROR:g}, MAE μ", _scaled(given.signals)),
+        ("noise", f"wheel speed noise {WHEEL_SPEED_NOISE:g} rad/s, MAE μ", _add_noise(given.signals)),
+        ("radius", f"wheel radius off by {WHEEL_RADIUS_ERROR:g}, MAE μ", _scale_radius(given.signals)),
     ):
         run = estimate(replace(given, signals=omega), AS_PRINTED)
         error = float(np.abs(run.mu - batch.mu_wheel[:, 0]).mean())
@@ -262,7 +262,7 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _noisy(signals: FloatArray) -> FloatArray:
+def _add_noise(signals: FloatArray) -> FloatArray:
     """Signals with white noise on the wheel speeds."""
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
@@ -270,7 +270,7 @@ def _noisy(signals: FloatArray) -> FloatArray:
     return changed
 
 
-def _scaled(signals: FloatArray) -> FloatArray:
+def _scale_radius(signals: FloatArray) -> FloatArray:
     """Signals of wheels whose radius is larger than the filter's."""
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR
@@ -304,7 +304,7 @@ def _low_plot(lows: dict[float, CaseRuns]) -> PaperPlot:
     return PaperPlot("low-friction", "Figure 9: error per wheel on low friction, constant speed", (panel,))
 
 
-def _inputs(runs: CaseRuns) -> PaperPlot:
+def _input_plot(runs: CaseRuns) -> PaperPlot:
     t, signals = runs.batch.t[:, 0], runs.batch.signals[:, 0]
     panels = (
         Panel(

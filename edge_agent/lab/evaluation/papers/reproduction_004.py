@@ -104,12 +104,12 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     printed = {noise: run_noise(MATCHED[SCENARIO], noise, printed_set, seeds) for noise in NOISES}
     for noise, number in zip(NOISES, ("3", "4"), strict=True):
         for place, name in ((1, "ACOFCKF"), (0, "FCKF")):
-            rows = _rows(noise, place, both[noise].values(name), own[noise].values(name), (real, default))
+            rows = _table_rows(noise, place, both[noise].values(name), own[noise].values(name), (real, default))
             done.tables.append(PaperTable(f"Table {number}: {noise} noise, {name}", rows))
     done.tables.append(PaperTable("The same with the printed P₀, Q = .1·T², R and μ₀", _as_printed(printed)))
-    done.tables.append(PaperTable("Errors of the peaks in the text, as shares", _peaks(both["constant"])))
-    done.tables.append(PaperTable("Options of the filter, constant noise", _options(seeds)))
-    tuning, rows = _tuning(seeds)
+    done.tables.append(PaperTable("Errors of the peaks in the text, as shares", _peak_rows(both["constant"])))
+    done.tables.append(PaperTable("Options of the filter, constant noise", _option_rows(seeds)))
+    tuning, rows = _tuning_rows(seeds)
     done.tables.append(
         PaperTable("Sixteen lower vertices tuned under the printed conditions, judged on other noise", rows)
     )
@@ -142,7 +142,9 @@ NOTES: Final = (
 )
 
 
-def _rows(noise: str, place: int, matched: Values, own: Values, real: tuple[Values, Values]) -> tuple[PaperRow, ...]:
+def _table_rows(
+    noise: str, place: int, matched: Values, own: Values, real: tuple[Values, Values]
+) -> tuple[PaperRow, ...]:
     rows = []
     improved = place == 1
     for measure in ("mae", "rmse"):
@@ -177,7 +179,7 @@ def _as_printed(printed: dict[str, NoisyRun]) -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _peaks(run: NoisyRun) -> tuple[PaperRow, ...]:
+def _peak_rows(run: NoisyRun) -> tuple[PaperRow, ...]:
     values = run.values("ACOFCKF")
     return tuple(
         PaperRow(
@@ -191,7 +193,7 @@ def _peaks(run: NoisyRun) -> tuple[PaperRow, ...]:
     )
 
 
-def _options(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
+def _option_rows(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
     tuned = shipped(ESTIMATOR)
     proportional = {"it": (tuned, AT_THE_TRUTH._replace(tyre=PROPORTIONAL))}
     motors = {"it": (tuned, AT_THE_TRUTH._replace(dual_motor=True))}
@@ -221,7 +223,7 @@ def _options(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
     return tuple(rows)
 
 
-def _tuning(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...]]:
+def _tuning_rows(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...]]:
     """Tune on the three noise levels, and judge on the noise of the other seeds."""
     setting = AS_PRINTED._replace(tyre=PROPORTIONAL)
     spec = MATCHED["004.dlc.proportional"]
