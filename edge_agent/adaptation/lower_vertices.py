@@ -1,16 +1,18 @@
-"""Triangular fuzzy sets whose lower vertices are free: the sets that paper 004 tunes (section III.C, figures 2 and 3).
+"""Triangular fuzzy sets whose lower vertices are free: the sets that paper 004 tunes (section
+III.C, figures 2 and 3).
 
 Legend
     peaks       upper vertices of the five sets of the mismatch [1] (5,)
     feet        their lower vertices between the peaks: right foot of set k, left foot of set k + 1 [1] (8,)
     out_peaks   upper vertices of the five sets of the step, ln of the factor on R [nat] (5,)
     out_feet    their lower vertices [nat] (8,)
-    w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output set
+    w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output
+    set
 
-The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks they hold with full weight. With
-the feet at the neighbouring peaks and out_feet at the neighbouring out_peaks these are almost the sets of
-`memberships.Memberships`, whose feet are tied to the peaks; there the output sets are points.
-Where no set holds, because feet leave a gap, the step is zero.
+The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks they hold
+with full weight. With the feet at the neighbouring peaks and out_feet at the neighbouring
+out_peaks these are almost the sets of `memberships.Memberships`, whose feet are tied to the peaks;
+there the output sets are points. Where no set holds, because feet leave a gap, the step is zero.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ class LowerVertices:
     """Sets of mismatch and step with free feet, as shares of the way between neighbouring peaks.
 
     Attributes:
-        feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k [1], 1 at the peak.
+        feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k
+        [1], 1 at the peak.
         out_feet: the same of the sets of the step.
 
     Raises:
@@ -70,7 +73,8 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return mismatches and steps, (knots,) each, between which the filter interpolates linearly."""
+        """Return mismatches and steps, (knots,) each, between which the filter interpolates
+        linearly."""
         inputs, _ = self.triangles()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
         even = np.linspace(self.peaks[0], self.peaks[-1], knots - len(corners) + 2)

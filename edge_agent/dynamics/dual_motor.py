@@ -1,14 +1,15 @@
 """One motor per axle with a differential: paper 004, equations (4) to (6).
 
-Legend: omega_1, omega_2 speeds of an axle's wheels and omega_c of its midpoint [rad/s], T_m motor torque [N m], i_t
-transmission ratio, eta_t its efficiency, F_x longitudinal force of the axle [N], J_w inertia of a wheel, R radius.
+Legend: omega_1, omega_2 speeds of an axle's wheels and omega_c of its midpoint [rad/s], T_m motor
+torque [N m], i_t transmission ratio, eta_t its efficiency, F_x longitudinal force of the axle [N],
+J_w inertia of a wheel, R radius.
 
     J_w*omega_i' = T_di - F_xi*R                    (4)
     2*J_w*omega_c' = T_m*i_t*eta_t - F_x*R          (5), (6)
 
-The paper takes the larger of two wheel speeds for the midpoint's; that is the outer wheel, so the mean is used here.
-Signals hold the torque at the wheels, so T_m*i_t*eta_t is the sum of an axle's two torques. The paper does not give i_t
-and eta_t.
+The paper takes the larger of two wheel speeds for the midpoint's; that is the outer wheel, so the
+mean is used here. Signals hold the torque at the wheels, so T_m*i_t*eta_t is the sum of an axle's
+two torques. The paper does not give i_t and eta_t.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ def axle_force(torque: float, turning: float, inertia: float, radius: float) -> 
 
 @inlined
 def motor_torque(torque: float, ratio: float, efficiency: float) -> float:
-    """Return T_m [N m] from the sum of an axle's wheel torques; a motor that brakes gains by the losses."""
+    """Return T_m [N m] from the sum of an axle's wheel torques; a motor that brakes gains by the
+    losses."""
     share = efficiency if torque >= 0.0 else 1.0 / efficiency
     return torque / (ratio * share)

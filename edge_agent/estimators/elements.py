@@ -17,8 +17,8 @@ class Element(NamedTuple):
     Attributes:
         place: equation, table, figure or section of the paper.
         what: the element.
-        verdict: "as printed"; "option": as printed if it is asked for, because the default needs something else;
-            "corrected"; "left out".
+        verdict: "as printed"; "option": as printed if it is asked for, because the default needs
+        something else; "corrected"; "left out".
         why: the reason, for everything but "as printed".
         where: module, function or option that holds it.
     """

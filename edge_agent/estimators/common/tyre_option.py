@@ -1,11 +1,13 @@
 """Options of the papers' tyres: how slip stiffness depends on friction, on load and on the axle.
 
-Legend: K slip stiffness, F_z load, mu friction, F_0 = m*g/4, k the vehicle file's stiffness over F_0 [1].
+Legend: K slip stiffness, F_z load, mu friction, F_0 = m*g/4, k the vehicle file's stiffness over
+F_0 [1].
 
     similarity                 K = k*F_z                        as on a real tyre
     proportional-to-friction   K = mu*k*F_z                     as papers 000, 003 and 004 print it
-    quadratic e                K = k*F_z*(1 + e - e*F_z/F_0)    the polynomial m*F_z - n*F_z^2, (14) of paper 001
-    rear_slope q               K of the rear tyres is q times as large per load (C_f and C_r of paper 002)
+    quadratic e                K = k*F_z*(1 + e - e*F_z/F_0)    the polynomial m*F_z - n*F_z^2,
+    (14) of paper 001 rear_slope q               K of the rear tyres is q times as large per load
+    (C_f and C_r of paper 002)
 """
 
 from __future__ import annotations

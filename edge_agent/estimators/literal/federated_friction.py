@@ -1,8 +1,9 @@
 """The friction filter of paper 000 as printed: two cubature sub-filters and a master, given motion.
 
-State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53); F_x from wheel
-torque (10); shares by (54), which gives more information to the worse filter, from one half because zero divides by
-zero. P_f, not its inverse, in (52). Cubature points by singular values (40), (41).
+State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53);
+F_x from wheel torque (10); shares by (54), which gives more information to the worse filter, from
+one half because zero divides by zero. P_f, not its inverse, in (52). Cubature points by singular
+values (40), (41).
 
 Legend: beta_i share of sub-filter i; P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20).
 """

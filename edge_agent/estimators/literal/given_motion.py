@@ -48,7 +48,8 @@ class GivenMotion:
         return parameter_row(self.vehicle)
 
     def wheel_forces(self) -> FloatArray:
-        """Return F_x = (T - J*omega')/R - k_r*F_z [N] of the wheels, (T, 4), from torque and speed."""
+        """Return F_x = (T - J*omega')/R - k_r*F_z [N] of the wheels, (T, 4), from torque and
+        speed."""
         row = self.row
         omega = self.signals[:, S.OMEGA : S.OMEGA + 4]
         torque = self.signals[:, S.TORQUE : S.TORQUE + 4]

@@ -1,11 +1,13 @@
 """Tyre forces of one sample for many values of friction at once, in double or single precision.
 
-Legend: s_x, s_y slip along and across; k_x, k_y slip stiffness over load [1]; f Dugoff's curve; F_z load; mu friction.
+Legend: s_x, s_y slip along and across; k_x, k_y slip stiffness over load [1]; f Dugoff's curve;
+F_z load; mu friction.
 
     proportional   F = mu*F_z*f(theta)*direction, theta = |(k_x*s_x, k_y*s_y)|      stiffness mu*k*F_z, as printed
     similarity     the same with theta over mu                                      stiffness k*F_z
 
-With the printed tyre the force is linear in friction, so friction below zero is allowed between two samples.
+With the printed tyre the force is linear in friction, so friction below zero is allowed between
+two samples.
 """
 
 from __future__ import annotations
@@ -69,7 +71,8 @@ class WheelForces:
         )
 
     def tyre(self, k: int, mu: FloatArray) -> FloatArray:
-        """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P, 4)."""
+        """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P,
+        4)."""
         free = self.free[k]
         size = np.maximum(np.hypot(free[:, 0], free[:, 1]), TINY)
         theta = size if self.proportional else size / np.maximum(mu, LEAST_MU)
@@ -78,7 +81,8 @@ class WheelForces:
         return np.asarray(pull[..., None] * free)
 
     def accelerations(self, k: int, force: FloatArray) -> FloatArray:
-        """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at sample `k`."""
+        """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at
+        sample `k`."""
         cos, sin = self.turned[k, :, 0], self.turned[k, :, 1]
         ahead = cos * force[..., 0] - sin * force[..., 1]
         left = sin * force[..., 0] + cos * force[..., 1]

@@ -1,17 +1,21 @@
-"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and its comparator.
+"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and
+its comparator.
 
-State mu_fl, mu_fr, mu_rl, mu_rr, a random walk. Measurement [a_x, a_y, r] (section 3.1): yaw rate over a sample, so the
-row is its difference r' [rad/s^2]. With `torque_rows` the torque balances of the wheels follow, F_x of each wheel:
-without them two of four frictions are visible straight on.
+State mu_fl, mu_fr, mu_rl, mu_rr, a random walk. Measurement [a_x, a_y, r] (section 3.1): yaw rate
+over a sample, so the row is its difference r' [rad/s^2]. With `torque_rows` the torque balances of
+the wheels follow, F_x of each wheel: without them two of four frictions are visible straight on.
 
-Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0, d = sum of w*e_i.
+Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0,
+d = sum of w*e_i.
 
-Square root (section 3.2): roots by singular values. With the printed alpha = .001 the centre has a weight of -10^6,
-which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta - alpha^2)*d*d' exactly, and there all
-weights are positive. That is the form used here, in either precision.
+Square root (section 3.2): roots by singular values. With the printed alpha = .001 the centre has a
+weight of -10^6, which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta -
+alpha^2)*d*d' exactly, and there all weights are positive. That is the form used here, in either
+precision.
 
-Covariance (section 3.1, "UKF"): the textbook sums with weights of 10^6, whose digits cancel. In single precision the
-covariance then loses its Cholesky factor, and the last one that existed is used instead.
+Covariance (section 3.1, "UKF"): the textbook sums with weights of 10^6, whose digits cancel. In
+single precision the covariance then loses its Cholesky factor, and the last one that existed is
+used instead.
 """
 
 from __future__ import annotations
@@ -54,7 +58,8 @@ UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)
 
 @dataclass(frozen=True)
 class FrictionRun:
-    """Friction of the wheels over a drive (T, 4), and the share of the steps whose covariance had no factor."""
+    """Friction of the wheels over a drive (T, 4), and the share of the steps whose covariance had
+    no factor."""
 
     mu: FloatArray
     lost: float
@@ -121,7 +126,8 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are never negative."""
+    """Axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are never
+    negative."""
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes
 

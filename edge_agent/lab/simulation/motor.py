@@ -1,7 +1,9 @@
-"""Permanent-magnet synchronous motors at the wheels, and the PID speed control of paper 003 (section 4.1).
+"""Permanent-magnet synchronous motors at the wheels, and the PID speed control of paper 003
+(section 4.1).
 
 Legend, in the rotor's d-q axes
-    u, i        voltage [V] and current [A] of an axis           L, R   inductance [H], resistance [ohm] of the stator
+    u, i        voltage [V] and current [A] of an axis           L, R   inductance [H], resistance
+    [ohm] of the stator
     psi         flux of the magnets [Wb]                         p      pole pairs
     omega_e     electrical speed p*omega_m [rad/s]               G      gear from motor to wheel
 
@@ -9,10 +11,10 @@ Legend, in the rotor's d-q axes
     L_q*i_q' = u_q - R*i_q - omega_e*(L_d*i_d + psi)             voltage of the q axis
     T = 1.5*p*(psi*i_q + (L_d - L_q)*i_d*i_q)                    torque
 
-The inverter's current control is proportional-integral with the motor's own terms fed forward, i_d is kept at zero, and
-the voltage is limited. The paper gives no constants: these are of an ordinary hub motor. The equation of mechanical
-motion is the wheel's own in `plant`, whose inertia holds the rotor; viscous friction is left out, because the filters
-take the torque at the wheel.
+The inverter's current control is proportional-integral with the motor's own terms fed forward, i_d
+is kept at zero, and the voltage is limited. The paper gives no constants: these are of an ordinary
+hub motor. The equation of mechanical motion is the wheel's own in `plant`, whose inertia holds the
+rotor; viscous friction is left out, because the filters take the torque at the wheel.
 """
 
 from __future__ import annotations
@@ -68,7 +70,8 @@ def at_rest() -> FloatArray:
 
 @compiled
 def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: float) -> float:
-    """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque at the wheel [N m].
+    """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque
+    at the wheel [N m].
 
     wanted: torque at the wheel that is asked for [N m].
     """

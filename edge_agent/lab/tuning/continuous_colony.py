@@ -1,8 +1,10 @@
-"""Ant colony over continuous variables, ACO_R (Socha and Dorigo, European J. of Operational Research 2008), pure.
+"""Ant colony over continuous variables, ACO_R (Socha and Dorigo, European J. of Operational
+Research 2008), pure.
 
-The graph of `colony` gives each vertex a short list of positions. Vertices of fuzzy sets are continuous, so here an
-archive of the k best vectors stands for the pheromone. An ant takes vector l of the archive with a weight that falls
-with its rank, and draws each variable from a normal distribution about it.
+The graph of `colony` gives each vertex a short list of positions. Vertices of fuzzy sets are
+continuous, so here an archive of the k best vectors stands for the pheromone. An ant takes vector
+l of the archive with a weight that falls with its rank, and draws each variable from a normal
+distribution about it.
 
 Legend
     l           rank in the archive, 1 is best
@@ -43,7 +45,8 @@ class ArchiveHabits:
 
 
 class SearchTally:
-    """Vectors evaluated so far, the best of them, and the history; for searches over continuous variables."""
+    """Vectors evaluated so far, the best of them, and the history; for searches over continuous
+    variables."""
 
     def __init__(self, problem: Problem) -> None:
         """Begin without any evaluation."""
@@ -109,7 +112,8 @@ def optimise(
 ) -> Result:
     """Search the vector with the largest objective, with ants·iterations evaluations.
 
-    The archive is filled first, from the whole range and the start. Variables range over their choices.
+    The archive is filled first, from the whole range and the start. Variables range over their
+    choices.
     """
     habits = habits or ArchiveHabits()
     tally = SearchTally(problem)
@@ -138,7 +142,8 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """The next vector: the start, then any until the archive is full, then one about a vector of the archive."""
+    """The next vector: the start, then any until the archive is full, then one about a vector of
+    the archive."""
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))
     if len(vectors) < habits.archive:

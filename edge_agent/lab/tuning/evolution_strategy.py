@@ -1,4 +1,5 @@
-"""(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), pure: a control of the ant colonies."""
+"""(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), pure: a control of the ant
+colonies."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Search with ants·iterations evaluations, one after the other; arguments and result as those of the colonies."""
+    """Search with ants·iterations evaluations, one after the other; arguments and result as those
+    of the colonies."""
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)
     parent = tally.fit(begin)

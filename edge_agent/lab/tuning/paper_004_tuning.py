@@ -1,7 +1,8 @@
-"""The tuning of paper 004 as the paper did it: sixteen lower vertices, three noise levels, its objective as a choice.
+"""The tuning of paper 004 as the paper did it: sixteen lower vertices, three noise levels, its
+objective as a choice.
 
-The double lane change at 80 km/h on the printed tyre, P_0 = .2*I, Q = .1*T^2; noise variance and R are .1, .05 and .01
-in turn (section IV.A). Objectives, larger is better:
+The double lane change at 80 km/h on the printed tyre, P_0 = .2*I, Q = .1*T^2; noise variance and R
+are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
 
     mismatch     1/(1 + |e|), e the mean difference of actual and theoretical innovation variance (33)
     likelihood   mean log-likelihood of the innovations [nat per sample], which no inflation of R wins
@@ -97,7 +98,8 @@ def _reported(sets: Sets, drive: LevelDrive) -> Estimates:
 
 
 def visibility() -> list[FloatArray]:
-    """Return eta of every position at every vertex: positions near the untuned one are preferred (31)."""
+    """Return eta of every position at every vertex: positions near the untuned one are preferred
+    (31)."""
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())
 

@@ -6,9 +6,10 @@
     aco_r        ants over continuous variables                 (`continuous_colony`)
     evolution    (1+1) evolution strategy                       (`evolution_strategy`)
 
-Objective: mean log-likelihood of the innovations over four conditions of R [nat/s] (`study`), on four drives. Each seed
-is one search of each kind, and one set of held-out drives with noise of its own on which all are judged, with the
-untuned sets and without sets for comparison. Differences are paired by seed; `.se` is the standard error over seeds.
+Objective: mean log-likelihood of the innovations over four conditions of R [nat/s] (`study`), on
+four drives. Each seed is one search of each kind, and one set of held-out drives with noise of its
+own on which all are judged, with the untuned sets and without sets for comparison. Differences are
+paired by seed; `.se` is the standard error over seeds.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ def compare_searches(
     quick: bool = False,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[Figure]:
-    """Search with every seed in every way, judge on held-out noise, and return means with standard errors."""
+    """Search with every seed in every way, judge on held-out noise, and return means with standard
+    errors."""
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
     train = study.record(study.TRAIN, duration)
     searched: dict[str, list[float]] = {}

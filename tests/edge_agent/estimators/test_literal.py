@@ -1,4 +1,5 @@
-"""Friction filters of papers 000 and 003 as printed: printed errors, precision, and the tyre that they need."""
+"""Friction filters of papers 000 and 003 as printed: printed errors, precision, and the tyre that
+they need."""
 
 from __future__ import annotations
 

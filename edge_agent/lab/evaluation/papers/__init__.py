@@ -1,1 +1,2 @@
-"""Reproduction of the five papers: each paper's conditions, figures and tables, one paper at a time."""
+"""Reproduction of the five papers: each paper's conditions, figures and tables, one paper at a
+time."""

@@ -1,4 +1,5 @@
-"""Columns of the papers' tables: the same drive matched, on the simulator's own plant, and with realistic sensors."""
+"""Columns of the papers' tables: the same drive matched, on the simulator's own plant, and with
+realistic sensors."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates
 
 
 def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
-    """Return the measures of a paper's estimator and of the default, on drives with ordinary sensors."""
+    """Return the measures of a paper's estimator and of the default, on drives with ordinary
+    sensors."""
     batch = realistic(PAPERS[name], seeds)
     found = [means(batch, estimates(bank_of(each, batch.vehicles), batch)) for each in (estimator, DEFAULT)]
     return found[0], found[1]

@@ -1,7 +1,7 @@
 """The papers' conditions: plants with the papers' tyres and without drag, and their drives.
 
-"Matched" is a plant that is the filter's model. Constant-speed drives keep drag and rolling resistance, known to the
-filter, because without a longitudinal force no tyre tells anything.
+"Matched" is a plant that is the filter's model. Constant-speed drives keep drag and rolling
+resistance, known to the filter, because without a longitudinal force no tyre tells anything.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """The vehicle of 002 with C_f, C_r and J of table 1, and the tyre that its filter needs for it."""
+    """The vehicle of 002 with C_f, C_r and J of table 1, and the tyre that its filter needs for
+    it."""
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
     weight = row[Parameter.MASS] * GRAVITY

@@ -1,4 +1,5 @@
-"""Figures of paper 004: path, motor torques, states with both filters, fuzzy sets, search and pheromone."""
+"""Figures of paper 004: path, motor torques, states with both filters, fuzzy sets, search and
+pheromone."""
 
 from __future__ import annotations
 

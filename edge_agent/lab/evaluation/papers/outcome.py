@@ -1,4 +1,5 @@
-"""Records of a paper's reproduction: table rows, curves of plots, and everything that a report needs."""
+"""Records of a paper's reproduction: table rows, curves of plots, and everything that a report
+needs."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class PaperRow(NamedTuple):
         own: the same filter on the simulator's own plant.
         realistic: the paper's estimator with ordinary sensors, a vehicle known to a few per cent.
         default: the default estimator on the same drives.
-        bar: limit of `matched`; the printed number where it is None and one is printed; NaN for no bar.
+        bar: limit of `matched`; the printed number where it is None and one is printed; NaN for no
+        bar.
         better: side of the bar.
         shown: printed number as text, where it is more than a number.
     """

@@ -1,4 +1,5 @@
-"""The report of one paper: one HTML page without scripts, and Markdown of its tables and elements."""
+"""The report of one paper: one HTML page without scripts, and Markdown of its tables and
+elements."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def number(value: float) -> str:
 
 
 def cells(row: PaperRow) -> list[str]:
-    """Return the cells of a row: printed, matched, own plant, realistic sensors, default estimator."""
+    """Return the cells of a row: printed, matched, own plant, realistic sensors, default
+    estimator."""
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
 
@@ -90,7 +92,8 @@ def report_markdown(done: Reproduction) -> str:
 
 
 def report_html(done: Reproduction, seconds: float) -> str:
-    """Return the report as one HTML page that shows the SVG files of its folder; `seconds` it took."""
+    """Return the report as one HTML page that shows the SVG files of its folder; `seconds` it
+    took."""
     counts = ", ".join(
         f"{sum(element.verdict == verdict for element in done.elements)} {verdict}" for verdict in VERDICTS
     )

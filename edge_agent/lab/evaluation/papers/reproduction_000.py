@@ -1,4 +1,5 @@
-"""Paper 000: joint federated filters; two lane changes from .5 to .3, friction filter as printed."""
+"""Paper 000: joint federated filters; two lane changes from .5 to .3, friction filter as
+printed."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ NEAR: Final = 0.1
 
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
-    """Return seconds until the mean friction (T,) is within NEAR, from the start and from the change."""
+    """Return seconds until the mean friction (T,) is within NEAR, from the start and from the
+    change."""
     t, truth = batch.t[:, 0], batch.mu[:, 0]
     near = np.abs(mu - truth) <= NEAR
     change = int(np.argmax(truth == truth[-1]))

@@ -1,4 +1,5 @@
-"""Paper 003: four-wheel friction by the square-root filter, its comparator UKF, under the paper's conditions."""
+"""Paper 003: four-wheel friction by the square-root filter, its comparator UKF, under the paper's
+conditions."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
 
 @dataclass(frozen=True)
 class FrictionCase:
-    """One experiment: the printed errors of SR-UKF and UKF, and seconds to convergence as printed."""
+    """One experiment: the printed errors of SR-UKF and UKF, and seconds to convergence as
+    printed."""
 
     name: str
     what: str
@@ -88,7 +90,8 @@ class CaseRuns:
         return float(np.abs(self.runs[name].mu - self.batch.mu_wheel[:, 0]).mean())
 
     def arrival(self, name: str) -> float:
-        """Seconds from the start, or from the change of friction, until all wheels are within NEAR."""
+        """Seconds from the start, or from the change of friction, until all wheels are within
+        NEAR."""
         truth = self.batch.mu_wheel[:, 0]
         changes = np.flatnonzero(np.abs(np.diff(truth, axis=0)).max(axis=1) > NEAR)
         first = int(changes[-1]) + 1 if len(changes) else 0

@@ -1,4 +1,5 @@
-"""Paper 004: fuzzy cubature filter before and after the ant colony, under constant and variable noise."""
+"""Paper 004: fuzzy cubature filter before and after the ant colony, under constant and variable
+noise."""
 
 from __future__ import annotations
 
