@@ -47,7 +47,7 @@ FLEET: Final = (
     "rebuild --archive {a} --out {d}/r --engine abacus", "export datex --out {d}/x.xml",
     "analyze contract --archive {a}",
     "query --connect tcp/127.0.0.1:1", "query --connect nonsense", "query --config {d}/none.json",
-    "watch --bbox 1", "watch --webhook nonsense", "watch --config {d}/bad.json", "compact --archive {d}",
+    "watch --bbox 1", "watch --webhook nonsense", "cits --amqp nonsense", "watch --config {d}/bad.json", "compact --archive {d}",
     "hand-over nowhere --to north-b", "hand-over */*/* --to north-b --connect tcp/127.0.0.1:1", "hand-over */*/*",
     "compact --archive {d}/none", "compact --archive {a} --round-rows 0", "compact --archive {a} --put-to nonsense://x",
     "retention --archive {a} --raw-days 1", "retention --archive {d} --raw-days 31", "forget --archive {a} --period x",
