@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from schemas.config import explain
 from schemas.errors import InputError
 from schemas.thresholds import GRAVITY
+from schemas.vehicle_classes import PREFIX, fields_of_class
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
 # Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et al., SAE 1999-01-1336).
@@ -118,12 +119,14 @@ class Vehicle(BaseModel):
 
 
 def load_vehicle(path: Path | str) -> Vehicle:
-    """Read a vehicle file (JSON).
+    """Read a vehicle file (JSON), or return that of a class: "class:compact".
 
     Raises:
         InputError: the file cannot be read, a field is missing or out of range, or mass and yaw inertia are not of one
             vehicle; names the field and the fix.
     """
+    if str(path).startswith(PREFIX):
+        return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))
     try:
         vehicle = Vehicle.model_validate_json(Path(path).read_bytes())
     except OSError as error:

@@ -4,11 +4,12 @@
     radius_fl … rr    turning of each wheel against the mean of the four on calm moments, less what yaw and slip explain
     ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
     yaw_rate          intercept of the wheels' yaw rate over the gyro's
-    steer_offset      intercept of δ over L·r/v with understeer beside it
-    steer_gain        gain of the same
+    steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three at once
     force_gain        torque over radius, over mass times acceleration: torque gain and mass, where torque is recorded
     wheel_lag, steer_lag    by which they speak later than the inertial unit: lags.py
-    understeer        δ beyond L·r/v per v·r [rad per m/s²]
+
+At one speed gain and understeer are the same; only a prior that the whole fleet shares tells them apart there. So the
+regression of a drive begins from USUAL around SOUND, and its standard deviations say how much of that is left.
 
 Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is taken off a radius by
 the file's stiffness, its driven axle, and what usual cars lose to air and to the tyres' rolling.
@@ -29,7 +30,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
-from edge_agent.inputs.doctor.identities import fits, robust
+from edge_agent.inputs.doctor.identities import CORRELATED_S, fits, robust
 from edge_agent.inputs.doctor.lags import lags
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
@@ -43,21 +44,26 @@ STRAIGHT: Final = 1.0  # [m/s^2] of v·r
 LEAST_S: Final = 10.0  # of moments that count
 # spread among drives that is always allowed for; what drives have in common; and spread among cars
 FLOOR: Final = {"radius": 0.0004, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "steer_offset": 0.0006,
-                "steer_gain": 0.03, "force_gain": 0.02, "understeer": 0.0015, "wheel_lag": 0.012,
+                "steer_gain": 0.02, "force_gain": 0.02, "understeer": 0.0005, "wheel_lag": 0.012,
                 "steer_lag": 0.012}  # fmt: skip
 BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0004,
-               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005, "wheel_lag": 0.009,
+               "steer_gain": 0.015, "force_gain": 0.002, "understeer": 0.0002, "wheel_lag": 0.009,
                "steer_lag": 0.009}  # fmt: skip
 USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
-                "force_gain": 0.08, "understeer": 0.01, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
+                "force_gain": 0.08, "understeer": 0.001, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
+SOUND: Final = {"steer_gain": 1.0, "force_gain": 1.0, "understeer": 0.0005}  # what usual cars have; 0 for the others
+STEERED_M_S: Final = 5.0  # from which on the way taken tells of the steering
+LINEAR: Final = 4.0  # [m/s^2] of v·r up to which understeer goes with it
+LEAST_ANGLE: Final = 0.001  # [rad] by which steering and way differ at least
+TRACED: Final = ("steer_offset", "steer_gain", "understeer")
 ROBUST: Final = 1.4826  # standard deviations in the median of absolute deviations
-UNKNOWN_SPLIT: Final = 0.0008  # BIAS of radii where the file does not say which axle drives
+UNKNOWN_SPLIT: Final = 0.003  # BIAS of radii where the file does not say which axle drives
 DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 x .3 x 2.2 m^2
 ROLLING: Final = 0.008  # [1] rolling resistance over load
 BRAKED_FRONT: Final = 0.7  # [1] share of the front axle in braking
 
 DriveEstimates: TypeAlias = dict[str, float]
-"""Estimates of one drive, by quantity."""
+"""Estimates of one drive, by quantity; QUANTITY_std is what its own regression leaves unknown of it."""
 
 
 def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
@@ -86,13 +92,16 @@ def weighed(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration |
     bias = BIAS if vehicle.drive_split_front is not None else BIAS | {"radius": UNKNOWN_SPLIT}
     learned = {}
     for name, values in estimates.items():
+        if name.endswith("_std"):
+            continue
         kind = name.partition("_")[0] if name.startswith("radius") else name
-        learned[name] = _posterior(kind, np.array(values), bias[kind])
+        unknown = min(estimates.get(f"{name}_std", [0.0]))
+        learned[name] = _posterior(kind, np.array(values), bias[kind], unknown)
     return Calibration.model_validate({"drives": len(drives), **learned})
 
 
 def surer(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Of each quantity, the value with the smaller standard deviation of two calibrations of a car."""
+    """Return, of each quantity, the value with the smaller standard deviation of two calibrations of a car."""
     if one is None or other is None:
         return one or other
     better = {
@@ -103,14 +112,19 @@ def surer(one: Calibration | None, other: Calibration | None) -> Calibration | N
     return other.model_copy(update={**better, "drives": max(one.drives, other.drives)})
 
 
-def _posterior(kind: str, values: FloatArray, bias: float) -> tuple[float, float]:
-    """Value and standard deviation by the estimates of drives (n,)."""
-    sound = 1.0 if kind.endswith("gain") else 0.0
+def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tuple[float, float]:
+    """Value and standard deviation by the estimates of drives (n,).
+
+    `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what is usual already.
+    """
+    sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
     around = ROBUST * float(np.median(np.abs(values - centre))) if len(values) > 2 else 2.0 * FLOOR[kind]
     spread = max(around, FLOOR[kind])
     std = float(np.hypot(spread / np.sqrt(len(values)), bias))
     share = USUAL[kind] ** 2 / (USUAL[kind] ** 2 + std**2)
+    if unknown:
+        return round(centre, 6), round(float(np.hypot(np.sqrt(share) * std, unknown)), 6)
     return round(sound + share * (centre - sound), 6), round(float(np.sqrt(share)) * std, 6)
 
 
@@ -132,14 +146,35 @@ def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     straight = moving & (np.abs(drive.v * drive.r) < STRAIGHT) & np.isfinite(drive.ay)
     if straight.sum() > LEAST_S * RATE_HZ:
         quantities["ay"] = float(np.median((drive.ay - drive.v * drive.r)[straight]))
-    steering = fits(drive)["steering"]
-    if steering.known and steering.error < 0.1:
-        quantities |= {"steer_offset": steering.offset, "steer_gain": steering.gain, "understeer": steering.beside[0]}
-    return quantities
+    return quantities | trace_steering(drive)
+
+
+def trace_steering(drive: EvenDrive) -> DriveEstimates:
+    """Return offset, gain and understeer of the steering with their standard deviations, from the way that it makes."""
+    fast = np.maximum(drive.v, STEERED_M_S)
+    across = drive.v * drive.r
+    rows = (drive.moving > 0) & np.isfinite(drive.delta) & np.isfinite(across)
+    rows &= (drive.v > STEERED_M_S) & (np.abs(across) < LINEAR)
+    if rows.sum() < LEAST_S * RATE_HZ:
+        return {}
+    table = np.stack([np.ones(int(rows.sum())), drive.wheelbase * (drive.r / fast)[rows], across[rows]], axis=1)
+    angle = drive.delta[rows]
+    away = angle - table @ robust(table, angle)
+    spread = max(ROBUST * float(np.median(np.abs(away))), LEAST_ANGLE)
+    near = np.abs(away) <= 3.0 * spread
+    usual = np.array([USUAL[name] for name in TRACED])
+    centre = np.array([SOUND.get(name, 0.0) for name in TRACED])
+    weight = 1.0 / (CORRELATED_S * RATE_HZ * spread**2)
+    information = weight * (table[near].T @ table[near]) + np.diag(1.0 / usual**2)
+    covariance = np.linalg.inv(information)
+    found = covariance @ (weight * (table[near].T @ angle[near]) + centre / usual**2)
+    std = np.sqrt(np.diag(covariance))
+    told = zip(TRACED, found.tolist(), std.tolist(), strict=True)
+    return {key: value for name, mean, error in told for key, value in ((name, mean), (f"{name}_std", error))}
 
 
 def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """How much faster each wheel turns than the mean of the four, but for yaw and slip."""
+    """Return how much faster each wheel turns than the mean of the four, but for yaw and slip."""
     calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
     calm &= np.isfinite(drive.wheels).all(axis=1) & np.isfinite(drive.r) & np.isfinite(drive.ax)
     if calm.sum() < LEAST_S * RATE_HZ:

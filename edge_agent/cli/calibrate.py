@@ -4,6 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from edge_agent.calibration.held_out import Drive, HeldOut, Prediction
+    from schemas.vehicle import Vehicle
+
+ESTIMATOR: Final = "aco-fckf"
+UNITS: Final = {
+    "ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s", "steer_offset": "rad", "wheel_lag": "s", "steer_lag": "s",
+    "understeer": "rad per m/s^2",
+}  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,9 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn and write; return 0."""
+    """Learn, judge on held-out drives and write; return 0."""
     from edge_agent.app.estimates_file import writable
-    from edge_agent.calibration.learn import learn
+    from edge_agent.calibration.held_out import learn_validated
+    from edge_agent.inputs.correct import scale_axles
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
@@ -27,16 +39,46 @@ def run(args: argparse.Namespace) -> int:
     drives = []
     for path in args.log:
         log = read_log(path)
-        faults = [] if args.trust else diagnose(log.t, log.signals, vehicle, log.ground).findings
+        signals = scale_axles(log.signals, vehicle)
+        faults = [] if args.trust else diagnose(log.t, signals, vehicle, log.ground).findings
         if faults:
             names = ", ".join(f"{fault.channel} {fault.kind}" for fault in faults)
             raise InputError("log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it")
-        drives.append((log.t, log.signals))
-    calibration = learn(drives, vehicle)
-    text = vehicle.model_copy(update={"calibration": calibration}).model_dump_json(indent=1, exclude_none=True)
+        drives.append((log.t, signals))
+    alike = vehicle.model_copy(update={"wheel_radius_front": None, "wheel_radius_rear": None})
+    found = learn_validated(drives, alike, predict_drive)
+    text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(indent=1, exclude_none=True)
     writable("out", args.out).write_text(text + "\n", encoding="utf-8")
-    for name, estimate in calibration.model_dump(exclude_none=True).items():
-        if isinstance(estimate, tuple):
-            print(f"{name:<14} {estimate[0]:+.5f} ± {estimate[1]:.5f}")
-    print(f"{args.out}: learned from {len(drives)} drives")
+    print("\n".join(report_lines(found)))
+    print(f"{args.out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
     return 0
+
+
+def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
+    """Replay a drive and return how well the estimator predicts its measurements."""
+    from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.calibration.held_out import Prediction
+    from edge_agent.estimators.estimates import Column
+    from edge_agent.inputs.correct import corrected
+    from schemas.signals import Health
+
+    t, signals = drive
+    values = bank_of(ESTIMATOR, [vehicle]).advance(t[:, None], corrected(t, signals, vehicle)[:, None]).values[:, 0]
+    contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0
+    likelihood = float(values[:, Column.INNOVATION_LOG_LIKELIHOOD].sum())
+    return Prediction(likelihood / max(float(t[-1] - t[0]), 1e-9), float(contradicted.mean()))
+
+
+def report_lines(found: HeldOut) -> list[str]:
+    """Return the learned values with units, the groups that were left out, and the judgement on held-out drives."""
+    lines = []
+    for name, estimate in found.calibration.model_dump(exclude_none=True).items():
+        if isinstance(estimate, tuple):
+            lines.append(f"{name:<14} {estimate[0]:+.5f} ± {estimate[1]:.5f} {UNITS.get(name, '1')}")
+    lines += [f"not written: {group}: it makes a held-out drive no better" for group in found.refused]
+    before, after = found.before, found.after
+    lines.append(
+        f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} -> "
+        f"{after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> {after.contradicted:.3f}"
+    )
+    return lines

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs", "ahead", "detection", "searches")
+ONLY: Final = ("inputs", "ahead", "detection", "searches", "real")
 PAPERS: Final = ("000", "001", "002", "003", "004")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources; "
         "ahead: warnings, their cost and delay, the map as a prior; "
         "detection: slippery road found, missed and falsely reported, in short and long drives; "
-        "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets",
+        "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets; "
+        "real: recorded drives of real cars in the folder --logs",
     )
     parser.add_argument(
         "--paper",
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one paper under its own conditions: its figures and tables next to ours, as index.html and report.md; "
         "ends with 1 if a matched number misses the printed one",
     )
+    parser.add_argument("--logs", type=Path, help="folder of LOG.parquet with LOG.json (--only real)")
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
     )
@@ -87,6 +89,8 @@ def run(args: argparse.Namespace) -> int:
         return _ahead(args, count)
     if args.only == "detection":
         return _detection(args, count)
+    if args.only == "real":
+        return _real(args)
     if args.only:
         return _inputs(args)
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
@@ -139,6 +143,21 @@ def _inputs(args: argparse.Namespace) -> int:
         figures = _measured(Path(scratch), args)
     write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
     text = f"# Inputs\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _real(args: argparse.Namespace) -> int:
+    from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
+    from schemas.runtime.figures import markdown, write
+
+    if args.logs is None:
+        raise InputError("logs", "is missing", "name the folder of logs, each next to its vehicle file: --logs DIR")
+    found = judge_folder(args.logs, lambda line: print(line, file=sys.stderr, flush=True))
+    figures = summarise(found)
+    write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
+    text = f"# Real cars\n\n{table(found)}\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
@@ -34,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Import; return 0 if the log was written."""
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
+    from edge_agent.inputs.doctor.adopt import align_import
     from edge_agent.inputs.merge import merge
     from edge_agent.inputs.names import draft
     from edge_agent.inputs.profile import load_profile, shipped
@@ -61,10 +63,16 @@ def run(args: argparse.Namespace) -> int:
         target = writable("draft", args.draft or out.with_suffix(".profile.json"))
         target.write_text(profile.text(), encoding="utf-8")
         print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")
-    merged = merge(
-        recordings, profile, wheel_radius=vehicle.wheel_radius if vehicle else None,
-        steering_ratio=vehicle.steering_ratio if vehicle else None, shifts=_shifts(args.clock),
-    )  # fmt: skip
+    merge_with = partial(
+        merge,
+        recordings,
+        wheel_radius=vehicle.wheel_radius if vehicle else None,
+        steering_ratio=vehicle.steering_ratio if vehicle else None,
+        shifts=_shifts(args.clock),
+    )
+    merged = merge_with(profile)
+    if vehicle is not None:
+        merged, profile = align_import(merged, profile, vehicle, merge_with)
     write_log(out, merged, profile, [source.name for source in args.source])
     for note in merged.notes:
         print(f"note: {note}")

@@ -102,7 +102,7 @@ def _mended(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """How long the readings of a device's channels wait for the latest device [s]; the latest is left out."""
+    """Return how long the readings of a device's channels wait for the latest device [s]; the latest is left out."""
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}
     late = {INERTIAL: 0.0, STEERING: _value(known.steer_lag, 0.0), TURNING: _value(known.wheel_lag, 0.0)}

@@ -8,7 +8,7 @@ causal.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,7 +17,9 @@ import numpy as np
 from edge_agent.inputs.correct import corrected, free_rear_wheels
 from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.inputs.doctor.fix import OF_DEVICE
+from edge_agent.inputs.doctor.fix import OF_DEVICE, fixed
+from edge_agent.inputs.merge import Merged
+from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
@@ -49,6 +51,11 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
         f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; corrected for this replay"
         for device, seconds in delays.items()
     ]
+    if any(finding.kind == "lift" for finding in diagnosis.findings):
+        standing = log.signals.copy()
+        standing[:, S.OMEGA : S.OMEGA + 4] = 0.0
+        notes.append("note: the car stands on a lift or rollers; its wheels are taken to stand")
+        return Adopted(replace(log, signals=standing), vehicle, diagnosis, notes)
     signals = align_devices(log.t, log.signals, delays) if delays else log.signals
     if diagnosis.locked == ["rear"] and not vehicle.rear_axle_locked:
         vehicle = vehicle.model_copy(update={"rear_axle_locked": True})
@@ -58,6 +65,27 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
         return Adopted(log, vehicle, diagnosis, notes)
     log = replace(log, signals=signals)
     return Adopted(log, vehicle, diagnose(log.t, signals, vehicle, log.ground) if delays else diagnosis, notes)
+
+
+def align_import(
+    merged: Merged, profile: Profile, vehicle: Vehicle, merge_with: Callable[[Profile], Merged]
+) -> tuple[Merged, Profile]:
+    """Return the merged recordings and their profile with the delays that the doctor measured of late devices.
+
+    `merge_with` merges the same recordings by another profile. Without a late device both stay as they are.
+    """
+    signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
+    for index, name in enumerate(CHANNELS):
+        if name in merged.columns:
+            signals[:, index] = merged.columns[name]
+    found = [fault for fault in diagnose(merged.t, signals, vehicle).findings if fault.kind == "clock"]
+    late = [fault for fault in found if fault.delay_s and fault.channel in OF_DEVICE]
+    if not late:
+        return merged, profile
+    profile, *_ = fixed(late, profile, vehicle)
+    aligned = merge_with(profile)
+    aligned.notes += [f"{fault.channel} {fault.words}; corrected by delay_s of the profile" for fault in late]
+    return aligned, profile
 
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:

@@ -42,5 +42,5 @@ class Diagnosis:
 
     @property
     def passed(self) -> bool:
-        """Whether every channel was found to be in order."""
+        """True if every channel was found to be in order."""
         return not self.findings and not self.unknown

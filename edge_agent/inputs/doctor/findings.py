@@ -11,10 +11,12 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.inputs.doctor.bumps import leading_axle
 from edge_agent.inputs.doctor.clocks import measure_clocks, wheels_speak_late
 from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare
 from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
+from edge_agent.inputs.doctor.lift import is_on_lift
 from edge_agent.inputs.doctor.places import exchanged, yaw_findings
 from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, Verdict, clocks, explain
 from edge_agent.inputs.doctor.slip import (
@@ -29,6 +31,7 @@ from edge_agent.inputs.doctor.slip import (
     is_foreign,
     is_same_when_coasting,
     is_steady,
+    is_too_noisy,
     share_of_parts,
     spread_of_parts,
 )
@@ -44,7 +47,7 @@ LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
 JUMPS = 0.01  # share of readings that may jump off the other wheels
 SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
-LARGEST_AX_FAR, AVERAGED_M = 0.9, 300.0  # [m/s^2] and the way over which slopes average to less than 8 %
+LARGEST_AX_FAR, AVERAGED_M = 0.8, 300.0  # [m/s^2] and the way over which slopes average to less than 7 %
 CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
 TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
@@ -61,6 +64,10 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
     diagnosis = Diagnosis()
     t, slow = _seconds(t, diagnosis)
     if slow:
+        return diagnosis
+    if is_on_lift(t, signals, vehicle):
+        words = "wheels turn while accelerometers and yaw rate rest: on a lift or rollers?"
+        diagnosis.findings.append(Finding("omega", "lift", words))
         return diagnosis
     signals = signals.copy()
     _jumps(signals, diagnosis)
@@ -103,6 +110,10 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
         diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
+        exchanged_axles = any(finding.kind == "front and rear exchanged" for finding in diagnosis.findings)
+        if not exchanged_axles and leading_axle(t, signals, vehicle) < 0:
+            words = "bumps reach the rear wheels first: front and rear exchanged?"
+            diagnosis.findings.append(Finding("omega", "front and rear exchanged", words))
     for quantity, channel in CHANNELS_OF.items():
         if any(finding.channel == channel for finding in diagnosis.findings):
             continue
@@ -222,6 +233,8 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
                 gain *= other.factor**member.power
         off = abs(np.log(abs(gain / law.centre)))
         noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)  # of a part's gain
+        if is_too_noisy(found[name]) and name != "ground" and ground.known:  # its parts say nothing of constancy
+            continue
         within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
         if name == "ground" and off > 0.0:
             within = min(STEADY, max(0.04, 0.4 * off))
@@ -315,7 +328,7 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     beside = (drive.ay - drive.v * drive.r)[straight]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         listed.append(("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2"))
-    if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
+    if axle.known and abs(abs(axle.gain) - 1.0) < 0.35 and axle.correlation > 0.75:
         error = float(np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving])))
         if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:  # one way round, a gain is an offset as well
             error = np.inf

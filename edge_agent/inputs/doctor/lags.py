@@ -23,7 +23,7 @@ from schemas.vehicle import Vehicle
 LONGEST_S: Final = 0.5
 LEAST_S: Final = 10.0  # of driving
 SLOW_S: Final = 5.0  # what changes more slowly is offset and bank
-LEAST_LIKE: Final = 0.9  # correlation from which on a lag is believed
+LEAST_LIKE: Final = 0.82  # correlation from which on a lag is believed
 LEAST_RATE: Final = 1e-5  # [rad/s] of yaw; less is rounding
 ALIKE: Final = 0.02  # of two correlations
 SMOOTH_S: Final = 0.1  # of a running mean, taken twice
@@ -36,10 +36,11 @@ SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
-def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> dict[str, float]:
+def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE) -> dict[str, float]:
     """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not tell are left out.
 
-    Signals are smoothed less than the doctor's: over half a second the peak is too round to tell milliseconds.
+    `least` is the correlation from which on a lag is believed. Signals are smoothed less than the doctor's: over half a
+    second the peak is too round to tell milliseconds.
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
 
@@ -56,7 +57,7 @@ def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> dict[str, floa
     ways = {"wheel_lag": (0.5 * (front + rear), front, rear), "steer_lag": (_bicycle(v, delta, vehicle),)}
     found = {}
     for name, sides in ways.items():
-        peaks = [_behind(side, gyro, driven & np.isfinite(side)) for side in sides]
+        peaks = [_behind(side, gyro, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
         if told:  # the mean of the axles comes first: a locked axle says nothing, and spoils the mean
             likest = max(peak.likeness for peak in told)
@@ -71,7 +72,7 @@ class _Peak(NamedTuple):
     likeness: float
 
 
-def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> _Peak | None:
+def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float) -> _Peak | None:
     """Return by how much `left` is behind `right`; None where the drive does not tell."""
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
@@ -87,7 +88,7 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> _Peak | No
         both = among & np.isfinite(left) & np.isfinite(other)
         like[k + most] = np.corrcoef(left[both], other[both])[0, 1] if both.sum() > 2 else 0.0
     top = int(np.argmax(like))
-    if like[top] < LEAST_LIKE or top in (0, 2 * most):
+    if like[top] < least or top in (0, 2 * most):
         return None
     before, here, after = like[top - 1 : top + 2]
     seconds = (top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ

@@ -34,6 +34,9 @@ def lines(diagnosis: Diagnosis) -> list[str]:
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown]
     lines += [f"{'lag':<8} {name:<10} {lag:+.3f} s behind the inertial unit" for name, lag in diagnosis.lags.items()]
+    lines += [
+        f"{'note':<8} {'omega':<10} the {axle} wheels turn as one: locked differential?" for axle in diagnosis.locked
+    ]
     return [*lines, *(f"{'sound':<8} {channel}" for channel in diagnosis.sound)]
 
 

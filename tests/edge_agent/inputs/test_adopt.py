@@ -12,8 +12,9 @@ from edge_agent.inputs.correct import corrected
 from edge_agent.inputs.doctor.adopt import adopt_measured, align_devices
 from edge_agent.inputs.signal_log import SignalLog
 from edge_agent.lab.evaluation.planted import DELTA, IMU, OMEGA, Recorded, drives
+from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
-from schemas.signals import S
+from schemas.signals import CHANNELS, S
 
 RATE_HZ = 100
 
@@ -80,3 +81,26 @@ def test_radius_of_an_axle_scales_its_wheels_and_torques(drive: Recorded) -> Non
     assert np.array_equal(scaled[:, OMEGA[:2]], drive.signals[:, OMEGA[:2]], equal_nan=True)
     torques = slice(S.TORQUE + 2, S.TORQUE + 4)
     assert np.allclose(scaled[:, torques], drive.signals[:, torques] / 1.04, equal_nan=True)
+
+
+@pytest.mark.parametrize("driven", [(2,), (0, 2)])
+def test_car_on_a_lift_is_recognised_and_stands(driven: tuple[int, ...]) -> None:
+    t = np.arange(0.0, 20.0, 0.01)
+    rng = np.random.default_rng(5)
+    signals = np.full((len(t), len(CHANNELS)), np.nan)
+    signals[:, [S.AX, S.AY]] = 0.1 + rng.normal(0.0, 0.05, (len(t), 2))
+    signals[:, S.YAW_RATE] = rng.normal(0.0, 0.002, len(t))
+    signals[:, S.DELTA : S.DELTA + 2] = 0.0
+    signals[:, OMEGA] = 0.0
+    for first in driven:
+        signals[:, S.OMEGA + first : S.OMEGA + first + 2] = (40.0 + 30.0 * np.sin(0.5 * t))[:, None]
+    vehicle = PRESETS["sedan"].vehicle
+    adopted = adopt_measured(SignalLog(t, signals, None, None, None), vehicle)
+    assert [(fault.channel, fault.kind) for fault in adopted.diagnosis.findings] == [("omega", "lift")]
+    assert not adopted.log.signals[:, OMEGA].any()
+    on_road = signals.copy()
+    on_road[:, S.AX] += vehicle.wheel_radius * 15.0 * np.cos(0.5 * t)
+    assert all(
+        fault.kind != "lift"
+        for fault in adopt_measured(replace(adopted.log, signals=on_road), vehicle).diagnosis.findings
+    )

@@ -1,0 +1,121 @@
+"""Judgement of a calibration on drives that it was not learned from.
+
+A calibration is a set of groups (radii, steering, inertial unit, clocks, torque). Each group is kept only if a car with
+it predicts held-out drives at least as well as one without: the predictive log-likelihood of the estimator's own
+innovations does not fall, and the model is not contradicted for longer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from edge_agent.calibration.learn import learn
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.vehicle import Calibration, Vehicle
+
+GROUPS: Final = {
+    "inertial unit": ("ax", "ay", "yaw_rate"),
+    "radii": ("radius_fl", "radius_fr", "radius_rl", "radius_rr"),
+    "steering": ("steer_offset", "steer_gain", "understeer"),
+    "clocks": ("wheel_lag", "steer_lag"),
+    "torque": ("force_gain",),
+}
+MOST_FOLDS: Final = 3
+LEAST_PART_S: Final = 20.0  # of a drive that is cut in two, each part
+WORSE: Final = 0.02  # [nat/s] below which a difference of predictions is rounding
+LONGER: Final = 0.005  # of the time in contradiction, likewise
+
+Drive: TypeAlias = tuple[FloatArray, FloatArray]
+"""Times (T,) [s] and signals (T, 18)."""
+
+
+class Prediction(NamedTuple):
+    """Predictive score of a car on one drive."""
+
+    log_likelihood: float  # of the innovations [nat/s]
+    contradicted: float  # share of the time
+
+
+class HeldOut(NamedTuple):
+    """The calibration to write, the groups that were left out, and predictions without and with it."""
+
+    calibration: Calibration
+    refused: list[str]
+    before: Prediction
+    after: Prediction
+    folds: int
+
+
+Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
+"""Replays a drive with a vehicle."""
+
+
+def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
+    """Learn from all drives what also helps on drives that were held out while it was learned.
+
+    Raises:
+        InputError: no drive is excited enough, or one drive is too short to hold a part out.
+    """
+    whole = learn(drives, vehicle)
+    folds = split_folds(drives)
+    candidates = []
+    judged = []
+    for taught, held in folds:
+        try:
+            candidates.append(learn(taught, vehicle))
+        except InputError:
+            continue
+        judged.append(held)
+    if not judged:
+        raise InputError("log", "no part can be held out to judge the calibration", "give two drives or a longer one")
+    before = [judge(vehicle, held) for held in judged]
+    best, kept, refused = before, list[str](), list[str]()
+    for group, names in GROUPS.items():
+        if not any(getattr(whole, name) is not None for name in names):
+            continue
+        tried = [
+            judge(vehicle.model_copy(update={"calibration": restrict(candidate, [*kept, group])}), held)
+            for candidate, held in zip(candidates, judged, strict=True)
+        ]
+        if is_worse(tried, best):
+            refused.append(group)
+        else:
+            best = tried
+            kept.append(group)
+    return HeldOut(restrict(whole, kept), refused, _mean(before), _mean(best), len(judged))
+
+
+def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
+    """Return pairs of drives to learn from and the drive to judge by; a single drive is cut in two."""
+    if len(drives) == 1:
+        t, signals = drives[0]
+        if t[-1] - t[0] < 2.0 * LEAST_PART_S:
+            return []
+        middle = int(np.searchsorted(t, 0.5 * (t[0] + t[-1])))
+        parts = [(t[:middle], signals[:middle]), (t[middle:], signals[middle:])]
+        return [([parts[0]], parts[1]), ([parts[1]], parts[0])]
+    chosen = np.unique(np.linspace(0, len(drives) - 1, min(MOST_FOLDS, len(drives))).round().astype(int))
+    return [([drive for k, drive in enumerate(drives) if k != held], drives[held]) for held in chosen.tolist()]
+
+
+def restrict(calibration: Calibration, groups: Sequence[str]) -> Calibration:
+    """Return the calibration with the quantities of some groups alone."""
+    names = {name for group in groups for name in GROUPS[group]}
+    update = {name: None for every in GROUPS.values() for name in every if name not in names}
+    return calibration.model_copy(update=update)
+
+
+def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
+    """Return True if predictions are worse on the mean of the drives, or one drive is contradicted for longer."""
+    lost = _mean(best).log_likelihood - _mean(tried).log_likelihood
+    longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))
+    return lost > WORSE or longer > LONGER
+
+
+def _mean(predictions: Sequence[Prediction]) -> Prediction:
+    likelihood = float(np.mean([prediction.log_likelihood for prediction in predictions]))
+    return Prediction(likelihood, float(np.mean([prediction.contradicted for prediction in predictions])))

@@ -1,0 +1,78 @@
+"""Front and rear wheels told apart by the road: a bump reaches the rear wheel one wheelbase after the front wheel.
+
+What the left and right wheel of an axle differ by, less its mean over some metres, is unevenness of the road and noise.
+Over the distance driven, the rear axle repeats the front one's after the wheelbase. The peak of their correlation
+there, or one wheelbase before, tells which axle is which; on a smooth road there is none.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import S
+from schemas.vehicle import Vehicle
+
+STEP_M: Final = 0.25  # of the distance over which wheel speeds are compared
+WINDOW: Final = 4.0  # wheelbases over which the mean is taken off
+FAST_M_S: Final = 5.0
+LEAST_M: Final = 300.0  # of driving
+LEAST_LIKE: Final = 0.2  # correlation of a peak
+NEAR_M: Final = 0.5  # that a peak may be off the wheelbase
+RIVAL: Final = 0.6  # share of the peak that the other direction, and other distances, stay below
+CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole or an error
+
+
+def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
+    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 where the road does not tell.
+
+    t are times (T,) [s], signals (T, 18).
+    """
+    omega = signals[:, S.OMEGA : S.OMEGA + 4]
+    good = np.isfinite(omega).all(axis=1)
+    if good.sum() < 2:
+        return 0
+    rims = np.stack([np.interp(t, t[good], omega[good, wheel]) for wheel in range(4)], axis=1) * vehicle.wheel_radius
+    speed = np.median(rims, axis=1)
+    way = np.concatenate([[0.0], np.cumsum(np.maximum(speed[:-1], 0.0) * np.diff(t))])
+    way, rows = np.unique(way, return_index=True)
+    at = np.arange(0.0, way[-1], STEP_M)
+    fast = np.interp(at, way, speed[rows]) > FAST_M_S
+    if fast.sum() * STEP_M < LEAST_M:
+        return 0
+    wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
+    front, rear = (
+        _unevenness(np.interp(at, way, (rims[:, right] - rims[:, left])[rows]), wheelbase)
+        for left, right in ((0, 1), (2, 3))
+    )
+    return _direction(front, rear, fast, wheelbase)
+
+
+def _unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
+    """Return what sides differ by (n,) less its mean over some wheelbases."""
+    width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
+    if width >= len(apart):
+        return np.zeros_like(apart)
+    return np.asarray(apart - np.convolve(apart, np.ones(width) / width, "same"))
+
+
+def _direction(front: FloatArray, rear: FloatArray, fast: BoolArray, wheelbase: float) -> int:
+    most = round(2.0 * wheelbase / STEP_M)
+    among = fast.copy()
+    among[:most] = False
+    among[len(among) - most :] = False
+    if among.sum() * STEP_M < LEAST_M or front[among].std() == 0.0 or rear[among].std() == 0.0:
+        return 0
+    limits = CLIPPED * front[among].std(), CLIPPED * rear[among].std()
+    front, rear = np.clip(front, -limits[0], limits[0]), np.clip(rear, -limits[1], limits[1])
+    lags = np.arange(-most, most + 1)
+    like = np.array([float(np.corrcoef(front[among], np.roll(rear, -lag)[among])[0, 1]) for lag in lags])
+    metres = lags * STEP_M
+    top = int(np.argmax(like))
+    near = abs(abs(metres[top]) - wheelbase) <= NEAR_M
+    mirrored = like[np.abs(metres + metres[top]) <= NEAR_M].max()
+    if not near or like[top] < LEAST_LIKE or mirrored > RIVAL * like[top]:
+        return 0
+    return 1 if metres[top] > 0.0 else -1

@@ -1,0 +1,247 @@
+"""Judgement of the estimator on recorded drives of real cars, for owners of such logs.
+
+A folder holds LOG.parquet with its vehicle file LOG.json, and optionally LOG.truth.parquet (t, vx, vy, mu, as far as
+they were measured) and LOG.meta.json (`mu_known`: friction that the surface surely had). Of the time in which a car
+moves, from the third second on:
+
+    informative    share with an interval narrower than INFORMATIVE of the prior's
+    right          of that, share whose interval meets what is known: true friction, else at least the grip in use
+    ice            share with P(slippery) > ICE although the road was not slippery
+    contradicted   share with the health flag CONTRADICTION
+    urgent         observations per hour that would be sent at once, of logs with a position
+    used           99th percentile of mu_utilised
+    vx, vy, slip   root mean square errors [m/s, m/s, deg] where there is truth
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators.estimates import Column
+from edge_agent.inputs.doctor.adopt import Adopted, prepare_log
+from edge_agent.inputs.doctor.drive import RATE_HZ, even, smooth
+from edge_agent.inputs.signal_log import SignalLog, read_log
+from edge_agent.observe.pipeline import Pipeline
+from schemas.config import AgentConfig
+from schemas.errors import InputError
+from schemas.mugrid import CENTRES
+from schemas.numeric import BoolArray, FloatArray
+from schemas.runtime.figures import Figure
+from schemas.signals import Health, S
+from schemas.thresholds import GRAVITY, SLIPPERY_MU
+from schemas.vehicle import Vehicle, load_vehicle
+
+ESTIMATOR: Final = "aco-fckf"
+BEGIN_S: Final = 3.0  # of a log that are left out
+MOVING_M_S: Final = 1.5
+FAST_M_S: Final = 3.0  # from which on sideslip is judged
+INFORMATIVE: Final = 0.6
+ICE: Final = 0.9
+GRIPS: Final = 0.6  # friction from which on a road is not slippery
+CERTAIN: Final = 0.9  # share of `mu_known` that a surface had at least
+MARGIN: Final = 0.03  # noise of the grip in use
+USED_SHARE: Final = 99.5  # percentile of the grip in use that a surface surely had
+LOOK_S: Final = 0.2  # between two looks at P(slippery)
+SMOOTH_S: Final = 0.25
+TRUTH: Final = ("vx", "vy", "mu")
+HEAD: Final = ("informative", "right", "ice", "contradicted", "urgent_per_hour", "used", "vx", "vy", "sideslip")
+
+
+@dataclass(frozen=True)
+class LogFigures:
+    """Figures of one log; NaN where the log does not tell."""
+
+    name: str
+    seconds: float
+    passed: bool
+    informative: float
+    right: float
+    ice: float
+    contradicted: float
+    urgent_per_hour: float
+    used: float
+    vx: float
+    vy: float
+    sideslip: float
+
+
+def judge_folder(folder: Path, log_line: Callable[[str], None] = lambda _: None) -> list[LogFigures]:
+    """Judge every log of a folder that has a vehicle file.
+
+    Raises:
+        InputError: the folder has no such log, or a log cannot be read.
+    """
+    paths = [
+        path
+        for path in sorted(folder.glob("*.parquet"))
+        if not path.name.endswith(".truth.parquet") and path.with_suffix(".json").exists()
+    ]
+    if not paths:
+        raise InputError("logs", f"{folder} has no LOG.parquet with LOG.json", "put each log next to its vehicle file")
+    found = []
+    for path in paths:
+        found.append(judge_log(path))
+        log_line(table_row(found[-1]))
+    return found
+
+
+def judge_log(path: Path) -> LogFigures:
+    """Replay one log and judge its estimates."""
+    adopted = prepare_log(read_log(path), load_vehicle(path.with_suffix(".json")))
+    values, slippery, urgent = replay_log(adopted.log, adopted.vehicle)
+    truth = read_truth(path, adopted.log.t)
+    meta = path.with_suffix(".meta.json")
+    known = json.loads(meta.read_text(encoding="utf-8")).get("mu_known") if meta.exists() else None
+    return judge_estimates(path.stem, adopted, (values, slippery), truth, known, urgent)
+
+
+def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, int | None]:
+    """Return estimates (T, columns), P(slippery) (T,), and the number of urgent observations.
+
+    The number is None where the log has no position.
+    """
+    pipeline = Pipeline(bank_of(ESTIMATOR, [vehicle]), 1, AgentConfig())
+    rows = max(1, round(LOOK_S / float(np.median(np.diff(log.t)))))
+    parts, slippery, urgent = [], [], 0
+    below = CENTRES < SLIPPERY_MU
+    for block in log.blocks(0, rows=rows):
+        estimates, observations, _ = pipeline.step(block)
+        urgent += int(observations.urgent.sum())
+        parts.append(estimates.values[:, 0])
+        belief = pipeline.beliefs()
+        probability = math.nan
+        if belief is not None:
+            weight = np.exp(belief[0][0])
+            probability = float(weight[below].sum() / weight.sum())
+        slippery.append(np.full(len(block.t), probability))
+    last = pipeline.finish()
+    urgent += 0 if last is None else int(last.urgent.sum())
+    located = bool(np.isfinite(log.signals[:, S.LATITUDE]).any())
+    return np.concatenate(parts), np.concatenate(slippery), urgent if located else None
+
+
+def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
+    """Return what was measured of the truth, by column, at the times of the log; NaN where nothing was."""
+    file = path.with_suffix(".truth.parquet")
+    if not file.exists():
+        return {name: np.full(len(t), np.nan) for name in TRUTH}
+    table = pq.read_table(file)
+    at = np.asarray(table["t"].to_numpy(zero_copy_only=False), float) if "t" in table.column_names else t
+    found: dict[str, FloatArray] = {}
+    for name in TRUTH:
+        if name in table.column_names:
+            found[name] = even(at, np.asarray(table[name].to_numpy(zero_copy_only=False), float), t)
+        else:
+            found[name] = np.full(len(t), np.nan)
+    return found
+
+
+def judge_estimates(
+    name: str,
+    adopted: Adopted,
+    estimates: tuple[FloatArray, FloatArray],
+    truth: dict[str, FloatArray],
+    known: float | None,
+    urgent: int | None,
+) -> LogFigures:
+    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and what is known of it."""
+    t, signals = adopted.log.t, adopted.log.signals
+    values, slippery = estimates
+    wheels = np.where(np.isfinite(signals[:, S.OMEGA : S.OMEGA + 4]), signals[:, S.OMEGA : S.OMEGA + 4], 0.0)
+    moving = (t - t[0] > BEGIN_S) & (adopted.vehicle.wheel_radius * np.median(wheels, axis=1) > MOVING_M_S)
+    width = values[:, Column.MU_UPPER] - values[:, Column.MU_LOWER]
+    told = moving & (width < INFORMATIVE * float(width[0]))
+    least = known_friction(t, signals, moving, known)
+    met = values[:, Column.MU_UPPER] >= least - MARGIN
+    exact = np.isfinite(truth["mu"])
+    inside = (values[:, Column.MU_LOWER] <= truth["mu"]) & (truth["mu"] <= values[:, Column.MU_UPPER])
+    right = np.where(exact, inside, met)
+    grips = np.where(exact, truth["mu"] >= GRIPS, known is None or known >= GRIPS)
+    contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0
+    fast = (t - t[0] > BEGIN_S) & (truth["vx"] > FAST_M_S)
+    hours = float(moving.sum()) * float(np.median(np.diff(t))) / 3600.0
+    slip = np.degrees(np.arctan2(values[:, Column.VY], values[:, Column.VX]) - np.arctan2(truth["vy"], truth["vx"]))
+    return LogFigures(
+        name=name,
+        seconds=float(t[-1] - t[0]),
+        passed=adopted.diagnosis.passed,
+        informative=share_of(told, moving),
+        right=share_of(right, told),
+        ice=share_of(slippery > ICE, moving & grips),
+        contradicted=share_of(contradicted, moving),
+        urgent_per_hour=math.nan if urgent is None or hours == 0.0 else urgent / hours,
+        used=float(np.percentile(values[moving, Column.MU_UTILISED], 99)) if moving.any() else math.nan,
+        vx=root_mean_square(values[:, Column.VX] - truth["vx"], (t - t[0] > BEGIN_S) & (truth["vx"] > 1.0)),
+        vy=root_mean_square(values[:, Column.VY] - truth["vy"], fast),
+        sideslip=root_mean_square(slip, fast),
+    )
+
+
+def known_friction(t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None) -> float:
+    """Return the friction that the surface of a log had at least: what is known of it, or what the car used."""
+    at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
+    along, across = (smooth(even(t, signals[:, channel], at), SMOOTH_S) for channel in (S.AX, S.AY))
+    used = np.hypot(along, across)[np.interp(at, t, moving.astype(float)) > 0.5] / GRAVITY
+    used = used[np.isfinite(used)]
+    felt = float(np.percentile(used, USED_SHARE)) if len(used) else 0.0
+    return max(felt, CERTAIN * known if known is not None else 0.0)
+
+
+def share_of(what: BoolArray, among: BoolArray) -> float:
+    """Return the share of `among` (T,) in which `what` (T,) holds; NaN where there is none."""
+    return float(np.mean(what[among])) if among.any() else math.nan
+
+
+def root_mean_square(error: FloatArray, among: BoolArray) -> float:
+    """Return the root mean square of errors (T,) over `among` (T,); NaN where nothing is known."""
+    some = among & np.isfinite(error)
+    return float(np.sqrt(np.mean(np.square(error[some])))) if some.any() else math.nan
+
+
+def summarise(found: Sequence[LogFigures]) -> list[Figure]:
+    """Return figures over all logs: means weighted by time, and the worst log where one log is too many."""
+    seconds = np.array([log.seconds for log in found])
+
+    def mean(name: str) -> float:
+        column = np.array([getattr(log, name) for log in found])
+        told = np.isfinite(column)
+        return float(np.average(column[told], weights=seconds[told])) if told.any() else math.nan
+
+    def worst(name: str) -> float:
+        column = [getattr(log, name) for log in found if math.isfinite(getattr(log, name))]
+        return max(column) if column else math.nan
+
+    return [
+        Figure("real.informative", mean("informative"), "1", 0.25, "more"),
+        Figure("real.right", mean("right"), "1", 0.90, "more"),
+        Figure("real.ice.worst", worst("ice"), "1", 0.01),
+        Figure("real.contradicted", mean("contradicted"), "1", 0.10),
+        Figure("real.urgent_per_hour.worst", worst("urgent_per_hour"), "1/h", 5.0),
+        Figure("real.used.worst", worst("used"), "1", 1.3),
+        Figure("real.sideslip", mean("sideslip"), "deg"),
+        Figure("real.vy", mean("vy"), "m/s"),
+        Figure("real.logs", float(len(found)), "logs"),
+        Figure("real.logs_passed", float(sum(log.passed for log in found)), "logs"),
+    ]
+
+
+def table_row(log: LogFigures) -> str:
+    """Return the figures of one log as a row of a Markdown table."""
+    cells = [f"{value:.3g}" if math.isfinite(value) else "–" for value in (asdict(log)[name] for name in HEAD)]
+    return f"| {log.name} | {log.seconds:.0f} | {'yes' if log.passed else 'no'} | {' | '.join(cells)} |"
+
+
+def table(found: Sequence[LogFigures]) -> str:
+    """Return all logs as a Markdown table."""
+    head = ["log", "seconds", "doctor passed", *(name.replace("_", " ") for name in HEAD)]
+    rows = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(table_row(log) for log in found)]
+    return "\n".join(rows)

@@ -1,0 +1,83 @@
+"""Vehicle files of common classes, for a car whose own numbers nobody has.
+
+Typical values of laden production cars with one or two persons. Stiffness is per wheel, at static load, against the
+angle of its rim: steering, bushes and roll are included, so that the front axle is softer than the rear one and every
+car understeers, by 20 to 35 mrad per g. Measured front axles of six cars have 10 to 17 times their load per radian,
+rear axles 15 to 25 (Volvo S90, VW Golf, Ferrari 250LM and others). Sizes follow the makers' data sheets of each class.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from schemas.errors import InputError
+from schemas.thresholds import GRAVITY
+
+PREFIX: Final = "class:"
+FRONT_PER_LOAD: Final = 13.0  # [1/rad] cornering stiffness over load, rim angle to side force
+REAR_PER_LOAD: Final = 20.0
+ALONG_PER_LOAD: Final = 20.0  # [1] longitudinal slip stiffness over load
+WHEEL_INERTIA: Final = 1.3  # [kg m^2]
+INERTIA_SHARE: Final = 0.97  # yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
+
+
+class Size(NamedTuple):
+    """Sizes of a class: mass [kg], arms of the axles [m], tracks [m], height of the centre of gravity [m], and so on.
+
+    `drive_front` is the share of the driving torque at the front axle, None where a class has all kinds.
+    """
+
+    mass: float
+    to_front: float
+    to_rear: float
+    track: float
+    height: float
+    radius: float
+    steering_ratio: float
+    drive_front: float | None
+
+
+CLASSES: Final = {
+    "small-car": Size(1180.0, 1.01, 1.50, 1.48, 0.53, 0.298, 15.0, 1.0),
+    "compact": Size(1450.0, 1.09, 1.55, 1.54, 0.54, 0.315, 15.0, 1.0),
+    "sedan": Size(1700.0, 1.28, 1.52, 1.58, 0.55, 0.330, 15.5, None),
+    "large-sedan": Size(2000.0, 1.42, 1.55, 1.62, 0.56, 0.345, 16.0, None),
+    "electric-sedan": Size(1900.0, 1.40, 1.48, 1.58, 0.46, 0.335, 10.5, None),
+    "suv": Size(1850.0, 1.22, 1.46, 1.60, 0.66, 0.350, 15.5, None),
+    "large-suv": Size(2350.0, 1.45, 1.50, 1.66, 0.72, 0.375, 16.5, None),
+    "van": Size(2350.0, 1.50, 1.75, 1.69, 0.76, 0.340, 17.5, None),
+    "pickup": Size(2250.0, 1.40, 1.80, 1.62, 0.72, 0.375, 17.5, 0.0),
+    "sports-car": Size(1500.0, 1.35, 1.12, 1.57, 0.46, 0.335, 14.5, 0.0),
+}  # fmt: skip
+
+
+def fields_of_class(name: str) -> dict[str, str | float | None]:
+    """Return the fields of the vehicle file of a class.
+
+    Raises:
+        InputError: there is no such class.
+    """
+    if name not in CLASSES:
+        raise InputError("vehicle", f"there is no class {name!r}", f"choose one of {', '.join(CLASSES)}")
+    size = CLASSES[name]
+    load = 0.5 * size.mass * GRAVITY / (size.to_front + size.to_rear)
+    wheel_load = 0.25 * size.mass * GRAVITY
+    mean_compliance = 0.5 * (1.0 / FRONT_PER_LOAD + 1.0 / REAR_PER_LOAD)
+    return {
+        "name": name,
+        "mass": size.mass,
+        "yaw_inertia": round(INERTIA_SHARE * size.mass * size.to_front * size.to_rear, 1),
+        "cg_to_front_axle": size.to_front,
+        "cg_to_rear_axle": size.to_rear,
+        "track_front": size.track,
+        "track_rear": size.track,
+        "cg_height": size.height,
+        "wheel_radius": size.radius,
+        "wheel_inertia": WHEEL_INERTIA,
+        "longitudinal_stiffness": round(ALONG_PER_LOAD * wheel_load),
+        "cornering_stiffness": round(wheel_load / mean_compliance),
+        "cornering_stiffness_front": round(FRONT_PER_LOAD * load * size.to_rear),
+        "cornering_stiffness_rear": round(REAR_PER_LOAD * load * size.to_front),
+        "drive_split_front": size.drive_front,
+        "steering_ratio": size.steering_ratio,
+    }

@@ -1,0 +1,85 @@
+"""Validation of a calibration on drives that it was not learned from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.calibration.held_out import (
+    Drive,
+    Prediction,
+    is_worse,
+    learn_validated,
+    restrict,
+    split_folds,
+)
+from edge_agent.calibration.learn import trace_steering
+from edge_agent.inputs.doctor.drive import prepare
+from edge_agent.lab.evaluation.planted import Recorded, drives, moved
+from schemas.errors import InputError
+from schemas.signals import S
+from schemas.vehicle import Calibration, Vehicle
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recorded:
+    """Two minutes of a car whose accelerometer is tilted."""
+    return moved([S.AX], 0.5)(drives(1, 31, rough=False, seconds=120)[0])
+
+
+def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
+    """Likelihood that only the offset of a_x changes; radii make every drive worse."""
+    known = vehicle.calibration
+    if known is None:
+        return Prediction(0.0, 0.0)
+    likelihood = (1.0 if known.ax is not None else 0.0) - (1.0 if known.radius_fl is not None else 0.0)
+    return Prediction(likelihood, 0.0)
+
+
+def test_group_that_makes_held_out_drives_worse_is_left_out(drive: Recorded) -> None:
+    half = len(drive.t) // 2
+    both = [(drive.t[:half], drive.signals[:half]), (drive.t[half:], drive.signals[half:])]
+    found = learn_validated(both, drive.vehicle, offset_judge)
+    assert found.calibration.ax is not None
+    assert found.calibration.ax[0] == pytest.approx(0.5, abs=3.0 * found.calibration.ax[1])
+    assert found.calibration.radius_fl is None
+    assert found.refused == ["radii"]
+    assert found.after.log_likelihood > found.before.log_likelihood
+
+
+def test_nothing_is_written_where_no_group_helps(drive: Recorded) -> None:
+    def refuse(vehicle: Vehicle, drive: Drive) -> Prediction:
+        return Prediction(0.0 if vehicle.calibration is None else -1.0, 0.0)
+
+    found = learn_validated([(drive.t, drive.signals)], drive.vehicle, refuse)
+    assert found.calibration == Calibration(drives=1)
+    assert found.after == found.before
+
+
+def test_short_single_drive_cannot_be_validated(drive: Recorded) -> None:
+    short = (drive.t[:3500], drive.signals[:3500])
+    assert split_folds([short]) == []
+    with pytest.raises(InputError, match="no part can be held out"):
+        learn_validated([short], drive.vehicle, offset_judge)
+
+
+def test_longer_contradiction_is_worse_whatever_the_likelihood() -> None:
+    assert is_worse([Prediction(5.0, 0.1)], [Prediction(0.0, 0.0)])
+    assert not is_worse([Prediction(0.0, 0.0)], [Prediction(0.0, 0.1)])
+
+
+def test_restriction_keeps_the_groups_that_are_named() -> None:
+    known = Calibration(drives=2, ax=(0.1, 0.1), radius_fl=(0.01, 0.001), steer_gain=(1.0, 0.1))
+    assert restrict(known, ["radii"]) == Calibration(drives=2, radius_fl=(0.01, 0.001))
+
+
+def test_understeer_and_gain_of_the_steering_are_traced_together(drive: Recorded) -> None:
+    signals = drive.signals.copy()
+    plain = trace_steering(prepare(drive.t, signals, drive.vehicle))
+    v = drive.vehicle.wheel_radius * np.nanmean(signals[:, S.OMEGA : S.OMEGA + 4], axis=1)
+    compliance = 0.002 * np.where(np.isfinite(v), v, 0.0) * signals[:, S.YAW_RATE]
+    signals[:, S.DELTA : S.DELTA + 2] += compliance[:, None]
+    soft = trace_steering(prepare(drive.t, signals, drive.vehicle))
+    assert soft["understeer"] - plain["understeer"] == pytest.approx(0.002, abs=2.0 * soft["understeer_std"])
+    assert soft["understeer"] - plain["understeer"] > 0.001
+    assert abs(soft["steer_gain"] - plain["steer_gain"]) < 2.0 * soft["steer_gain_std"]

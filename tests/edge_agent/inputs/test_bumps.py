@@ -1,0 +1,38 @@
+"""Front and rear wheels told apart by the bumps of the road."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.inputs.doctor.bumps import leading_axle
+from edge_agent.lab.simulation.presets import PRESETS
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+
+CAR = PRESETS["sedan"].vehicle
+WHEELBASE = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
+SPEED = 20.0
+
+
+def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
+    """A minute at 20 m/s: both axles roll over one road, with noise of their own."""
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 60.0, 0.01)
+    road = np.convolve(rng.normal(0.0, 1.0, 30_000), np.ones(12) / 12.0, "same")  # every 5 cm
+    signals = np.full((len(t), len(CHANNELS)), np.nan)
+    for wheel in range(4):
+        place = 100.0 + SPEED * t - (0.0 if wheel < 2 else WHEELBASE)
+        side = 1.0 if wheel % 2 else -1.0
+        uneven = bumps * side * np.interp(place, 0.05 * np.arange(len(road)), road)
+        signals[:, S.OMEGA + wheel] = (SPEED + uneven + rng.normal(0.0, 0.02, len(t))) / CAR.wheel_radius
+    return t, signals
+
+
+@pytest.mark.parametrize(("bumps", "front_first"), [(0.1, 1), (0.0, 0)])
+def test_bumps_tell_front_from_rear_and_a_smooth_road_does_not(bumps: float, front_first: int) -> None:
+    t, signals = uneven_drive(bumps)
+    assert leading_axle(t, signals, CAR) == front_first
+    exchanged = signals.copy()
+    exchanged[:, S.OMEGA : S.OMEGA + 4] = signals[:, [S.OMEGA + 2, S.OMEGA + 3, S.OMEGA, S.OMEGA + 1]]
+    assert leading_axle(t, exchanged, CAR) == -front_first
