@@ -31,7 +31,6 @@ from edge_agent.inputs.doctor.slip import (
     is_foreign,
     is_same_when_coasting,
     is_steady,
-    is_too_noisy,
     share_of_parts,
     spread_of_parts,
 )
@@ -47,7 +46,7 @@ LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
 JUMPS = 0.01  # share of readings that may jump off the other wheels
 SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
-LARGEST_AX_FAR, AVERAGED_M = 0.8, 300.0  # [m/s^2] and the way over which slopes average to less than 7 %
+LARGEST_AX_FAR, AVERAGED_M = 0.9, 300.0  # [m/s^2] and the way over which slopes average to less than 8 %
 CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
 TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
@@ -233,8 +232,6 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
                 gain *= other.factor**member.power
         off = abs(np.log(abs(gain / law.centre)))
         noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)  # of a part's gain
-        if is_too_noisy(found[name]) and name != "ground" and ground.known:  # its parts say nothing of constancy
-            continue
         within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
         if name == "ground" and off > 0.0:
             within = min(STEADY, max(0.04, 0.4 * off))
@@ -328,7 +325,7 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     beside = (drive.ay - drive.v * drive.r)[straight]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         listed.append(("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2"))
-    if axle.known and abs(abs(axle.gain) - 1.0) < 0.35 and axle.correlation > 0.75:
+    if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
         error = float(np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving])))
         if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:  # one way round, a gain is an offset as well
             error = np.inf

@@ -23,7 +23,7 @@ from schemas.vehicle import Vehicle
 LONGEST_S: Final = 0.5
 LEAST_S: Final = 10.0  # of driving
 SLOW_S: Final = 5.0  # what changes more slowly is offset and bank
-LEAST_LIKE: Final = 0.82  # correlation from which on a lag is believed
+LEAST_LIKE: Final = 0.9  # correlation from which on a lag is believed
 LEAST_RATE: Final = 1e-5  # [rad/s] of yaw; less is rounding
 ALIKE: Final = 0.02  # of two correlations
 SMOOTH_S: Final = 0.1  # of a running mean, taken twice

@@ -19,16 +19,13 @@ RADIUS_PARTS: Final = 4
 STEADY: Final = 0.4
 STEADY_SHARE: Final = 0.75
 
-AXLES_LIKE: Final = 0.4  # correlation of each axle with the yaw rate, from which on their signs count
+AXLES_LIKE: Final = 0.7  # correlation of each axle with the yaw rate, from which on their signs count
 LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
 HALF_LIKE: Final = 0.7  # correlation from which on the lag of a half counts
 LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
 LEAST_CURVATURE: Final = 0.004  # [1/m] root mean square, from which on an axle shows that it is locked
 LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
 LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's
-CALM_DOT, CALM_ACROSS = 0.3, 0.5  # [m/s^2] up to which wheels hardly slip
-CALM_S, CALM_SPREAD = 20.0, 0.02  # of such driving, in which ground speed over wheel speed is as constant as this
-QUIET_LIKE, QUIET_ERROR = 0.9, 0.1  # correlation and error of an identity on a motorway
 TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
 
 
@@ -117,18 +114,10 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
     """
     ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
     known = np.isfinite(ratio) & (drive.moving > 0)
-    calm = known & (np.abs(drive.v_dot) < CALM_DOT) & (np.abs(drive.v * drive.r) < CALM_ACROSS)
-    if calm.sum() > CALM_S * RATE_HZ and np.std(ratio[calm]) < CALM_SPREAD * abs(gain):
-        return bool(abs(float(np.median(ratio[calm])) / gain - 1.0) < CALM_SPREAD)
     for rows in (known & (drive.v_dot > 0.1), known & (drive.v_dot < -0.1)):
         if rows.sum() < 2 * RATE_HZ or abs(float(np.median(ratio[rows])) / gain - 1.0) > 0.04:
             return False
     return True
-
-
-def is_too_noisy(fit: Fit) -> bool:
-    """Return True if a drive is so quiet that the gains of its parts are mostly noise."""
-    return fit.correlation < QUIET_LIKE and fit.error > QUIET_ERROR
 
 
 def spread_of_parts(beside: FloatArray) -> float:
