@@ -100,6 +100,7 @@ ELSEWHERE = {
              "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS, "--plots": CAMPAIGN,
+                 "--logs": "test_logs_of_a_folder_are_judged_and_reported",
                  "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
                  "--only": "test_only_the_inputs_are_evaluated_where_so_asked",
                  "--paper": "test_paper_is_reproduced_and_written"},
