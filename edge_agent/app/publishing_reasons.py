@@ -10,6 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from edge_agent.inputs.block import Block
+from edge_agent.publish.publisher import Counts
 from schemas.runtime.process import LogLine
 from schemas.signals import S
 
@@ -40,8 +41,8 @@ class PublisherState(Protocol):
         ...
 
     @property
-    def is_refused(self) -> bool:
-        """Return True if a service refused records and accepted none."""
+    def counts(self) -> Counts:
+        """Return the records by kind and result."""
         ...
 
 
@@ -107,7 +108,7 @@ def reasons(
         found.append(f"the router at {where} is away: records wait on disk and are sent when it returns")
     elif publisher.unanswered_s > UNANSWERED_S:
         found.append("no service acknowledges the records: start `fleet-service run` on the same router")
-    if publisher.is_refused:
+    if any(publisher.counts.rejected.values()) and not any(publisher.counts.acknowledged.values()):
         found.append("a service refuses all records: the reason stands in its log and in its metrics")
     return found
 

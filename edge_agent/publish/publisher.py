@@ -109,11 +109,6 @@ class Publisher:
         return not all(list(self._connected.values()))
 
     @property
-    def is_refused(self) -> bool:
-        """True if a service refused records and accepted none."""
-        return any(self.counts.rejected.values()) and not any(self.counts.acknowledged.values())
-
-    @property
     def unanswered_s(self) -> float:
         """Time for which nothing sent was answered [s]."""
         return self._outbox.unanswered_s(self._clock())

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons
 from edge_agent.inputs.block import Block
+from edge_agent.publish.publisher import Counts
 from schemas.signals import CHANNELS, S
+from schemas.wire import Kind
 
 ENDPOINTS = ("tcp/127.0.0.1:7447",)
 NAMED_S = 5.0
+REFUSED = Counts(rejected={Kind.OBSERVATION: 3})
 
 
 @dataclass
@@ -23,7 +26,7 @@ class State:
     links: int = 1
     cut_off: bool = False
     unanswered_s: float = 0.0
-    is_refused: bool = False
+    counts: Counts = field(default_factory=Counts)
 
 
 class Clock:
@@ -53,7 +56,7 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
     "no router": (block(), State(links=0), [], "no router answers at tcp/127.0.0.1:7447"),
     "router away": (block(), State(cut_off=True), [], "is away"),
     "no service": (block(), State(unanswered_s=4.5), [], "no service acknowledges"),
-    "refused": (block(), State(is_refused=True), [], "refuses"),
+    "refused": (block(), State(counts=REFUSED), [], "refuses"),
 }
 
 
