@@ -25,7 +25,7 @@ from schemas.runtime.durable import open_durably
 from schemas.runtime.installing import install_command
 from schemas.runtime.palette import GRIP_RANGE, line_of, shade
 from schemas.signals import Health, S
-from schemas.thresholds import NS, SLIPPERY_MU
+from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
 PAGE, IMAGES, RECORDING = ".html", (".png", ".svg", ".pdf"), ".mcap"
 ENDINGS: Final = (PAGE, *IMAGES, RECORDING)
@@ -66,15 +66,15 @@ PANELS: Final = (
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Drive with its estimates by estimator; `title` is shown above."""
+class RecordedDrive:
+    """RecordedDrive with its estimates by estimator; `title` is shown above."""
 
     log: SignalLog
     estimates: Mapping[str, pa.Table]
     title: str
 
 
-def write_report(drive: Drive, path: Path, start_ns: int = 0) -> None:
+def write_report(drive: RecordedDrive, path: Path, start_ns: int = 0) -> None:
     """Write a report in the format of the path's ending.
 
     Raises:
@@ -97,7 +97,7 @@ def curve_of(table: pa.Table, panel: Panel) -> tuple[FloatArray, FloatArray, Flo
     if len(panel.band) == 2:
         low, high = (table[name].to_numpy().astype(np.float64) for name in panel.band)
     elif panel.band:
-        spread = 1.645 * table[panel.band[0]].to_numpy().astype(np.float64)
+        spread = Z_95 * table[panel.band[0]].to_numpy().astype(np.float64)
         low, high = value - spread, value + spread
     else:
         low, high = np.full_like(value, np.nan), np.full_like(value, np.nan)
@@ -110,7 +110,7 @@ def thin_parts(count: int) -> list[slice]:
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]
 
 
-def page_of(drive: Drive) -> str:
+def page_of(drive: RecordedDrive) -> str:
     """Return the page."""
     plots = [_plot_of(drive, panel) for panel in PANELS]
     data: dict[str, Any] = {
@@ -123,7 +123,7 @@ def page_of(drive: Drive) -> str:
     return found.replace("<!--TITLE-->", html.escape(drive.title)).replace("/*DATA*/null", text)
 
 
-def _plot_of(drive: Drive, panel: Panel) -> dict[str, Any]:
+def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
     curves, low_end, high_end = [], math.inf, -math.inf
     for name, table in drive.estimates.items():
         t, value, low, high = curve_of(table, panel)
@@ -145,7 +145,7 @@ def _plot_of(drive: Drive, panel: Panel) -> dict[str, Any]:
     return {"name": panel.name, "unit": panel.unit, "curves": curves, "ends": list(ends)}
 
 
-def _health_spans(drive: Drive) -> list[dict[str, Any]]:
+def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
     """Return the spans in which the first estimator reported a limit, by flag."""
     table = next(iter(drive.estimates.values()))
     t, flags = table["t"].to_numpy(), table["health"].to_numpy()
@@ -159,7 +159,7 @@ def _health_spans(drive: Drive) -> list[dict[str, Any]]:
     return found
 
 
-def _track_of(drive: Drive) -> dict[str, Any] | None:
+def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
     """Return the places of the drive [m from its middle] with time and the colour of the first estimator's mu."""
     position = drive.log.signals[:, [S.LATITUDE, S.LONGITUDE]].reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(position).all(axis=1))
@@ -192,7 +192,7 @@ def _least_known(values: FloatArray) -> float:
     return float(known.min()) if len(known) else math.nan
 
 
-def figure_of(drive: Drive) -> Any:  # noqa: ANN401 a figure of matplotlib, which is optional
+def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401 a figure of matplotlib, which is optional
     """Return the report as a figure of matplotlib.
 
     Raises:
@@ -236,7 +236,7 @@ def figure_of(drive: Drive) -> Any:  # noqa: ANN401 a figure of matplotlib, whic
     return drawn
 
 
-def write_recording(drive: Drive, path: Path, start_ns: int) -> None:
+def write_recording(drive: RecordedDrive, path: Path, start_ns: int) -> None:
     """Write estimates and positions as an MCAP file with JSON messages.
 
     Topics: `/ESTIMATOR/estimate` with the columns of the estimates, and `/location` (foxglove.LocationFix).
@@ -272,7 +272,7 @@ def _schema_of(name: str, message: Mapping[str, Any]) -> dict[str, Any]:
     return {"type": "object", "title": name, "properties": properties}
 
 
-def _messages_of(drive: Drive, start_ns: int) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
+def _messages_of(drive: RecordedDrive, start_ns: int) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
     """Yield time [ns], topic, schema and message."""
     for name, table in drive.estimates.items():
         columns = [field.name for field in table.schema if not field.name.startswith("mu_f") and field.name != "t"]

@@ -138,7 +138,7 @@ def _write_report(
         progress_messages.set_status(f"estimating with {name}")
         found[name] = estimate(log, vehicle, name)
     title = f"{args.log[0].name}: {vehicle.name}, {float(log.t[-1] - log.t[0]):.0f} s"
-    drive_report.write_report(drive_report.Drive(log, found, title), args.out)
+    drive_report.write_report(drive_report.RecordedDrive(log, found, title), args.out)
     return [f"note: {args.out} shows {', '.join(found)}"]
 
 
