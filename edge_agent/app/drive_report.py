@@ -1,8 +1,7 @@
-"""Report of a drive: the estimates of one or more estimators as an HTML page, an image or an MCAP file.
+"""Report of a drive: the estimates of one or more estimators as an HTML page or an image.
 
 Speed, sideslip, friction with its 90 % band, grip in use, health and the track share one time axis. The HTML page is
-one file that needs no network; pointing at a plot reads all values of that moment. The MCAP file has JSON messages with
-schemas, which Foxglove and other viewers open.
+one file that needs no network; pointing at a plot reads all values of that moment.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import html
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -25,15 +24,14 @@ from schemas.runtime.durable import open_durably
 from schemas.runtime.installing import install_command
 from schemas.runtime.palette import GRIP_RANGE, line_of, shade
 from schemas.signals import Health, S
-from schemas.thresholds import NS, SLIPPERY_MU, Z_95
+from schemas.thresholds import SLIPPERY_MU, Z_95
 
-PAGE, IMAGES, RECORDING = ".html", (".png", ".svg", ".pdf"), ".mcap"
-ENDINGS: Final = (PAGE, *IMAGES, RECORDING)
+PAGE, IMAGES = ".html", (".png", ".svg", ".pdf")
+ENDINGS: Final = (PAGE, *IMAGES)
 MOST_POINTS: Final = 1500  # of a curve on the page; more are thinned, extremes of the band kept
 WIDTH, HEIGHT, LEFT = 900, 150, 56
 _TEMPLATE: Final = Path(__file__).with_name("drive.html")
 _DEGREES: Final = 180.0 / math.pi
-_MCAP_STEP_S: Final = 0.02  # 50 Hz: faster than any eye
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class RecordedDrive:
     title: str
 
 
-def write_report(drive: RecordedDrive, path: Path, start_ns: int = 0) -> None:
+def write_report(drive: RecordedDrive, path: Path) -> None:
     """Write a report in the format of the path's ending.
 
     Raises:
@@ -85,8 +83,6 @@ def write_report(drive: RecordedDrive, path: Path, start_ns: int = 0) -> None:
             file.write(page_of(drive).encode())
     elif path.suffix in IMAGES:
         figure_of(drive).savefig(path, dpi=120)
-    elif path.suffix == RECORDING:
-        write_recording(drive, path, start_ns)
     else:
         raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(ENDINGS)}")
 
@@ -234,65 +230,3 @@ def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401 a figure of matplotl
         place.set(xlabel="east [m]", ylabel="north [m]")
     drawn.suptitle(drive.title)
     return drawn
-
-
-def write_recording(drive: RecordedDrive, path: Path, start_ns: int) -> None:
-    """Write estimates and positions as an MCAP file with JSON messages.
-
-    Topics: `/ESTIMATOR/estimate` with the columns of the estimates, and `/location` (foxglove.LocationFix).
-
-    Raises:
-        InputError: the package mcap is not installed.
-    """
-    try:
-        from mcap.writer import Writer
-    except ImportError as error:
-        raise InputError("out", "the package mcap is missing", install_command("mcap")) from error
-    with open_durably(path) as file:
-        writer = Writer(file)
-        writer.start(profile="", library="gripmap")
-        for stamp, topic, schema, message in sorted(_messages_of(drive, start_ns), key=lambda one: one[:2]):
-            _put_message(writer, stamp, topic, schema, message)
-        writer.finish()
-
-
-def _put_message(writer: Any, stamp: int, topic: str, schema: str, message: Mapping[str, Any]) -> None:  # noqa: ANN401
-    known: dict[str, int] = writer.__dict__.setdefault("gripmap_channels", {})
-    if topic not in known:
-        text = json.dumps(_schema_of(schema, message)).encode()
-        number = writer.register_schema(name=schema, encoding="jsonschema", data=text)
-        known[topic] = writer.register_channel(topic=topic, message_encoding="json", schema_id=number)
-    body = json.dumps(message, allow_nan=False).encode()
-    writer.add_message(channel_id=known[topic], log_time=stamp, publish_time=stamp, data=body)
-
-
-def _schema_of(name: str, message: Mapping[str, Any]) -> dict[str, Any]:
-    kinds = {int: "integer", float: "number", dict: "object", list: "array", str: "string"}
-    properties = {key: {"type": kinds.get(type(value), "number")} for key, value in message.items()}
-    return {"type": "object", "title": name, "properties": properties}
-
-
-def _messages_of(drive: RecordedDrive, start_ns: int) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
-    """Yield time [ns], topic, schema and message."""
-    for name, table in drive.estimates.items():
-        columns = [field.name for field in table.schema if not field.name.startswith("mu_f") and field.name != "t"]
-        columns = [column for column in columns if not column.startswith(("mu_rl", "mu_rr"))]
-        for row in table.take(_steps_of(table["t"].to_numpy())).to_pylist():
-            values = {key: float(row[key]) for key in columns if row[key] is not None and math.isfinite(row[key])}
-            yield start_ns + round(row["t"] * NS), f"/{name}/estimate", "gripmap.Estimate", values
-    for k in _steps_of(drive.log.t):
-        latitude, longitude = (float(drive.log.signals[k, channel]) for channel in (S.LATITUDE, S.LONGITUDE))
-        if math.isfinite(latitude) and math.isfinite(longitude):
-            stamp = start_ns + round(float(drive.log.t[k]) * NS)
-            when = {"sec": stamp // NS, "nsec": stamp % NS}
-            fix = {"timestamp": when, "frame_id": "vehicle", "latitude": latitude, "longitude": longitude}
-            yield stamp, "/location", "foxglove.LocationFix", {**fix, "altitude": 0.0}
-
-
-def _steps_of(t: FloatArray) -> Sequence[int]:
-    """Return the rows that are at least _MCAP_STEP_S apart."""
-    kept: list[int] = []
-    for k, at in enumerate(t.tolist()):
-        if not kept or at - t[kept[-1]] >= _MCAP_STEP_S - 1e-9:
-            kept.append(k)
-    return kept

@@ -124,19 +124,22 @@ def _more(names: str | None) -> list[str]:
     return [] if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
-def _write_report(
-    args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]
-) -> list[str]:
+def _write_report(args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]) -> list[str]:
     """Estimate with each estimator, write the report, and return notes."""
+    import pyarrow as pa
+
     from edge_agent.app import drive_report
     from edge_agent.app.estimates_file import writable
-    from edge_agent.app.library import estimate
+    from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.app.library import to_table
 
     writable("out", args.out)
     found = {}
     for name in dict.fromkeys(names):
         progress_messages.set_status(f"estimating with {name}")
-        found[name] = estimate(log, vehicle, name)
+        bank = bank_of(name, [vehicle])
+        parts = [to_table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
+        found[name] = pa.concat_tables(parts)
     title = f"{args.log[0].name}: {vehicle.name}, {float(log.t[-1] - log.t[0]):.0f} s"
     drive_report.write_report(drive_report.RecordedDrive(log, found, title), args.out)
     return [f"note: {args.out} shows {', '.join(found)}"]

@@ -39,7 +39,9 @@ _NOT: Final = {  # options of another kind of export
     **dict.fromkeys(WHAT, (*_LIVE, *_TABLE, *_ROADS)),
     DATEX: ("archive", *_PART, *_TABLE, *_ROADS),
     ICEBERG: (*_LIVE, *_PART, *_ROADS, "out", "snapshot"),
-    **dict.fromkeys(ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "last", "snapshot")),
+    **dict.fromkeys(
+        ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "last", "snapshot")
+    ),
 }
 _NEEDS: Final = {
     **dict.fromkeys(WHAT, ("archive", "out")),
