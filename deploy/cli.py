@@ -15,7 +15,11 @@ COMMANDS: Final = (
     Command("router", "deploy.router", "run a Zenoh router until a signal",
             "gripmap router --listen tcp/0.0.0.0:7447"),
 )  # fmt: skip
-LINE: Final = ("gripmap", "GripMap on one machine; see also edge-agent and fleet-service.", COMMANDS)
+LINE: Final = (
+    "gripmap",
+    "GripMap on one machine; see also edge-agent and fleet-service.",
+    COMMANDS,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -17,7 +17,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument("--duration", type=float, default=150.0, help="seconds of driving (default 150)")
     parser.add_argument("--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)")
-    parser.add_argument("--warned", type=float, default=0.5, help="share of the drivers who hear the map (default 0.5)")
+    parser.add_argument(
+        "--warned",
+        type=float,
+        default=0.5,
+        help="share of the drivers who hear the map (default 0.5)",
+    )
     parser.add_argument("--stay", action="store_true", help="keep map and page running after it, until Ctrl-C")
     parser.add_argument("--open", action="store_true", help="open the page in the browser of this machine")
     parser.add_argument("--page-port", type=int, default=8080, help="of the live page; 0: a free one (default 8080)")

@@ -58,7 +58,11 @@ The observations, as any Parquet reader sees them:
 
 
 def report(
-    folder: Path, comparison: compare.MapComparison, measured: list[figures.Figure], grip: compare.LostGrip, seed: int
+    folder: Path,
+    comparison: compare.MapComparison,
+    measured: list[figures.Figure],
+    grip: compare.LostGrip,
+    seed: int,
 ) -> list[figures.Figure]:
     """Write and print all figures, draw the map next to the truth and the passes that lost grip; return the figures."""
     found = [*measured, *grip.figures()]

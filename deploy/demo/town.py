@@ -20,7 +20,7 @@ import numpy as np
 
 from edge_agent.lab.simulation.roads import Road, rounded
 from edge_agent.lab.simulation.scenarios import Scenario
-from fleet_service.page.vector_tiles import EXTENT, LINE, POINT, POLYGON, Shape, encode_tile
+from fleet_service.page.vector_tiles import EXTENT, LINE, POINT, POLYGON, TileShape, encode_tile
 from schemas.numeric import FloatArray
 
 NAME: Final = "Frostberg"
@@ -29,9 +29,15 @@ ZOOMS: Final = range(11, 17)
 AROUND_M: Final = 900.0  # of the town's middle that the map covers
 BUFFER: Final = 256  # units beyond a tile's edge, so that no line ends at it
 STREETS: Final = (
-    "Kyrkogatan", "Brogatan", "Kvarngatan", "Sjögatan", "Norra Ringvägen", "Östra Ringvägen", "Södra Ringvägen",
+    "Kyrkogatan",
+    "Brogatan",
+    "Kvarngatan",
+    "Sjögatan",
+    "Norra Ringvägen",
+    "Östra Ringvägen",
+    "Södra Ringvägen",
     "Västra Ringvägen",
-)  # fmt: skip
+)
 CLEAR_M: Final = 9.0  # between a street's centre and a house
 HOUSES: Final = 420
 LAKE: Final = (-330.0, -330.0, 150.0, 105.0)  # x, y, radii [m]
@@ -132,7 +138,11 @@ def write(scenario: Scenario, folder: Path) -> tuple[Path, Path]:
 
 def _roads(scenario: Scenario, found: StreetPlan) -> dict[str, object]:
     def feature(shape: str, coordinates: object, **about: str) -> dict[str, object]:
-        return {"type": "Feature", "geometry": {"type": shape, "coordinates": coordinates}, "properties": about}
+        return {
+            "type": "Feature",
+            "geometry": {"type": shape, "coordinates": coordinates},
+            "properties": about,
+        }
 
     def degrees(line: FloatArray) -> list[list[float]]:
         latitude, longitude = scenario.to_latlon(line[:, 0], line[:, 1])
@@ -156,9 +166,13 @@ def _write_tiles(scenario: Scenario, found: StreetPlan, path: Path) -> None:
         table.execute("create table metadata (name text, value text)")
         table.execute("create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)")
         about = {
-            "name": NAME, "format": "pbf", "attribution": ATTRIBUTION, "minzoom": str(ZOOMS[0]),
-            "maxzoom": str(ZOOMS[-1]), "type": "baselayer",
-        }  # fmt: skip
+            "name": NAME,
+            "format": "pbf",
+            "attribution": ATTRIBUTION,
+            "minzoom": str(ZOOMS[0]),
+            "maxzoom": str(ZOOMS[-1]),
+            "type": "baselayer",
+        }
         table.executemany("insert into metadata values (?, ?)", about.items())
         for zoom in ZOOMS:
             box = _world(scenario, corners) * 2**zoom
@@ -175,20 +189,26 @@ def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> b
         at = (_world(scenario, line) * 2**zoom - (x, y)) * _PER_TILE
         return [(int(px), int(py)) for px, py in np.rint(at)]
 
-    layers: dict[str, list[Shape]] = {"park": [], "water": [], "building": [], "transportation": [], "place": []}
+    layers: dict[str, list[TileShape]] = {
+        "park": [],
+        "water": [],
+        "building": [],
+        "transportation": [],
+        "place": [],
+    }
     for layer, outline in found.areas:
         ring = units(outline)
         if _touches(ring) and (layer != "building" or zoom >= 14):
-            layers[layer].append(Shape(POLYGON, [ring], {"class": layer}))
+            layers[layer].append(TileShape(POLYGON, [ring], {"class": layer}))
     for name, line, kind in found.streets:
         for part in _inside(units(line)):
-            layers["transportation"].append(Shape(LINE, [part], {"class": kind, "name": name}))
+            layers["transportation"].append(TileShape(LINE, [part], {"class": kind, "name": name}))
     for layer, name, px, py in found.names:
         (point,) = units(np.array([[px, py]]))
         if min(point) >= 0 and max(point) < EXTENT:
             kind = "town" if layer == "place" else "lake"
             layers.setdefault("place" if layer == "place" else "water_name", []).append(
-                Shape(POINT, [[point]], {"class": kind, "name": name})
+                TileShape(POINT, [[point]], {"class": kind, "name": name})
             )
     return encode_tile(layers)
 

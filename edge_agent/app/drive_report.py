@@ -24,7 +24,7 @@ from schemas.runtime.durable import open_durably
 from schemas.runtime.installing import install_command
 from schemas.runtime.palette import GRIP_RANGE, line_of, shade
 from schemas.signals import Health, S
-from schemas.thresholds import SLIPPERY_MU, Z_95
+from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
 PAGE, IMAGES = ".html", (".png", ".svg", ".pdf")
 ENDINGS: Final = (PAGE, *IMAGES)
@@ -110,10 +110,16 @@ def page_of(drive: RecordedDrive) -> str:
     """Return the page."""
     plots = [_plot_of(drive, panel) for panel in PANELS]
     data: dict[str, Any] = {
-        "title": drive.title, "plots": plots, "health": _health_spans(drive), "track": _track_of(drive),
-        "width": WIDTH, "height": HEIGHT, "left": LEFT, "slippery": SLIPPERY_MU,
+        "title": drive.title,
+        "plots": plots,
+        "health": _health_spans(drive),
+        "track": _track_of(drive),
+        "width": WIDTH,
+        "height": HEIGHT,
+        "left": LEFT,
+        "slippery": SLIPPERY_MU,
         "estimators": [{"name": name, "colour": line_of(name).colour} for name in drive.estimates],
-    }  # fmt: skip
+    }
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no value can end or open a tag
     found = _TEMPLATE.read_text(encoding="utf-8")
     return found.replace("<!--TITLE-->", html.escape(drive.title)).replace("/*DATA*/null", text)
@@ -163,8 +169,8 @@ def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
         return None
     rows = known[:: max(1, len(known) // MOST_POINTS)]
     latitude, longitude = position[rows].T
-    x = (longitude - longitude.mean()) * math.cos(math.radians(float(latitude.mean()))) * 111_195.0
-    y = (latitude - latitude.mean()) * 111_195.0
+    x = (longitude - longitude.mean()) * math.cos(math.radians(float(latitude.mean()))) * METRES_PER_DEGREE
+    y = (latitude - latitude.mean()) * METRES_PER_DEGREE
     table = next(iter(drive.estimates.values()))
     t = drive.log.t[rows]
     at = np.clip(np.searchsorted(table["t"].to_numpy(), t), 0, table.num_rows - 1)

@@ -38,9 +38,15 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
         latitude, longitude = (box[1] + box[3]) / 2, (box[0] + box[2]) / 2
         alerts = sum(_inside(box, one["longitude"], one["latitude"]) for one in standing)
         found.append(
-            {"name": _name(latitude, longitude, named), "box": box, "latitude": latitude, "longitude": longitude,
-             "cells": len(own), "alerts": alerts}
-        )  # fmt: skip
+            {
+                "name": _name(latitude, longitude, named),
+                "box": box,
+                "latitude": latitude,
+                "longitude": longitude,
+                "cells": len(own),
+                "alerts": alerts,
+            }
+        )
     return sorted(found, key=lambda one: (-one["alerts"], -one["cells"]))[:MOST]
 
 

@@ -19,9 +19,12 @@ MBTILES, PMTILES = ".mbtiles", ".pmtiles"
 OWN: Final = "/base/{z}/{x}/{y}"  # address of the tiles of a file
 VECTOR: Final = "pbf"
 KINDS: Final = {
-    "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "webp": "image/webp",
+    "png": "image/png",
+    "jpg": "image/jpeg",
+    "jpeg": "image/jpeg",
+    "webp": "image/webp",
     VECTOR: "application/vnd.mapbox-vector-tile",
-}  # fmt: skip
+}
 ZOOMS: Final = (0, 19)  # that an address answers: as far as the public ones go
 DEEPEST: Final = 30
 _TAG: Final = re.compile(r"<[^>]*>")
@@ -121,4 +124,8 @@ def base_map(text: str, attribution: str | None = None) -> BaseMap:
 
 
 def _refused(problem: str) -> InputError:
-    return InputError("base_map", problem, "write https://HOST/{z}/{x}/{y}.png, or name an .mbtiles or .pmtiles file")
+    return InputError(
+        "base_map",
+        problem,
+        "write https://HOST/{z}/{x}/{y}.png, or name an .mbtiles or .pmtiles file",
+    )

@@ -44,8 +44,19 @@ def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) ->
 def as_json() -> dict[str, Any]:
     """Return the palette for the page, for light and for dark ground."""
     light = {"four": FOUR, "two": TWO, "little": LITTLE, "ground": GROUND, "alert": ALERT}
-    dark = {"four": DARK_FOUR, "two": DARK_TWO, "little": DARK_LITTLE, "ground": DARK_GROUND, "alert": DARK_ALERT}
+    dark = {
+        "four": DARK_FOUR,
+        "two": DARK_TWO,
+        "little": DARK_LITTLE,
+        "ground": DARK_GROUND,
+        "alert": DARK_ALERT,
+    }
     return {
-        "narrow": NARROW, "middling": MIDDLING, "edges": EDGES, "slippery": SLIPPERY_MU, "known": KNOWN_SLIPPERY,
-        "light": light, "dark": dark,
-    }  # fmt: skip
+        "narrow": NARROW,
+        "middling": MIDDLING,
+        "edges": EDGES,
+        "slippery": SLIPPERY_MU,
+        "known": KNOWN_SLIPPERY,
+        "light": light,
+        "dark": dark,
+    }

@@ -22,7 +22,12 @@ AHEAD: Final = 3  # cells to the next one of a learned line: what nobody reporte
 SMOOTHED: Final = 5  # cells, centred: two lanes and a receiver's error make the raw line zigzag
 LEAST_CELLS: Final = 3  # of a learned line; fewer have no direction
 MOST_LINES: Final = 50_000
-_STEP: Final = ((1, 0), (0, -1), (-1, 0), (0, 1))  # column and row of the next cell, by sector: east, north, …
+_STEP: Final = (
+    (1, 0),
+    (0, -1),
+    (-1, 0),
+    (0, 1),
+)  # column and row of the next cell, by sector: east, north, …
 
 
 class Line(NamedTuple):

@@ -26,7 +26,7 @@ _NO_COMPRESSION, _GZIP_COMPRESSION, _MVT = 1, 2, 1
 _MOST_DIRECTORY: Final = 16 << 20
 
 
-class Shape(NamedTuple):
+class TileShape(NamedTuple):
     """Shape of a layer: points, lines or rings in units of the tile (EXTENT across, y down), and its tags."""
 
     kind: int
@@ -34,12 +34,12 @@ class Shape(NamedTuple):
     tags: Mapping[str, str | int]
 
 
-def encode_tile(layers: Mapping[str, Iterable[Shape]]) -> bytes:
+def encode_tile(layers: Mapping[str, Iterable[TileShape]]) -> bytes:
     """Return a tile of these layers; a layer without shapes is left out."""
     return b"".join(_field(3, _layer(name, list(shapes))) for name, shapes in layers.items() if shapes)
 
 
-def _layer(name: str, shapes: list[Shape]) -> bytes:
+def _layer(name: str, shapes: list[TileShape]) -> bytes:
     keys: dict[str, int] = {}
     values: dict[str | int, int] = {}
     found = [_number(15, 2), _field(1, name.encode())]
@@ -55,7 +55,7 @@ def _layer(name: str, shapes: list[Shape]) -> bytes:
     return b"".join([*found, _number(5, EXTENT)])
 
 
-def _commands(shape: Shape) -> bytes:
+def _commands(shape: TileShape) -> bytes:
     out, x, y = [], 0, 0
 
     def move_to(points: Sequence[tuple[int, int]]) -> None:

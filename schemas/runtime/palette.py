@@ -24,7 +24,12 @@ GRIP: Final = (
     "#f47a3d", "#f58e3e", "#f6a03e", "#f6b23f", "#f5c43f", "#f4d53e", "#f2e63e", "#f6ec73", "#f7f2a0",
 )  # fmt: skip
 GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
-SURFACES: Final = {"ice": 0.15, "snow": 0.35, "wet": 0.6, "dry": 0.9}  # peak adhesion that a reader knows them by
+SURFACES: Final = {
+    "ice": 0.15,
+    "snow": 0.35,
+    "wet": 0.6,
+    "dry": 0.9,
+}  # peak adhesion that a reader knows them by
 HATCH: Final = "//////"  # of what was not measured, on white
 UNKNOWN: Final = "not measured: only lower bounds"
 

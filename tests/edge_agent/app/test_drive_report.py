@@ -12,7 +12,14 @@ import pyarrow as pa
 import pytest
 
 from edge_agent.app import drive_report
-from edge_agent.app.drive_report import MOST_POINTS, PANELS, RecordedDrive, curve_of, page_of, write_report
+from edge_agent.app.drive_report import (
+    MOST_POINTS,
+    PANELS,
+    RecordedDrive,
+    curve_of,
+    page_of,
+    write_report,
+)
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, Health, S
@@ -26,10 +33,13 @@ def drive_of(*names: str, rows: int = ROWS, wide: bool = False) -> RecordedDrive
     t = np.arange(rows) * 0.01
     columns: dict[str, Any] = {name: np.full(rows, 0.1) for name in ESTIMATES_SCHEMA.names}
     columns |= {
-        "t": t, "vx": 10.0 + np.sin(t), "mu": np.full(rows, 0.3), "mu_lower": np.full(rows, 0.1 if wide else 0.25),
+        "t": t,
+        "vx": 10.0 + np.sin(t),
+        "mu": np.full(rows, 0.3),
+        "mu_lower": np.full(rows, 0.1 if wide else 0.25),
         "mu_upper": np.full(rows, 1.1 if wide else 0.35),
         "health": np.where(t > 20, Health.NO_POSITION.value, 0).astype(np.int32),
-    }  # fmt: skip
+    }
     table = pa.table(columns).cast(ESTIMATES_SCHEMA)
     signals = np.full((rows, len(CHANNELS)), np.nan)
     signals[:, S.LATITUDE] = 57.7 + t * 1e-5

@@ -49,7 +49,12 @@ def block(position: bool = True, wheels: float = 20.0) -> Block:
 
 CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
     "silent source": (block(), State(), ["can0 is silent for 3 s"], "is silent"),
-    "doctor has not passed": (block(), State(), ["the signal doctor: has not passed the signals yet"], "doctor"),
+    "doctor has not passed": (
+        block(),
+        State(),
+        ["the signal doctor: has not passed the signals yet"],
+        "doctor",
+    ),
     "no position": (block(position=False), State(), [], "no position"),
     "no wheel speed": (block(wheels=float("nan")), State(), [], "no wheel speed"),
     "standing": (block(wheels=0.0), State(), [], "stands"),

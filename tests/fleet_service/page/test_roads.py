@@ -55,13 +55,19 @@ def test_lines_of_a_file_have_names_and_directions(tmp_path: Path) -> None:
     path = tmp_path / "roads.geojson"
 
     def feature(shape: str, coordinates: object, **about: str) -> dict[str, object]:
-        return {"type": "Feature", "geometry": {"type": shape, "coordinates": coordinates}, "properties": about}
+        return {
+            "type": "Feature",
+            "geometry": {"type": shape, "coordinates": coordinates},
+            "properties": about,
+        }
 
     line = [[11.0, 57.0], [11.1, 57.0]]
     features = [
-        feature("LineString", line, name="One"), feature("MultiLineString", [line, line], oneway="yes"),
-        feature("Point", [11.0, 57.0], name="Town"), feature("Point", [11.0, 57.0]),
-    ]  # fmt: skip
+        feature("LineString", line, name="One"),
+        feature("MultiLineString", [line, line], oneway="yes"),
+        feature("Point", [11.0, 57.0], name="Town"),
+        feature("Point", [11.0, 57.0]),
+    ]
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     found = read_roads(path)
     assert [(one.name, one.directions) for one in found.lines] == [("One", 3), ("", 1), ("", 1)]

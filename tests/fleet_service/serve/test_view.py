@@ -21,9 +21,16 @@ def belief_around(mu: float, std: float) -> FloatArray:
 def seen(belief: FloatArray, values: float) -> CellView:
     one = np.ones(1, np.int64)
     return CellView(
-        one * CELL, one * 2, belief[None], np.array([values], np.float32), one * 9, one * 20,
-        one * START, one * START, np.zeros(1, bool),
-    )  # fmt: skip
+        one * CELL,
+        one * 2,
+        belief[None],
+        np.array([values], np.float32),
+        one * 9,
+        one * 20,
+        one * START,
+        one * START,
+        np.zeros(1, bool),
+    )
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.2, 0.3])

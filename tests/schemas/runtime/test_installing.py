@@ -14,9 +14,15 @@ from schemas.runtime.installing import install_command
 @pytest.mark.parametrize(
     ("origin", "command"),
     [
-        ({"url": "file:///src/grip", "dir_info": {"editable": True}}, "pip install --editable '/src/grip[page]'"),
+        (
+            {"url": "file:///src/grip", "dir_info": {"editable": True}},
+            "pip install --editable '/src/grip[page]'",
+        ),
         ({"url": "file:///src/grip", "dir_info": {}}, "pip install '/src/grip[page]'"),
-        ({"url": "file:///d/g.whl", "archive_info": {}}, "pip install 'gripmap[page] @ file:///d/g.whl'"),
+        (
+            {"url": "file:///d/g.whl", "archive_info": {}},
+            "pip install 'gripmap[page] @ file:///d/g.whl'",
+        ),
         (None, "pip install '.[page]' in a checkout, or the wheel with [page]"),
     ],
 )
@@ -32,7 +38,9 @@ def test_the_hint_installs_from_the_same_place(
     assert install_command("page") == command
 
 
-def test_a_source_tree_that_was_never_installed_has_a_hint_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_tree_that_was_never_installed_has_a_hint_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def missing(_: str) -> None:
         raise metadata.PackageNotFoundError
 
