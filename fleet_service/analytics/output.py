@@ -114,7 +114,7 @@ def add_places(table: pa.Table) -> pa.Table:
     if "cell" not in names or "latitude" in names or "west" in names:
         return table
     known = table["cell"].is_valid().to_numpy()
-    cells = np.where(known, table["cell"].fill_null(0).to_numpy(), 0).astype(np.int64)
+    cells = np.array([cell or 0 for cell in table["cell"].to_pylist()], np.int64)
     for name, values in zip(("latitude", "longitude"), grid.centre(cells), strict=True):
         table = table.append_column(name, pa.array(np.round(values, 6), mask=~known))
     return table

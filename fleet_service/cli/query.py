@@ -65,8 +65,8 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
     whole = map_client.ask(map_client.settings(arguments.connect, arguments.config), {}).table
     if whole is None or not whole.num_rows:
         return
-    ends = ((min, "west"), (min, "south"), (max, "east"), (max, "north"))
-    box = [least_or_most(whole[name].to_pylist()) for least_or_most, name in ends]
+    west_end, south_end, east_end, north_end = (whole[name].to_numpy() for name in ("west", "south", "east", "north"))
+    box = [float(west_end.min()), float(south_end.min()), float(east_end.max()), float(north_end.max())]
     words = "no cell lies in this box; the map covers --bbox " + ",".join(f"{side:.3f}" for side in box)
     west, south, east, north = (float(side) for side in arguments.bbox.split(","))
     if box[0] < north and box[2] > south and box[1] < east and box[3] > west:

@@ -22,6 +22,7 @@ from edge_agent.app.drive_report import (
 )
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.errors import InputError
+from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, Health, S
 from schemas.tables import ESTIMATES_SCHEMA
 
@@ -30,7 +31,7 @@ START_NS = 1_700_000_000 * 10**9
 
 
 def drive_of(*names: str, rows: int = ROWS, wide: bool = False) -> RecordedDrive:
-    t = np.arange(rows) * 0.01
+    t: FloatArray = np.arange(rows, dtype=np.float64) * 0.01
     columns: dict[str, Any] = {name: np.full(rows, 0.1) for name in ESTIMATES_SCHEMA.names}
     columns |= {
         "t": t,
