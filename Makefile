@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 PAPERS := .venv/.papers
+LIGHT := .venv/.light
 ONLY ?=
 
 # two processes more than cores, because many tests wait for processes of their own
@@ -35,8 +36,15 @@ $(PAPERS): $(STAMP)
 	$(BIN)/python -m deploy.precompile papers
 	touch $@
 
-demo: setup  #= router, service and simulated cars; prints the address of the live map
-	$(BIN)/python -m deploy.demo $(ARGS)
+demo: $(LIGHT)  ## router, service, page and simulated cars; prints the address of the live map
+	$(BIN)/gripmap demo $(ARGS)
+
+# what the demo needs, and nothing for developers
+$(LIGHT): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[demo,page]'
+	$(BIN)/python -m deploy.precompile
+	touch $@
 
 test: $(PAPERS)  ## tests that take seconds
 	$(TESTS) --durations 10 -m 'not long and not campaign'

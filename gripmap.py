@@ -50,6 +50,14 @@ def __dir__() -> list[str]:
     return sorted({name for face in FACES for name in importlib.import_module(face).__all__})
 
 
+def gripmap_main() -> NoReturn:
+    """Run `gripmap`."""
+    from deploy.cli import main
+    from schemas.runtime.process import force_exit
+
+    force_exit(main())
+
+
 def edge_agent_main() -> NoReturn:
     """Run `edge-agent`."""
     from edge_agent.cli import main

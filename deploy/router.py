@@ -1,4 +1,4 @@
-"""Zenoh router in a process of its own: `python -m deploy.router [--config FILE] [--listen ENDPOINT]`.
+"""Zenoh router in a process of its own: `gripmap router [--config FILE] [--listen ENDPOINT]`.
 
 The Python package of Zenoh contains the router, so no other binary is needed. It prints `router: tcp/…` when it listens
 (with the real port if port 0 was given) and ends on SIGINT or SIGTERM.
@@ -61,16 +61,25 @@ def open_router(config: Path = CONFIG, listen: str | Sequence[str] | None = None
     return session, list(json.loads(reply.payload.to_string())["locators"])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a router until a signal ends it."""
-    parser = argparse.ArgumentParser(prog="deploy.router", description="A Zenoh router for GripMap.")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)")
     parser.add_argument(
         "--listen", nargs="+", help="endpoints instead of the file's, e.g. tcp/127.0.0.1:0 for a free port"
     )
     parser.add_argument("--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port")
     parser.add_argument("--metrics-host", default="127.0.0.1", help="listen address of it (default 127.0.0.1)")
-    args = parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a router until a signal ends it."""
+    parser = argparse.ArgumentParser(prog="deploy.router", description="A Zenoh router for GripMap.")
+    add_arguments(parser)
+    return run(parser.parse_args(argv))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a router until a signal ends it."""
     # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's main thread.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:

@@ -1,6 +1,7 @@
 """Errors that a person or another program can act on.
 
 InputError          misuse or bad input: names the field and the fix (exit code 2 at the command line)
+├── UnreachableError  nobody answers where an answer was expected (exit code 1)
 └── WireError       a payload that is not the message it claims to be (a counted refusal in the service)
 """
 
@@ -22,6 +23,10 @@ class InputError(ValueError):
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), (self.field, self.problem, self.fix)
+
+
+class UnreachableError(InputError):
+    """A router or service that does not answer: the input may be right, and a later try may succeed."""
 
 
 class WireError(InputError):

@@ -100,5 +100,9 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
         name = str(first["loc"][0])
         unknown, own = first["type"] == "extra_forbidden", first["type"] == "value_error"
         because = f" ({first['msg'].removeprefix('Value error, ')})" if own else ""
+        if not unknown and "&" in parameters[name]:
+            raise InputError(
+                name[:60], "holds a '&'", "part the parameters by ';', as in bbox=W,S,E,N;format=json"
+            ) from error
         problem = "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
         raise InputError(name[:60], problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error

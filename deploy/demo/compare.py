@@ -25,20 +25,28 @@ from schemas.runtime.figures import Figure
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 from schemas.wire import Alert, Kind
 
+PASSES: Final = "demo.passes"
+ENOUGH: Final = 20  # passes that make a share worth reading
 DELAY: Final = "demo.alert.delay_passes"
+WALL: Final = "demo.wall_s"
 COVERAGE: Final = "demo.map.coverage90"
 WIDEST: Final = 0.99  # coverage of a map that is not too shy
 PASS_GAP_NS: Final = 10_000_000_000  # visits of a vehicle that are further apart are of two passes
+NEVER: Final = int(np.iinfo(np.int64).max)
 BORDER_MU: Final = 0.1  # visits to one cell differ by less where a surface ends in it
 LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def works(found: Sequence[Figure]) -> bool:
-    """Return True if the demo did its work; a late alert or a wide map does not count as a failure."""
+    """Return True if the demo did its work.
+
+    A late alert, a wide map, few passes or a busy machine do not count as a failure.
+    """
 
     def breaks(figure: Figure) -> bool:
         wide = figure.name == COVERAGE and figure.value > WIDEST
-        return not (figure.holds or figure.name == DELAY or wide)
+        goal = figure.name in (DELAY, WALL) or figure.name.startswith(PASSES)
+        return not (figure.holds or goal or wide)
 
     return not any(map(breaks, found))
 
@@ -106,22 +114,39 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 
 
 def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int) -> float:
-    """Return the excited passes over the new patch until its first alert; infinite without one.
+    """Return the excited passes over a new patch until its first alert, the median of all patches.
+
+    A patch without an alert counts as infinite; cells within LINK_CELLS of each other are one patch.
 
     Args:
         visits: the truth.
-        patch: (visits,) True for visits to a cell of the patch after it had appeared.
+        patch: (visits,) True for visits to a cell of a patch after it had appeared.
         alerts: (time of receipt [ns], alert).
         changed_ns: time at which the patch appeared.
     """
-    cells = set(visits["cell"].filter(pa.array(patch)).to_pylist())
-    heard = [at for at, alert in alerts if alert.raised and alert.cell in cells and at >= changed_ns]
-    if not heard:
-        return float("inf")
     left: IntArray = visits["leave_time"].cast(pa.int64()).to_numpy()
     excited = visits["utilisation"].to_numpy() >= EXCITED_SHARE
-    rows = visits.filter(pa.array(patch & excited & (left <= min(heard))))
-    return float(passes(rows))
+    cell = visits["cell"].to_numpy()
+    delays = []
+    for cells, known in known_patches(visits, patch, alerts, changed_ns):
+        rows = visits.filter(pa.array(patch & excited & np.isin(cell, cells) & (left <= known)))
+        delays.append(float(passes(rows)) if known < NEVER else float("inf"))
+    return float(np.median(delays)) if delays else float("inf")
+
+
+def known_patches(
+    visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
+) -> list[tuple[IntArray, int]]:
+    """Return the cells of each patch and the time of its first alert [ns], NEVER without one."""
+    cells = np.unique(visits["cell"].to_numpy()[patch])
+    label = link_cells(cells)
+    found = []
+    for number in range(int(label.max(initial=-1)) + 1):
+        own = cells[label == number]
+        inside = set(own.tolist())
+        heard = [at for at, one in alerts if one.raised and one.cell in inside and at >= changed_ns]
+        found.append((own, min(heard, default=NEVER)))
+    return found
 
 
 def passes(rows: pa.Table) -> int:
@@ -148,12 +173,12 @@ def figures(
         Figure("demo.vehicles", vehicles, "", 30, "more"),
         Figure(COVERAGE, _mean(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
-        Figure(DELAY, delay_passes(visits, patch, alerts, changed_ns), "passes", 4),
+        Figure(DELAY, delay_passes(visits, patch, alerts, changed_ns), "passes, median of the new patches", 3),
         Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
         Figure("demo.alerts.per_stretch", per_stretch(alerts, visits), "per icy stretch and direction", 2),
         Figure("demo.observations.unacknowledged", counts["observations_unsettled"], "", 0),
         Figure("demo.observations.duplicates", rows - distinct, "", 0),
-        Figure("demo.wall_s", wall_s, "s", 240),
+        Figure(WALL, wall_s, "s", 240),
         Figure("demo.observations", rows, ""),
         Figure("demo.map.cells", len(comparison.cells), ""),
         Figure("demo.map.cells_measured", int(value.sum()), "with two or more vehicles"),
@@ -162,8 +187,8 @@ def figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Passes over the new ice since its first alert, one per row: whether the driver was warned and a wheel lost its
-    grip.
+    """Passes over the new ice since the first alert of its patch, one per row: whether the driver was warned and a
+    wheel lost its grip.
 
     `cell` is where it was lost, or the first of the pass.
     """
@@ -178,7 +203,11 @@ class LostGrip:
         shares = [
             Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes") for name, rows in kinds if rows.any()
         ]  # of no pass there is no share
-        return shares + [Figure(f"demo.passes.{name}", int(rows.sum()), "over new ice") for name, rows in kinds]
+        counts = [int(rows.sum()) for _, rows in kinds]
+        return shares + [
+            Figure(f"{PASSES}.{name}", count, "over new ice", ENOUGH, "more")
+            for (name, _), count in zip(kinds, counts, strict=True)
+        ]
 
     def line(self) -> str:
         """Return the result as one line."""
@@ -188,10 +217,11 @@ class LostGrip:
 
 
 def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float) -> LostGrip:
-    """Return the passes over the new ice since its first alert; `share` of the drivers is warned."""
+    """Return the passes over the new ice since the first alert of its patch; `share` of the drivers is warned."""
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
-    cells = set(visits["cell"].filter(pa.array(on)).to_pylist())
-    known = min((at for at, a in alerts if a.raised and a.cell in cells and at >= changed_ns), default=None)
+    since = np.full(visits.num_rows, NEVER)
+    for cells, known in known_patches(visits, on, alerts, changed_ns):
+        since[np.isin(visits["cell"].to_numpy(), cells)] = known
     vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
     count = max((_number(name) for name in vehicles), default=0)
     warned = warned_ones(count, share)
@@ -199,7 +229,7 @@ def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int
     enter, left = (visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
     last: dict[str, tuple[int, int]] = {}
     order = np.argsort(enter, kind="stable")
-    for k in order[on[order] & (enter[order] >= (known if known is not None else np.iinfo(np.int64).max))].tolist():
+    for k in order[on[order] & (enter[order] >= since[order])].tolist():
         name, cell = vehicles[k], int(visits["cell"][k].as_py())
         number, at = last.get(name, (0, -PASS_GAP_NS))
         number += enter[k] - at > PASS_GAP_NS

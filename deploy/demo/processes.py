@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from deploy.demo import town
+from edge_agent.lab.simulation.scenarios import scenario_named
+
 START_S = 300.0  # the first start after a change compiles the kernels, on a busy machine
 STOP_S = 10.0
-SCENARIO = "hills"
+SCENARIO = "frost"
 SHOWN = {"snapshot_s": 10.0, "metrics_port": 0}  # for the page: a past within minutes, and what the service says
 
 
@@ -106,10 +109,11 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 @contextmanager
 def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
-    """Run the live page; yield its address. The truth in `folder/overlay.parquet` can be drawn over the map."""
+    """Run the live page on the town's streets; yield its address. The truth can be drawn over the map."""
     metrics = service.line_with("ready").rpartition(", ")[2]
-    options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port,
-               "--metrics": metrics, "--overlay": folder / "overlay.parquet"}  # fmt: skip
+    tiles, roads = town.write(scenario_named(SCENARIO), folder)
+    options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port, "--metrics": metrics,
+               "--overlay": folder / "overlay.parquet", "--base-map": tiles, "--roads": roads}  # fmt: skip
     words = [str(word) for option in options.items() for word in option]
     shown = ManagedProcess("page", [str(Path(sys.executable).parent / "fleet-service"), "page", *words], folder)
     try:

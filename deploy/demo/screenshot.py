@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 SIZE: Final = {"width": 1280, "height": 800}
 WAIT_MS: Final = 20_000
@@ -23,7 +24,7 @@ def take(address: str, path: Path) -> None:
     try:
         from playwright import sync_api
     except ImportError as error:
-        raise InputError("screenshot", "Playwright is missing", "pip install 'gripmap[dev]'") from error
+        raise InputError("screenshot", "Playwright is missing", install_command("dev")) from error
     if program is None:
         raise InputError("screenshot", "no Chromium on this machine", "apt install chromium")
     size: Any = SIZE

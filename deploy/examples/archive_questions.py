@@ -36,4 +36,6 @@ def main(archive: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit("usage: python deploy/examples/archive_questions.py ARCHIVE [FOLDER]")
     main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "try/questions"))

@@ -42,4 +42,6 @@ def main(endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, wit
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit("usage: python deploy/examples/be_warned.py ENDPOINT LATITUDE LONGITUDE [YAW [SECONDS]]")
     main(sys.argv[1], *map(float, sys.argv[2:]))

@@ -22,7 +22,7 @@ def main(folder: Path) -> None:
     found = {name: edge_agent.estimate(log, vehicle, name) for name in ("ckf", "sr-ukf")}
     frame = found["ckf"].to_pandas()
     print(frame[["t", "vx", "mu", "mu_lower", "mu_upper", "mu_utilised"]].iloc[::100].round(2).to_string(index=False))
-    title = "double lane change, 20 m/s, μ .5, sedan, seed 1"
+    title = "double lane change at 22 m/s, μ .5, sedan, seed 1"
     edge_agent.plot(found, truth=truth, title=title).savefig(folder / "first.svg")
 
 

@@ -19,6 +19,7 @@ from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.runtime.installing import install_command
 from schemas.runtime.palette import line_of
 from schemas.tables import ESTIMATES_SCHEMA
 from schemas.vehicle import Vehicle
@@ -94,7 +95,7 @@ def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise InputError("plot", "matplotlib is not installed", "pip install matplotlib") from error
+        raise InputError("plot", "matplotlib is not installed", install_command("demo")) from error
     figure = Figure(figsize=(8, 6), layout="constrained")
     speed, friction = figure.subplots(2, 1, sharex=True)
     if truth is not None:

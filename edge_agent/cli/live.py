@@ -16,6 +16,7 @@ from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.live_loop import ENDED_DRAIN_S, STATUS_EVERY_S, STOPPED_DRAIN_S, Progress, drive
 from edge_agent.app.metrics import health_problems, metrics
+from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons
 from edge_agent.cli.common import close_publisher, print_status, publisher_of, stop_on_signal
 from edge_agent.inputs.block import Block
 from edge_agent.observe.pipeline import Pipeline
@@ -89,6 +90,7 @@ def drive_live(
                     one.attach(name, session)
 
         def after() -> None:
+            reporter.look()
             if lookout is not None:
                 _show(lookout, pipeline)
             if vss is not None and admitted():
@@ -104,13 +106,22 @@ def drive_live(
                 f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s", event="ready", vehicles=len(names)
             )
         )
+        watch = SignalWatch()
+        reporter = ReasonReporter(lambda: reasons(watch, publisher, config.zenoh.connect, troubled()), log_line)
         report = partial(print_status, publisher=publisher, log_line=log_line)
         if lookout is not None:
             lookout.start()
         drive(
-            blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted,
+            watch.blocks(blocks),
+            pipeline,
+            publisher,
+            stop,
+            report,
+            duration_s=duration_s,
+            progress=progress,
+            admitted=admitted,
             after=after,
-        )  # fmt: skip
+        )
         heard: dict[str, float] = {}
         if lookout is not None:
             lookout.close()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_estimator, memberships_of
 from schemas.errors import InputError
-from schemas.runtime import commandline
+from schemas.runtime import commandline, progress_messages
 from schemas.thresholds import NS
 
 if TYPE_CHECKING:
@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from edge_agent.inputs.block import Block
     from edge_agent.inputs.signal_log import SignalLog
     from schemas.config import AgentConfig
+    from schemas.vehicle import Vehicle
 
 NOW = "now"
+REPORTS = (".html", ".png", ".svg", ".pdf")
 LOCAL, SPARK = "local", "spark"
 OLD_NS = 29 * 86_400 * NS  # a service takes nothing of more than thirty days ago, unless it is told otherwise
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
@@ -34,7 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     add_estimator(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, help="estimates to write (.parquet, .csv, .mcap); of several logs, a folder"
+        "--out",
+        type=Path,
+        required=True,
+        help="estimates (.parquet, .csv, .mcap), or a report to look at (.html, .png, .svg, .pdf); "
+        "of several logs, a folder of estimates",
+    )
+    parser.add_argument(
+        "--compare", metavar="NAME,NAME", help="more estimators on the same drive, side by side in a report"
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument("--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)")
@@ -74,9 +83,13 @@ def run(args: argparse.Namespace) -> int:
         if args.engine == SPARK:
             return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
         return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
+    if args.compare is not None and args.out.suffix not in REPORTS:
+        raise InputError("compare", f"is of no use for {args.out.name}", f"write {', '.join(REPORTS)}")
     path = args.log[0]
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
+    if args.out.suffix in REPORTS and args.publish:
+        raise InputError("publish", "does not go together with a report", "replay twice: once with .parquet")
     bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
     log = read_log(path)
     start_ns = _start(args.start, log)
@@ -87,6 +100,10 @@ def run(args: argparse.Namespace) -> int:
         require_valid_signals(diagnosis)
     else:
         notes += warn_about_faults(diagnosis)
+    if args.out.suffix in REPORTS:
+        notes += _write_report(args, log, vehicle, [estimator, *_more(args.compare)])
+        print("\n".join(notes), file=sys.stderr)
+        return 0
     with EstimatesFile(args.out) as file:
         code = 0
 
@@ -101,6 +118,31 @@ def run(args: argparse.Namespace) -> int:
                 keep(block, bank.advance(block.t, block.signals))
     print("\n".join([*notes, plausibility.line()]), file=sys.stderr)
     return code or (IMPLAUSIBLE if plausibility.problems() else 0)
+
+
+def _more(names: str | None) -> list[str]:
+    return [] if names is None else [name.strip() for name in names.split(",") if name.strip()]
+
+
+def _write_report(args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]) -> list[str]:
+    """Estimate with each estimator, write the report, and return notes."""
+    import pyarrow as pa
+
+    from edge_agent.app import drive_report
+    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.app.library import to_table
+
+    writable("out", args.out)
+    found = {}
+    for name in dict.fromkeys(names):
+        progress_messages.set_status(f"estimating with {name}")
+        bank = bank_of(name, [vehicle])
+        parts = [to_table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
+        found[name] = pa.concat_tables(parts)
+    title = f"{args.log[0].name}: {vehicle.name}, {float(log.t[-1] - log.t[0]):.0f} s"
+    drive_report.write_report(drive_report.RecordedDrive(log, found, title), args.out)
+    return [f"note: {args.out} shows {', '.join(found)}"]
 
 
 def _check_engine(engine: str, jobs: int, *, several: bool) -> None:

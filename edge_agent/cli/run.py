@@ -71,13 +71,13 @@ def run(args: argparse.Namespace) -> int:
         return _live(args, sources, config)
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
-    kind, colon, address = sources[0].partition(":")
+    kind, _, address = sources[0].partition(":")
     others = plugins.entry_points_of(plugins.SOURCES)
     if kind in others:
         vehicle = load_vehicle(_vehicle_file(args))
         name, blocks = args.name or vehicle.name, plugins.load_entry_point(plugins.SOURCES, kind)(address)
-    elif colon and not Path(sources[0]).exists():
-        known = ", ".join(sorted([*KINDS, *others]))
+    elif kind != SIMULATED and not Path(sources[0]).exists():
+        known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
         raise InputError("source", f"{sources[0]!r} is no file, and {kind!r} no kind of source", f"kinds are {known}")
     else:
         vehicle, name, blocks = _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))

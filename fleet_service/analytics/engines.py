@@ -14,13 +14,14 @@ from fleet_service.archive.export.extract import Extract
 from fleet_service.archive.format import layout, snapshots
 from schemas.errors import InputError
 from schemas.runtime import spark
+from schemas.runtime.installing import install_command
 from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Kind
 
 try:
     import ibis
 except ImportError as error:
-    raise InputError("analyze", "Ibis is not installed", "pip install 'gripmap[analytics]'") from error
+    raise InputError("analyze", "Ibis is not installed", install_command("analytics")) from error
 
 Table: TypeAlias = Any  # an ibis.Table, whose package has no types
 ENGINES: Final = ("duckdb", "spark")

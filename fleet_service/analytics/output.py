@@ -19,6 +19,7 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
+from schemas.runtime.installing import install_command
 
 SHOWN_ROWS: Final = 20
 PLOTS: Final = (".png", ".svg", ".pdf")
@@ -30,7 +31,7 @@ TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 def text(table: pa.Table, question: Question) -> str:
     """Return the first rows in the question's order, for the terminal."""
-    shown = order_rows(table, question).slice(0, SHOWN_ROWS)
+    shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
     names = [name for name in shown.schema.names if not pa.types.is_nested(shown.schema.field(name).type)]
     cells = [names, *([_text(name, row[name]) for name in names] for row in shown.select(names).to_pylist())]
     widths = [max(len(row[k]) for row in cells) for k in range(len(names))]
@@ -42,7 +43,7 @@ def text(table: pa.Table, question: Question) -> str:
 def lines(table: pa.Table, question: Question) -> str:
     """Return all rows in the question's order as JSON lines; times are ISO 8601, UTC."""
     return "\n".join(json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
-                     for row in order_rows(table, question).to_pylist())  # fmt: skip
+                     for row in add_places(order_rows(table, question)).to_pylist())  # fmt: skip
 
 
 def _json(name: str, value: object) -> object:
@@ -67,11 +68,11 @@ def _text(name: str, value: object) -> str:
     if name == "sector":
         return grid.HEADINGS[int(str(value))]
     if name in TIMES and isinstance(value, int):
-        return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S}"
+        return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
     if isinstance(value, float):
         return f"{value:.6f}" if name in ("latitude", "longitude", "west", "south", "east", "north") else f"{value:.4g}"
     if isinstance(value, datetime):
-        return f"{value:%Y-%m-%d %H:%M:%S}"
+        return f"{value:%Y-%m-%dT%H:%M:%SZ}"
     return str(value)
 
 
@@ -91,10 +92,32 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
         elif path.suffix == ".html":
             with open_durably(path) as file:
                 file.write(page(table, question).encode())
-        elif path.name.endswith(".geo.parquet") or path.suffix == ".geojson":
+        elif path.name.endswith(".geo.parquet"):
             extract.write(add_geometry(table, question), path)
+        elif path.suffix == ".geojson":
+            extract.write(add_geometry(times_as_timestamps(table), question), path)
         else:
-            extract.write(table, path)
+            extract.write(times_as_timestamps(add_places(table)), path)
+
+
+def times_as_timestamps(table: pa.Table) -> pa.Table:
+    """Return an answer whose seconds since 1970 are timestamps, which text files write as ISO 8601."""
+    for place, field in enumerate(table.schema):
+        if field.name in TIMES and pa.types.is_integer(field.type):
+            table = table.set_column(place, field.name, table[field.name].cast(pa.timestamp("s", "UTC")))
+    return table
+
+
+def add_places(table: pa.Table) -> pa.Table:
+    """Return an answer with the coordinates of its cells, if it has cells and no coordinates yet."""
+    names = table.schema.names
+    if "cell" not in names or "latitude" in names or "west" in names:
+        return table
+    known = table["cell"].is_valid().to_numpy()
+    cells = np.array([cell or 0 for cell in table["cell"].to_pylist()], np.int64)
+    for name, values in zip(("latitude", "longitude"), grid.centre(cells), strict=True):
+        table = table.append_column(name, pa.array(np.round(values, 6), mask=~known))
+    return table
 
 
 def add_geometry(table: pa.Table, question: Question) -> pa.Table:
@@ -119,7 +142,7 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
     try:
         from fleet_service.analytics.plots import draw
     except ImportError as error:
-        raise InputError("out", "matplotlib is not installed", "pip install '.[analytics]'") from error
+        raise InputError("out", "matplotlib is not installed", install_command("analytics")) from error
     draw(table, question.name, question.about, path)
 
 

@@ -1,5 +1,5 @@
-"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze, rebuild,
-certs, evaluate, completion.
+"""`fleet-service`: run, query, watch, page, router, hand-over, compact, retention, forget, export, roads, analyze,
+rebuild, certs, evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
 needs them, so that help is fast.
@@ -18,7 +18,7 @@ from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
-LIVE: Final = ("run", "watch", "page", "cits")  # commands that go on until a signal
+LIVE: Final = ("run", "watch", "page", "cits", "router")  # commands that go on until a signal
 
 COMMANDS: Final = (
     Command("run", "fleet_service.cli.run", "run the service: receive observations, serve the map, keep the archive",
@@ -31,6 +31,8 @@ COMMANDS: Final = (
             "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
     Command("cits", "fleet_service.cli.cits", "send alerts as DENM to an AMQP interchange, and take foreign ones",
             "fleet-service cits --amqp amqps://host:5671 --from subscriptions --witness cits-se"),
+    Command("router", "deploy.router", "run a Zenoh router until a signal; the same as `gripmap router`",
+            "fleet-service router --listen tcp/127.0.0.1:7447"),
     Command("hand-over", "fleet_service.cli.hand_over", "move a region to a standby while it runs",
             "fleet-service hand-over 1202/310/* --to north-b"),
     Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, and compute roll-ups",

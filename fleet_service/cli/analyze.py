@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known_questions, question_of
-from fleet_service.cli.common import add_part, compact_first, span
+from fleet_service.cli.common import add_part, compact_first, duration_s, span
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
@@ -23,7 +22,6 @@ FOR: Final = {
     "within": ("contract",),
 }  # fmt: skip
 USUAL_VEHICLES: Final = 2
-UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,13 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _seconds(text: str | None) -> float | None:
-    """Return a duration in seconds from its usual notation."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
-    if found is None:
-        raise InputError("within", f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d")
-    return float(found[1]) * UNITS[found[2]]
+    return None if text is None else duration_s("within", text)
 
 
 def _checked_question(arguments: argparse.Namespace) -> Question:

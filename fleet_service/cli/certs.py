@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 LONGEST_DAYS = 36525.0  # a century; beyond, dates end
 ASKED = 3  # names that may be revoked without a word: a list that is short by mistake must not end a fleet
@@ -57,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         from fleet_service.enrolment.enrol import Registry, Terms
     except ImportError as error:
-        raise InputError("certs", "the package cryptography is missing", "pip install 'gripmap[certs]'") from error
+        raise InputError("certs", "the package cryptography is missing", install_command("certs")) from error
     try:
         registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
         leaving = registry.leaving(fleet)

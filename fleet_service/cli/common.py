@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import signal
 import sys
 import threading
@@ -15,11 +16,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from schemas.config import moment
 from schemas.errors import InputError
 from schemas.runtime import progress_messages
+from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from fleet_service.client.datex import Supplier
 
 STATUSES: Final = ("real", "test", "technicalExercise", "securityExercise")
+
+UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def stop_on_signals() -> threading.Event:
@@ -62,6 +66,7 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 def add_part(parser: argparse.ArgumentParser) -> None:
     """Declare the options that select a part of the archive."""
     parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC")
+    parser.add_argument("--last", metavar="TIME", help="instead of --from: so long until now, e.g. 12h, 90min or 7d")
     parser.add_argument("--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)")
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
 
@@ -89,6 +94,18 @@ def confirm(arguments: argparse.Namespace, what: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
+def duration_s(field: str, text: str) -> float:
+    """Return a duration in seconds from its usual notation, such as 90min or 12h.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
+    if found is None:
+        raise InputError(field, f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d")
+    return float(found[1]) * UNITS[found[2]]
+
+
 def span(arguments: argparse.Namespace) -> tuple[int, int]:
     """Return begin and end [ns] from the options of `add_part`.
 
@@ -96,6 +113,10 @@ def span(arguments: argparse.Namespace) -> tuple[int, int]:
         InputError: one of them is no time, or the end is not after the begin.
     """
     since = 0 if arguments.since is None else moment(arguments.since, "from")
+    if arguments.last is not None:
+        if arguments.since is not None or arguments.until is not None:
+            raise InputError("last", "does not go together with --from or --to", "give one or the other")
+        since = time.time_ns() - round(duration_s("last", arguments.last) * NS)
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
     if since >= until:
         raise InputError("to", f"{arguments.until or 'now'} is not after --from {arguments.since}", "give a later time")

@@ -33,13 +33,15 @@ ICEBERG: Final = "iceberg"
 ROUTERS: Final = ("valhalla", "graphhopper")
 _LIVE: Final = ("country", "supplier", "follow", "connect", "config")
 _ROADS: Final = ("roads", "exclude_ice")
-_PART: Final = ("bbox", "since", "until")
+_PART: Final = ("bbox", "since", "until", "last")
 _TABLE: Final = ("catalog", "namespace", "at")
 _NOT: Final = {  # options of another kind of export
     **dict.fromkeys(WHAT, (*_LIVE, *_TABLE, *_ROADS)),
     DATEX: ("archive", *_PART, *_TABLE, *_ROADS),
     ICEBERG: (*_LIVE, *_PART, *_ROADS, "out", "snapshot"),
-    **dict.fromkeys(ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "snapshot")),
+    **dict.fromkeys(
+        ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "last", "snapshot")
+    ),
 }
 _NEEDS: Final = {
     **dict.fromkeys(WHAT, ("archive", "out")),

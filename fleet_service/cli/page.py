@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fleet_service.cli.common import add_connection, add_supplier, stop_on_signals, supplier_of
 from schemas.errors import InputError
 from schemas.runtime import commandline
+from schemas.runtime.installing import install_command
 
 if TYPE_CHECKING:
     from fleet_service.client.datex_feed import DatexFile
@@ -31,7 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to draw over the map")
     parser.add_argument(
-        "--base-map", metavar="URL|FILE", help="raster tiles below the cells: URL with {z}, {x} and {y}, or .mbtiles"
+        "--base-map", metavar="URL|FILE", help="map below the roads: .pmtiles or .mbtiles, or URL with {z}, {x}, {y}"
+    )
+    parser.add_argument("--attribution", metavar="TEXT", help="of the base map (default: what its file says)")
+    parser.add_argument(
+        "--roads", metavar="FILE", type=Path, help="GeoJSON of road lines with names (default: learned from the fleet)"
     )
     parser.add_argument(
         "--datex", metavar="FILE", type=Path, help="keep a DATEX II publication current in this file, and serve it"
@@ -47,20 +52,34 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         from fleet_service.page import server
         from fleet_service.page.basemap import base_map
+        from fleet_service.page.roads import read_roads
     except ImportError as error:
-        fix = "pip install 'gripmap[page]'"
+        fix = install_command("page")
         raise InputError("page", f"the package {error.name} is missing", fix) from error
     if arguments.archive is not None:
-        from fleet_service.archive.format.layout import require_archive
-
-        require_archive(arguments.archive)
+        _check_archive(arguments.archive)
     settings = server.PageSettings(
         connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
         names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
-        base_map=None if arguments.base_map is None else base_map(arguments.base_map), datex=_publication(arguments),
+        base_map=None if arguments.base_map is None else base_map(arguments.base_map, arguments.attribution),
+        roads=None if arguments.roads is None else read_roads(arguments.roads), datex=_publication(arguments),
     )  # fmt: skip
     server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
     return 0
+
+
+def _check_archive(root: Path) -> None:
+    """Warn if the archive does not exist yet: a service that starts for the first time creates it.
+
+    Raises:
+        InputError: the folder has other contents.
+    """
+    from fleet_service.archive.format.layout import require_archive
+
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        require_archive(root)
+    else:
+        print(f"waiting for the archive {root}: its service creates it; the past appears then", flush=True)
 
 
 def _publication(arguments: argparse.Namespace) -> DatexFile | None:

@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not answer.served:
         print("no service answers for the map: start one; that is not the same as an empty map", file=sys.stderr)
         return NOBODY
+    if arguments.bbox is not None and answer.table is not None and not answer.table.num_rows:
+        _say_what_is_covered(arguments)
     if arguments.out is None:
         print(map_client.text(answer))
     elif answer.table is not None and arguments.out.suffix in (".parquet", ".csv"):
@@ -54,6 +56,22 @@ def run(arguments: argparse.Namespace) -> int:
         print(answer.gap, file=sys.stderr)
         return NOBODY
     return 0
+
+
+def _say_what_is_covered(arguments: argparse.Namespace) -> None:
+    """Print the box of the whole map if a queried box is empty: latitude and longitude may be swapped."""
+    from fleet_service.client import map_client
+
+    whole = map_client.ask(map_client.settings(arguments.connect, arguments.config), {}).table
+    if whole is None or not whole.num_rows:
+        return
+    west_end, south_end, east_end, north_end = (whole[name].to_numpy() for name in ("west", "south", "east", "north"))
+    box = [float(west_end.min()), float(south_end.min()), float(east_end.max()), float(north_end.max())]
+    words = "no cell lies in this box; the map covers --bbox " + ",".join(f"{side:.3f}" for side in box)
+    west, south, east, north = (float(side) for side in arguments.bbox.split(","))
+    if box[0] < north and box[2] > south and box[1] < east and box[3] > west:
+        words += ": longitude comes before latitude"
+    print(words, file=sys.stderr)
 
 
 def _form(out: Path | None, given: str | None) -> str | None:

@@ -16,7 +16,7 @@ import zenoh
 
 from schemas import grid, keys, query, regions, tables
 from schemas.config import ServiceConfig, ZenohSettings, load
-from schemas.errors import InputError
+from schemas.errors import InputError, UnreachableError
 from schemas.numeric import IntArray
 from schemas.query import Format
 from schemas.runtime import commandline, tokens, zenoh_session
@@ -162,12 +162,14 @@ def open_connected(connection: ZenohSettings) -> zenoh.Session:
     """Return a session that is connected to a router.
 
     Raises:
-        InputError: no router answers.
+        UnreachableError: no router answers.
     """
     try:
         return zenoh.open(zenoh_session.configuration(connection))
     except zenoh.ZError as error:
-        raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
+        where = ", ".join(connection.connect)
+        fix = "start one with `gripmap router`, or name its endpoint with --connect"
+        raise UnreachableError("connect", f"no router at {where}", fix) from error
 
 
 def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:

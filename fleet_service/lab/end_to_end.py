@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.resampled import DrivenVisits, TrueVisits, driven
 from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe
@@ -80,7 +81,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
-    with_value = is_measured(lower, upper, fusion.live.values[slots])
+    with_value = is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)
     pure = with_value & one_surface(fusion, visits)[slots]
     found = _figures(scores, with_value) | {
         "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5, "safe95": safe(scores),

@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_service.fusion import Fusion
+from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import end_to_end
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.end_to_end import OBSERVATIONS, SEVERAL, TRUTH
@@ -63,7 +64,7 @@ def moments(folder: Path) -> list[AskedWay]:
         belief = fusion.beliefs(slots, until)
         lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
         scores = of_beliefs(belief, truth, end_to_end.excited(fusion, past)[slots])
-        out.append(AskedWay(scores, is_measured(lower, upper, fusion.live.values[slots])))
+        out.append(AskedWay(scores, is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)))
     return out
 
 

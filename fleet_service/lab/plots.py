@@ -10,6 +10,7 @@ from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.rules import RULES
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure
+from schemas.runtime.installing import install_command
 from schemas.runtime.palette import ESTIMATORS
 
 SIZE = (5.5, 4.2)
@@ -24,7 +25,7 @@ def draw(found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "
     try:
         from matplotlib.figure import Figure as Canvas
     except ImportError as error:
-        raise InputError("plots", "matplotlib is not installed", "pip install 'gripmap[demo]'") from error
+        raise InputError("plots", "matplotlib is not installed", install_command("demo")) from error
     values = {figure.name: figure.value for figure in found}
     paths = []
     for name, plot in (

@@ -1,32 +1,54 @@
-"""Base map below the cells: raster tiles from an address, or from a file of the operator, served here.
+"""Base map below the roads: vector or raster tiles of a file, served here, or raster tiles from an address.
 
-The file is MBTiles 1.3 (github.com/mapbox/mbtiles-spec): images in a table of SQLite, rows counted from the south.
+Files are MBTiles 1.3 (github.com/mapbox/mbtiles-spec: a table of SQLite, rows counted from the south) with images or
+with vector tiles, and PMTiles 3 with vector tiles. The layers of vector tiles are those of OpenMapTiles or Protomaps.
 """
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import threading
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
+from fleet_service.page.vector_tiles import PmtilesFile, unpack_tile
 from schemas.errors import InputError
 
-ENDING: Final = ".mbtiles"
+MBTILES, PMTILES = ".mbtiles", ".pmtiles"
 OWN: Final = "/base/{z}/{x}/{y}"  # address of the tiles of a file
-KINDS: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "webp": "image/webp"}
+VECTOR: Final = "pbf"
+KINDS: Final = {
+    "png": "image/png",
+    "jpg": "image/jpeg",
+    "jpeg": "image/jpeg",
+    "webp": "image/webp",
+    VECTOR: "application/vnd.mapbox-vector-tile",
+}
 ZOOMS: Final = (0, 19)  # that an address answers: as far as the public ones go
 DEEPEST: Final = 30
+_TAG: Final = re.compile(r"<[^>]*>")
+
+
+class TileSource(Protocol):
+    """Tiles of a file."""
+
+    kind: str
+    zooms: tuple[int, int]
+
+    def picture(self, zoom: int, x: int, y: int) -> bytes | None:
+        """Return a tile, counted from the north-west; None if there is none."""
+        ...
 
 
 class TileFile:
-    """Raster tiles of a file; thread-safe.
+    """Tiles of an MBTiles file; thread-safe.
 
     Args:
         path: ends in .mbtiles.
 
     Raises:
-        InputError: it does not exist, or has no images.
+        InputError: it does not exist, or has no tiles.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,47 +57,75 @@ class TileFile:
             raise _refused(f"{path} is not there")
         try:
             self._table = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
-            metadata = dict(self._table.execute("select name, value from metadata where name = 'format'"))
+            self.metadata: dict[str, Any] = dict(self._table.execute("select name, value from metadata"))
             least, most = self._table.execute("select min(zoom_level), max(zoom_level) from tiles").fetchone()
         except sqlite3.Error as error:
             raise _refused(f"{path} cannot be read ({error})") from error
-        form = str(metadata.get("format"))
+        form = str(self.metadata.get("format"))
         if form not in KINDS or least is None:
             raise _refused(f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile")
-        self.kind, self.zooms = KINDS[form], (int(least), int(most))
+        self.kind = KINDS[form]
+        self.zooms = (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west; None if there is none."""
+        """Return a tile, counted from the north-west and unpack_tile; None if there is none."""
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
         asked = "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
         with self._lock:
             found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
-        return None if found is None else bytes(found[0])
+        return None if found is None else unpack_tile(bytes(found[0]))
+
+
+class _Pmtiles:
+    """Tiles of a PMTiles file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = PmtilesFile(path)
+        self.kind = KINDS[VECTOR]
+        self.zooms = self._file.zooms
+        self.metadata = self._file.metadata
+
+    def picture(self, zoom: int, x: int, y: int) -> bytes | None:
+        """Return a tile, counted from the north-west; None if there is none."""
+        if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
+            return None
+        return self._file.tile(zoom, x, y)
 
 
 class BaseMap(NamedTuple):
-    """Address of the tiles with {z}, {x} and {y}, its zoom levels, and the file, if there is one."""
+    """Address of the tiles with {z}, {x} and {y}, its zoom levels, the file, if there is one, and who made the map."""
 
     address: str
     zooms: tuple[int, int] = ZOOMS
-    file: TileFile | None = None
+    file: TileSource | None = None
+    attribution: str = ""
+
+    @property
+    def is_vector(self) -> bool:
+        """True for vector tiles."""
+        return self.file is not None and self.file.kind == KINDS[VECTOR]
 
 
-def base_map(text: str) -> BaseMap:
-    """Return a base map from the text of the option.
+def base_map(text: str, attribution: str | None = None) -> BaseMap:
+    """Return a base map from the text of the option; `attribution` replaces that of the file.
 
     Raises:
         InputError: the text is neither an address of tiles nor a file of them.
     """
-    if text.endswith(ENDING):
-        file = TileFile(Path(text))
-        return BaseMap(OWN, file.zooms, file)
+    if text.endswith((MBTILES, PMTILES)):
+        file = TileFile(Path(text)) if text.endswith(MBTILES) else _Pmtiles(Path(text))
+        named = attribution if attribution is not None else str(file.metadata.get("attribution") or "")
+        return BaseMap(OWN, file.zooms, file, _TAG.sub("", named).strip())
     whole = all(f"{{{name}}}" in text for name in "zxy") and not any(mark in text for mark in " ;,'\"")
     if not whole or not text.startswith(("http://", "https://", "/")):
         raise _refused(f"{text[:60]!r} is no address of tiles")
-    return BaseMap(text)
+    return BaseMap(text, attribution=attribution or "")
 
 
 def _refused(problem: str) -> InputError:
-    return InputError("base_map", problem, "write https://HOST/{z}/{x}/{y}.png, or name a .mbtiles of png, jpg or webp")
+    return InputError(
+        "base_map",
+        problem,
+        "write https://HOST/{z}/{x}/{y}.png, or name an .mbtiles or .pmtiles file",
+    )

@@ -1,6 +1,7 @@
-"""Past of the map from the snapshots of a service: available moments, a past map, a cell's history.
+"""Past of the map: available moments, a past map, a cell's history.
 
-Snapshots hold public cells only, so this data is as public as the map itself.
+The last minutes come from memory, earlier moments from the snapshots of a service. Snapshots hold public cells only, so
+this data is as public as the map itself.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.format import layout, snapshots
 from fleet_service.page import records, world
+from fleet_service.page.recent import RecentMoments
 from fleet_service.page.records import Records
 from schemas import grid
 from schemas.errors import InputError
@@ -31,20 +33,26 @@ _OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehi
 
 
 class Moments:
-    """Snapshots of an archive.
+    """Recent moments, and the snapshots of an archive.
 
     Args:
         root: of the archive; None without one.
+        recent: moments of the live map that this page received.
     """
 
-    def __init__(self, root: Path | None) -> None:
-        self._root = root
+    def __init__(self, root: Path | None, recent: RecentMoments | None = None) -> None:
+        self._root, self._recent = root, recent or RecentMoments()
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
         self._lock = threading.Lock()
 
+    @property
+    def has_archive(self) -> bool:
+        """True if an archive was named."""
+        return self._root is not None
+
     def times(self) -> list[int]:
-        """Return the moments of all snapshots [s since 1970], oldest first."""
-        return sorted(self._files())[-MOST:]
+        """Return all moments [s since 1970], oldest first."""
+        return sorted({*self._files(), *self._recent.times()})[-MOST:]
 
     def tiles(self, moment: int) -> list[int]:
         """Return the tiles with cells at a moment."""
@@ -59,7 +67,10 @@ class Moments:
         """Return the belief about a cell at each moment at which it was public, oldest first."""
         found = []
         files = self._files()
-        for moment in sorted(files)[-HISTORY:]:
+        for moment in self.times()[-HISTORY:]:
+            if moment not in files:
+                found += self._recent_history(moment, cell, sector)
+                continue
             wanted = (pc.field("cell") == cell) & (pc.field("sector") == sector)
             try:
                 table = pq.read_table(files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None)
@@ -70,6 +81,15 @@ class Moments:
                 found.append({"moment": moment, **row, "mu": row["mu"] if measured else None})
         return found
 
+    def _recent_history(self, moment: int, cell: int, sector: int) -> list[dict[str, Any]]:
+        """Return the belief about a cell at a recent moment, or nothing."""
+        tile = int(grid.tile_of(cell))
+        place = (cell & 0x3FFF) * grid.SECTORS + sector
+        held = (self._recent.at(moment) or {}).get(tile)
+        if held is None:
+            return []
+        return [records.as_values(row) | {"moment": moment} for row in held[held["place"] == place]]
+
     def _files(self) -> dict[int, Path]:
         if self._root is None:
             return {}
@@ -77,6 +97,9 @@ class Moments:
         return {snapshots.time_of(path) // NS: path for folder in folders for path in folder.glob("*.parquet")}
 
     def _at(self, moment: int) -> dict[int, Records]:
+        recent = self._recent.at(moment)
+        if recent is not None:
+            return recent
         with self._lock:
             if moment not in self._kept:
                 self._kept[moment] = self._read(moment)

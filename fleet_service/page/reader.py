@@ -71,6 +71,8 @@ class Reader:
                 self._served = served
                 self._note_fallen(services)
                 self._refresh(session)
+                if served:
+                    self._world.remember(time.time())
                 stop.wait(ROUND_S)
             self._session = None
 

@@ -89,6 +89,18 @@ def _steps(rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray
     return np.where(np.isfinite(value), whole, NO_NUMBER).astype(np.uint8)
 
 
+def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
+    """Return a record in numbers; `mu` is None where nothing was measured."""
+    measured = row["basis"] != BOUND and row["mu"] != NO_NUMBER
+    return {
+        "mu": int(row["mu"]) / MU_STEPS if measured else None,
+        "mu_lower": int(row["lower"]) / MU_STEPS, "mu_upper": int(row["upper"]) / MU_STEPS,
+        "p_slippery": min(int(row["slippery"]) / SHARE_STEPS, 1.0),
+        "basis": {MEASURED: "measured", BORROWED: "borrowed"}.get(int(row["basis"]), "bound"),
+        "vehicles": int(row["vehicles"]),
+    }  # fmt: skip
+
+
 def aggregate_worst(records: Records, level: int) -> Records:
     """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings together.
 

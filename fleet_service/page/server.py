@@ -23,6 +23,7 @@ from fleet_service.page.basemap import BaseMap
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
+from fleet_service.page.roads import RoadMap
 from fleet_service.page.watchers import MOST, Watchers
 from fleet_service.page.world import MapMirror
 from schemas.config import ZenohSettings
@@ -45,7 +46,8 @@ class PageSettings:
         archive: of the service, for the past; None without one.
         metrics: addresses of services' metrics, for the health view.
         overlay: Parquet of cell, sector, mu to draw over the map.
-        base_map: raster tiles below the cells; None without one.
+        base_map: tiles below the roads; None without one.
+        roads: lines to draw the ribbons along; None to learn them from the cells.
         datex: a DATEX II publication to maintain and to serve; None without one.
         most: maximum number of watchers.
     """
@@ -58,6 +60,7 @@ class PageSettings:
     metrics: list[str] = field(default_factory=list)
     overlay: Path | None = None
     base_map: BaseMap | None = None
+    roads: RoadMap | None = None
     datex: DatexFile | None = None
     most: int = MOST
 
@@ -78,9 +81,16 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 
     watchers = Watchers(world, state, settings.most)
     sources = web.Sources(
-        world, reader, Moments(settings.archive), ServiceHealth(settings.metrics), watchers, settings.overlay,
-        settings.base_map, settings.datex,
-    )  # fmt: skip
+        world,
+        reader,
+        Moments(settings.archive, world.recent),
+        ServiceHealth(settings.metrics),
+        watchers,
+        overlay=settings.overlay,
+        base_map=settings.base_map,
+        datex=settings.datex,
+        roads=settings.roads,
+    )
     hosts = [*settings.names, *(LOOPBACK if settings.host in LOOPBACK or settings.names else ())]
 
     @contextlib.asynccontextmanager

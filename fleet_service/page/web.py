@@ -20,13 +20,14 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleet_service.client.datex_feed import DatexFile
-from fleet_service.page import asked, colours, ogc, overlay, records, route
+from fleet_service.page import areas, asked, colours, ogc, overlay, records, route
 from fleet_service.page.basemap import BaseMap
 from fleet_service.page.files import Files
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
+from fleet_service.page.roads import RoadMap, learned_lines
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
 from fleet_service.page.world import MapMirror
 from schemas import grid, keys
@@ -48,6 +49,7 @@ class Sources(NamedTuple):
     overlay: Path | None = None
     base_map: BaseMap | None = None
     datex: DatexFile | None = None
+    roads: RoadMap | None = None
 
 
 def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]) -> ASGIApp:
@@ -64,7 +66,8 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         "/tiles": routes.tiles, "/blocks": routes.blocks, "/events": routes.events,
         "/cell/{cell}/{sector}": routes.cell,
         "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
-        "/health": routes.health, "/overlay": routes.overlay, "/datex2/situation.xml": routes.situations,
+        "/health": routes.health, "/overlay": routes.overlay, "/roads": routes.roads,
+        "/areas": routes.areas, "/datex2/situation.xml": routes.situations,
         "/base/{z:int}/{x:int}/{y:int}": routes.picture, **routes.features.paths(),
     }  # fmt: skip
     app = Starlette(
@@ -109,8 +112,24 @@ class Routes:
         return JSONResponse({
             "colours": colours.as_json(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
             "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "overlay": self._of.overlay is not None,
-            "base_map": base and {"address": base.address, "zooms": base.zooms},
+            "base_map": base and {
+                "address": base.address, "zooms": base.zooms, "vector": base.is_vector,
+                "attribution": base.attribution,
+            },
+            "archive": self._of.moments.has_archive,
         })  # fmt: skip
+
+    async def roads(self, _: Request) -> Response:
+        """Return the lines along which ribbons are drawn: of the operator's file, or learned from the cells."""
+        if self._of.roads is not None:
+            return JSONResponse(self._of.roads.as_json() | {"learned": False})
+        lines = await run_in_threadpool(lambda: learned_lines(*self._of.world.places()))
+        return JSONResponse(RoadMap(lines, []).as_json() | {"learned": True})
+
+    async def areas(self, _: Request) -> Response:
+        """Return the areas with data, the most alerts first."""
+        named = self._of.roads.places if self._of.roads is not None else []
+        return JSONResponse(await run_in_threadpool(areas.found_in, self._of.world, named))
 
     async def picture(self, request: Request) -> Response:
         """Return a tile of the operator's file; empty if there is none."""

@@ -12,8 +12,10 @@ import pyarrow as pa
 
 from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.page import records
+from fleet_service.page.recent import RecentMoments
 from fleet_service.page.records import Records, TileBlock
 from schemas import grid
+from schemas.numeric import IntArray
 from schemas.wire import Alert
 
 _EMPTY: Final = np.zeros(0, records.RECORD)
@@ -42,6 +44,7 @@ class MapMirror:
         self._tiles: dict[int, MirroredTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
         self._stretches = Stretches()
+        self.recent = RecentMoments()
         self._alerts_changed = False
         self.alerts_heard = 0  # counts what was said of alerts
         self.heard = 0.0  # when any service said anything [s since 1970]
@@ -71,6 +74,20 @@ class MapMirror:
             self.heard = now
             self.alerts_heard += 1
             self._stretches.take_all(standing, lambda alert: served(alert.cell))
+
+    def remember(self, now: float) -> None:
+        """Keep the map of this moment for the slider."""
+        with self._lock:
+            self.recent.keep(now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)})
+
+    def places(self) -> tuple[IntArray, IntArray]:
+        """Return cell and sector of all records, (n,) each."""
+        with self._lock:
+            held = [(tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()]
+        if not held:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        place = np.concatenate([tile * (1 << 14) * grid.SECTORS + place for tile, place in held])
+        return place // grid.SECTORS, place % grid.SECTORS
 
     def changes(self) -> list[TileBlock]:
         """Return the changes of each tile since the last call."""

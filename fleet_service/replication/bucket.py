@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -49,7 +50,7 @@ class ObjectBucket:
             from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
             from obstore.store import from_url
         except ImportError as error:
-            fix = "pip install 'gripmap[objects]'"
+            fix = install_command("objects")
             raise InputError("archive.copy", "a copy needs obstore, which is not installed", fix) from error
         self._do, self._known, self._missing = obstore, AlreadyExistsError, (NotFoundError, FileNotFoundError)
         self._failed: tuple[type[Exception], ...] = (BaseError, OSError)

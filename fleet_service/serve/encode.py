@@ -28,10 +28,11 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
-    basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values))
+    slippery = cells.belief @ SLIPPERY_SHARE
+    basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values, slippery))
     columns: dict[str, Any] = {
         "cell": cells.cell, "sector": cells.sector, "mu": pa.array(middle, mask=basis == _BOUND), "mu_lower": lower,
-        "mu_upper": upper, "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
+        "mu_upper": upper, "p_slippery": slippery, "basis": _BASES.take(basis.astype(np.int8)),
         "vehicles": cells.vehicles, "observations": cells.observations,
         "first_time": cells.first, "last_time": cells.last, "age_s": np.maximum(now - cells.last, 0) * 1e-9,
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,

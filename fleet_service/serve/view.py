@@ -17,9 +17,10 @@ LOWER, UPPER = 0.05, 0.95  # of the interval
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved
-# the interval; else all that is known is a lower bound.
+# the interval, or when it is more likely slippery than not; else all that is known is a lower bound.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
+KNOWN_SLIPPERY: Final = 0.5
 TIME_STEP_NS: Final = 900 * NS  # a quarter of an hour, in which a street has had several cars
 COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) for m in (1, 2, 5))])
 
@@ -74,12 +75,17 @@ def joined(*views: CellView) -> CellView:
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 
-def is_measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
-    """Return True for beliefs that rest on a value and not only on bounds, (k,).
+def is_measured(lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray) -> BoolArray:
+    """Return True for beliefs that say more than a lower bound, (k,).
+
+    A belief that calls the road slippery always does, wherever it came from: values of the other headings lower it
+    too, and ice that is known must never be shown as unknown.
 
     Args:
         lower, upper: ends of the interval, (k,).
         values: number of votes with a value, (k,).
+        p_slippery: probability of less friction than SLIPPERY_MU, (k,).
     """
     narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH
-    return np.asarray((values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow))
+    valued = (values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow)
+    return np.asarray(valued | (p_slippery > KNOWN_SLIPPERY))

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, NoReturn
 
-from schemas.errors import InputError
+from schemas.errors import InputError, UnreachableError
 
 FAILED: Final = 1
 BAD_INPUT: Final = 2
@@ -33,9 +33,17 @@ class Command(NamedTuple):
     example: str
 
 
+class OneLineParser(argparse.ArgumentParser):
+    """Parser whose errors are one line like those of the commands, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and the help command, and exit."""
+        self.exit(BAD_INPUT, f"error: {message}; see {self.prog} --help\n")
+
+
 def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen: str | None) -> argparse.ArgumentParser:
     """Return a parser with all commands by name and the options of the chosen ones; other modules are not imported."""
-    parser = argparse.ArgumentParser(prog=prog, description=description)
+    parser = OneLineParser(prog=prog, description=description)
     parser.add_argument("--version", action=VersionAction)
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in commands:
@@ -107,7 +115,7 @@ def run_guarded(run: Callable[[], int]) -> int:
         return int(run())
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return FAILED if isinstance(error, UnreachableError) else BAD_INPUT
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -13,6 +13,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 if TYPE_CHECKING:
     from prometheus_client.registry import CollectorRegistry
@@ -81,7 +82,7 @@ def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
         from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
         from prometheus_client.registry import Collector, CollectorRegistry
     except ImportError as error:
-        fix = "pip install 'gripmap[metrics]', or leave the port out"
+        fix = f"{install_command('metrics')}; or leave the port out"
         raise InputError("metrics_port", "the package prometheus-client is missing", fix) from error
 
     class Values(Collector):

@@ -1,19 +1,35 @@
 """Colours of all plots and pages, distinguishable with three kinds of colour blindness and in greyscale.
 
-`GRIP` is viridis (van der Walt and Smith 2015). Its lightness increases monotonically, so darker is more slippery in
-print too. Unmeasured areas have no colour: they are white and hatched. `tests/test_palette.py` computes the distances.
+The live page, HTML reports, images and QGIS share them. `FOUR` are the classes of a well known grip, `TWO` those of a
+roughly known one, `LITTLE` is no class. In the order ice, snow, rather slippery, wet, rather not, good grip the
+lightness rises on light ground and falls on dark ground, for every kind of sight and on grey paper: what is dangerous
+stands out most. `GRIP` runs through `FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green,
+because a safe colour would be a promise. `tests/test_palette.py` computes order and distances.
 """
 
 from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+FOUR: Final = ("#2f005b", "#a3195b", "#f47a3d", "#f2e63e")  # ice, snow, wet, good grip
+TWO: Final = ("#a36f63", "#f3b49b")  # rather slippery, rather not
+LITTLE: Final = "#b4b8bf"
+GROUND: Final = "#f6f5f2"
+DARK_FOUR: Final = ("#f6e0ff", "#f3b8b3", "#e05219", "#65310b")
+DARK_TWO: Final = ("#e478a7", "#9d4e4d")
+DARK_LITTLE: Final = "#61626e"
+DARK_GROUND: Final = "#15181d"
 GRIP: Final = (
-    "#440154", "#481f70", "#443983", "#3b528b", "#31688e", "#287c8e", "#21918c", "#20a486", "#35b779", "#5ec962",
-    "#90d743", "#c8e020", "#fde725",
+    "#22003f", "#2f005b", "#50015b", "#6d065c", "#880f5b", "#a3195b", "#b43157", "#c44552", "#d4574c", "#e46946",
+    "#f47a3d", "#f58e3e", "#f6a03e", "#f6b23f", "#f5c43f", "#f4d53e", "#f2e63e", "#f6ec73", "#f7f2a0",
 )  # fmt: skip
 GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
-SURFACES: Final = {"ice": 0.15, "snow": 0.35, "wet": 0.6, "dry": 0.9}  # peak adhesion that a reader knows them by
+SURFACES: Final = {
+    "ice": 0.15,
+    "snow": 0.35,
+    "wet": 0.6,
+    "dry": 0.9,
+}  # peak adhesion that a reader knows them by
 HATCH: Final = "//////"  # of what was not measured, on white
 UNKNOWN: Final = "not measured: only lower bounds"
 

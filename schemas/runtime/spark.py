@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 import pyarrow as pa
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 _Task = TypeVar("_Task")
 _Outcome = TypeVar("_Outcome")
@@ -38,7 +39,7 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
         from pyspark.errors import PySparkRuntimeError
         from pyspark.sql import SparkSession
     except ImportError as error:
-        raise InputError("engine", "Spark is not installed", "pip install 'gripmap[spark]'") from error
+        raise InputError("engine", "Spark is not installed", install_command("spark")) from error
     os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # that of this environment, which has the package
     builder = SparkSession.builder.appName("gripmap")
     for key, value in (*SETTINGS.items(), ("spark.ui.showConsoleProgress", str(progress).lower())):

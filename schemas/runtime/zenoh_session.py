@@ -35,7 +35,9 @@ LONGEST_OPEN_MS: Final = 10_000  # Zenoh's own time to open a link
 _TIMEOUT: Final = "connect/timeout_ms"
 _OPEN: Final = "transport/unicast/open_timeout"
 NAME: Final = "{name}"
+ENDPOINTS: Final = "connect/endpoints"
 _TLS: Final = "transport/link/tls"
+_FIX: Final = "write the protocol before it, such as tcp/127.0.0.1:7447 or tls/HOST:7447"
 
 log = logging.getLogger(__name__)
 
@@ -56,13 +58,15 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
         problem = "with a limit Zenoh tries the first endpoint only"
         raise InputError(f"zenoh.config.{_TIMEOUT}", problem, "leave it out; open_session waits for a router")
     config = zenoh.Config()
-    chosen = {**CLIENT, "connect/endpoints": settings.connect, **settings.config}
+    chosen = {**CLIENT, ENDPOINTS: settings.connect, **settings.config}
     for key, value in chosen.items():
         text = json.dumps(value)
         try:
             config.insert_json5(key, text.replace(NAME, name))
         except zenoh.ZError as error:
             problem = f"Zenoh refuses {text[:60]}"
+            if key == ENDPOINTS:
+                raise InputError("connect", f"{', '.join(settings.connect)[:60]} is no endpoint", _FIX) from error
             raise InputError(f"zenoh.config.{key}", problem, "see Zenoh's configuration reference") from error
     for key, value in json.loads(config.get_json(_TLS)).items():
         if key.endswith(("certificate", "private_key")) and value is not None and not Path(value).is_file():

@@ -30,10 +30,10 @@ import pyarrow as pa
 
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import geo
-from fleet_service.page.colours import FOUR, GROUND, LITTLE, TWO
 from schemas import keys
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
+from schemas.runtime.palette import FOUR, GROUND, LITTLE, TWO
 from schemas.thresholds import NS
 from tests import browser, npm
 from tests.benchmarks import page_stage

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from deploy.demo import compare, page, picture
-from deploy.demo.__main__ import report
+from deploy.demo.story import report
 from schemas.runtime.figures import Figure
 from schemas.wire import Alert
 from tests.browser import opened
@@ -141,7 +141,8 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     nobody = compare.lost_grip(driven, [], 10 * S, 0.5)
     assert not len(nobody.lost), "nobody knew of it"
     assert {one.name: one.value for one in nobody.figures()} == {"demo.passes.warned": 0, "demo.passes.unwarned": 0}
-    assert all(one.holds for one in nobody.figures())
+    assert not any(one.holds for one in nobody.figures())
+    assert compare.works(nobody.figures()), "few passes are no failure of the demo"
     found = compare.MapComparison(tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
     told = report(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
     assert grip.line() in capsys.readouterr().out

@@ -296,7 +296,8 @@ BAD_COMMANDS = {
     "no rate": (["fleet", "--rate", "nan"], "^error: rate"),
     "unknown scenario": (["fleet", "--scenario", "moon"], "^error: scenario: "),
     "truth into nowhere": (["fleet", "--truth", "/dev/null/truth"], "^error: truth: cannot write /dev/null/truth"),
-    "log without vehicle": (["run", "--source", "log.parquet"], "^error: vehicle: is not given; "),
+    "log without vehicle": (["run", "--source", __file__], "^error: vehicle: is not given; "),
+    "misspelt source": (["run", "--source", "simulted", "--name", "car-x"], "^error: source: 'simulted' is no file"),
 }
 
 

@@ -115,8 +115,18 @@ def test_a_bad_query_is_one_line_that_names_the_field_and_exit_code_2(
 
 
 def test_a_missing_router_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["query", "--connect", "tcp/127.0.0.1:1"]) == 2
-    assert capsys.readouterr().err.startswith("error: connect: no router at ")
+    assert main(["query", "--connect", "tcp/127.0.0.1:1"]) == 1
+    assert capsys.readouterr().err.startswith("error: connect: no router at tcp/127.0.0.1:1; ")
+
+
+def test_an_endpoint_without_a_protocol_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", "--connect", "127.0.0.1:7447"]) == 2
+    assert "write the protocol before it, such as tcp/127.0.0.1:7447" in capsys.readouterr().err
+
+
+def test_parameters_parted_by_an_ampersand_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", "--bbox", "1,2,3,4&format=json", "--connect", "tcp/127.0.0.1:1"]) == 2
+    assert "part the parameters by ';'" in capsys.readouterr().err
 
 
 def test_a_taken_archive_is_said(tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]) -> None:

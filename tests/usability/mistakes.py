@@ -36,7 +36,8 @@ EDGE: Final = (
     "evaluate --out /proc/none", "evaluate --seeds 1 --out {d}/ev", "completion abacus",
 )  # fmt: skip
 FLEET: Final = (
-    "", "no-such-command", "run --archive /proc/none", "run --archive {d}/a --config {d}/bad.json",
+    "", "no-such-command", "router --config {d}/none.json5", "run --archive /proc/none",
+    "run --archive {d}/a --config {d}/bad.json",
     "query --bbox 1,2", "query --bbox -181,0,1,1", "query --bbox a,b,c,d", "query --route 1,2", "query --at yesterday",
     "query --format xml", "query --out {d}/x.xlsx", "query --out /proc/none/x.json", "query --min-vehicles none",
     "page --port none", "page --port 70000", "page --config {d}/none.json", "page --archive {d}", "page --country se",

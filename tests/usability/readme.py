@@ -29,6 +29,8 @@ PAGES: Final = tuple(
 )
 LASTING: Final = (
     "python -m deploy.router",
+    "gripmap router",
+    "edge-agent fleet",
     "fleet-service run",
     "edge-agent run",
     "fleet-service watch",
@@ -58,7 +60,9 @@ def commands(text: str) -> list[str]:
             found.append(block)
         else:
             lines = (re.sub(r"\s{2,}#.*", "", line).strip() for line in block.splitlines())
-            found += [line for line in lines if line.startswith(("python ", "fleet-service ", "edge-agent "))]
+            found += [
+                line for line in lines if line.startswith(("python ", "gripmap ", "fleet-service ", "edge-agent "))
+            ]
     return [one for one in found if not one.startswith(LEFT_OUT)]
 
 

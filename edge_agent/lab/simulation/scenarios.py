@@ -121,6 +121,22 @@ def hills() -> Scenario:
     return replace(demo(), name="hills", about="the demo's town on slopes to 8 %, with crossfall", relief=relief)
 
 
+def frost() -> Scenario:
+    """The town on hills in the first frost: at 35 s black ice appears at five places of its eastern half.
+
+    For the demonstration: every driver meets the new ice several times, so warned and unwarned ones can be compared.
+    """
+    town = hills()
+    kept = tuple(patch for patch in town.patches if not math.isfinite(patch.start))
+    places = (
+        ("Brogatan", 40.0, 0.0, 0.0), ("Kyrkogatan", 14.0, 112.0, math.pi / 2), ("Norra Ringvägen", 66.0, 144.0, 0.0),
+        ("Östra Ringvägen", 190.0, 62.0, math.pi / 2), ("Östra Ringvägen south", 190.0, -34.0, math.pi / 2),
+    )  # fmt: skip
+    ice = tuple(Patch(f"black ice on {name}", x, y, 44.0, 12.0, ICE, angle, start=35.0) for name, x, y, angle in places)
+    return replace(town, name="frost", about="the town on hills; at 35 s black ice appears at five places",
+                   patches=(*kept, *ice))  # fmt: skip
+
+
 def drawn(seed: int) -> Scenario:
     """The demonstration's town with other frictions and other hills, drawn by the seed: for figures.
 
@@ -218,7 +234,7 @@ def tiny() -> Scenario:
     )
 
 
-SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), tiny())}
+SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), frost(), tiny())}
 
 
 def scenario_named(name: str | Scenario) -> Scenario:

@@ -102,17 +102,17 @@ def breach(
         slot: (n,) numbers of slots, ascending.
         lower, mu, upper: (n,) interval and mean of each.
         level: agreed grip.
-        span: begin and end [s] of all measurements; outside it nothing is known.
+        span: begin and end [s] of all measurements; outside it nothing is known, so slots are cut to it.
     """
-    begins = slot * SLOT_S
+    begins, closes = np.maximum(slot * SLOT_S, span[0]), np.minimum((slot + 1) * SLOT_S, span[1])
     first, after = _runs(mu < level)
-    ends = np.where(after < len(slot), begins[np.minimum(after, len(slot) - 1)], begins[after - 1] + SLOT_S)
+    ends = np.where(after < len(slot), begins[np.minimum(after, len(slot) - 1)], closes[after - 1])
     lasted = ends - begins[first]
     far = np.append(False, np.diff(begins) > GAP_S)
     sure, over = _runs(upper < level, far)
-    surely = begins[over - 1] + SLOT_S - begins[sure]
-    kept = begins[lower >= level]
-    unsure = np.append(kept, span[1]) - np.append(span[0], kept + SLOT_S)
+    surely = closes[over - 1] - begins[sure]
+    is_kept = lower >= level
+    unsure = np.append(begins[is_kept], span[1]) - np.append(span[0], closes[is_kept])
     begin = int(begins[first[lasted.argmax()]]) if len(first) else 0
     return int(lasted.max(initial=0)), int(surely.max(initial=0)), int(unsure.max(initial=0)), begin
 

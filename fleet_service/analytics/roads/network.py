@@ -10,6 +10,7 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.runtime.installing import install_command
 
 EXTRACT: Final = (".pbf", ".osm", ".osm.gz", ".osm.bz2")
 LINES: Final = (".gpkg", ".geojson", ".shp", ".fgb", ".parquet")
@@ -78,7 +79,7 @@ def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
     try:
         import osmium
     except ImportError as error:
-        raise InputError("extract", "osmium is not installed", "pip install 'gripmap[roads]'") from error
+        raise InputError("extract", "osmium is not installed", install_command("roads")) from error
     links: list[DirectedLink] = []
     try:
         date = osmium.io.Reader(str(path)).header().get("osmosis_replication_timestamp", "")
@@ -102,7 +103,7 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
     try:
         import geopandas
     except ImportError as error:
-        raise InputError("extract", "geopandas is not installed", "pip install 'gripmap[roads]'") from error
+        raise InputError("extract", "geopandas is not installed", install_command("roads")) from error
     try:
         frame: Any = geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
     except Exception as error:  # each of its readers raises its own

@@ -151,12 +151,17 @@ def _geojson(table: pa.Table, path: Path) -> None:
         file.detach()  # flushes it; `open_durably` closes it
 
 
+def iso_text(us: int) -> str:
+    """Return a time [us since 1970] as ISO 8601, UTC."""
+    return str(np.datetime_as_string(np.datetime64(us, "us"), "ms", "UTC"))
+
+
 def _texts(table: pa.Table, name: str) -> list[Any]:
     """Return values for JSON: times as ISO 8601 text, no NaN, no digits beyond single precision."""
     column = table[name]
     if pa.types.is_timestamp(column.type):
-        us = column.cast(tables.US).cast(pa.int64()).to_numpy().astype("datetime64[us]")
-        return list(np.datetime_as_string(us, "ms", "UTC").tolist())
+        us = column.cast(tables.US, safe=False).cast(pa.int64()).to_pylist()
+        return [None if one is None else iso_text(one) for one in us]
     if pa.types.is_date(column.type):
         return [None if day is None else day.isoformat() for day in column.to_pylist()]
     if pa.types.is_floating(column.type):
@@ -172,7 +177,11 @@ def _flat(table: pa.Table) -> pa.Table:
 
 def _csv(table: pa.Table, path: Path) -> None:
     with open_durably(path) as file:
-        pacsv.write_csv(_flat(table), file)
+        flat = _flat(table)
+        for place, name in enumerate(flat.schema.names):
+            if pa.types.is_timestamp(flat.schema.field(name).type):
+                flat = flat.set_column(place, name, pa.array(_texts(flat, name), pa.string()))
+        pacsv.write_csv(flat, file)
 
 
 _WRITERS: Final[dict[str, Callable[[pa.Table, Path], None]]] = {

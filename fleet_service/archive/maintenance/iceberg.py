@@ -19,6 +19,7 @@ from fleet_service.archive.format.segments import SCHEMAS
 from fleet_service.archive.maintenance.compaction import hold_compaction_lock
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably
+from schemas.runtime.installing import install_command
 from schemas.wire import Kind
 
 Catalog: TypeAlias = Any  # of pyiceberg, which an archive without tables does not need
@@ -129,7 +130,7 @@ def _catalog(place: Place) -> Catalog:
     try:
         from pyiceberg.catalog import load_catalog
     except ImportError as error:
-        raise InputError("catalog", "pyiceberg is not installed", "pip install 'gripmap[iceberg]'") from error
+        raise InputError("catalog", "pyiceberg is not installed", install_command("iceberg")) from error
     if not place.catalog.startswith(("sqlite://", "postgresql")):
         return load_catalog(place.catalog)
     catalog_properties = {"type": "sql", "uri": place.catalog}

@@ -1,21 +1,27 @@
-// Alerts: which stand, why, for how long; a sound when one begins, if it was asked for.
+// Alerts: which stand, where in plain words, how sure, for how long; a sound when one begins, if it was asked for.
 import { make } from "./elements.js";
 import { ago, say } from "./texts.js";
+import { alertWords, bySeverity, certainty, coordinates } from "./words.js";
 
 export function alertsPanel(app) {
   const sound = make("label", { class: "line" }, make("input", { type: "checkbox", id: "sound", checked: app.show.sound, onchange: e => app.set("sound", e.target.checked) }), say("alerts.sound"));
-  const head = [make("h2", {}, say("alerts.head")), sound];
+  const head = [make("h2", {}, say("alerts.head"))];
   if (app.cells.at !== null) head.push(make("p", { class: "note" }, say("alerts.none.past")));
-  if (!app.alerts.length) return [...head, make("p", {}, say("alerts.none"))];
-  return [...head, make("ol", { class: "alerts" }, ...app.alerts.map(alert => item(app, alert)))];
+  if (!app.alerts.length) return [...head, make("p", { class: "quiet" }, say("alerts.none")), sound];
+  return [...head, alertList(app), sound];
 }
 
-function item(app, alert) {
-  const values = { length: Math.round(alert.length_m), direction: alert.direction, headings: alert.headings.join(", "), mu: alert.mu.toFixed(2), lower: alert.mu_lower.toFixed(2), upper: alert.mu_upper.toFixed(2), vehicles: alert.vehicles };
-  return make("li", { "data-alert": alert.id },
-    make("strong", {}, say("alerts.line", values)), make("span", {}, say("alerts.grip", values)),
-    make("span", {}, say("alerts.since", { ago: ago(app.live.now() - Date.parse(alert.since) / 1000), reason: alert.reason })),
-    make("button", { type: "button", onclick: () => app.jump(alert) }, say("alerts.jump")));
+export function alertList(app, most = Infinity) {
+  return make("ol", { class: "alerts" }, ...bySeverity(app.alerts).slice(0, most).map((alert, k) => item(app, alert, k + 1)));
+}
+
+function item(app, alert, number) {
+  const values = { length: Math.round(alert.length_m), mu: alert.mu.toFixed(2), lower: alert.mu_lower.toFixed(2), upper: alert.mu_upper.toFixed(2), vehicles: alert.vehicles, percent: certainty(alert.p_slippery), ago: ago(app.live.now() - Date.parse(alert.since) / 1000) };
+  return make("li", { "data-alert": alert.id, class: alert.mu < .2 ? "ice" : "snow" },
+    make("span", { class: "number", "aria-hidden": "true" }, String(number)),
+    make("div", {}, make("strong", {}, alertWords(alert, app.roadAt(alert.longitude, alert.latitude))), make("span", {}, say("alerts.line", values)), make("span", { class: "note" }, say("alerts.grip", values)),
+      make("span", { class: "note place" }, coordinates(alert.longitude, alert.latitude)),
+      make("button", { type: "button", onclick: () => app.jump(alert) }, say("alerts.jump"))));
 }
 
 // Those of `after` that were not there before.

@@ -19,7 +19,7 @@ function ready(block) {
       row[k] = rowOf(local);
       x[k] = west + column[k] * side;
       y[k] = north + row[k] * side;
-      kind[k] = kindOf(rows.basis[k], rows.mu[k], rows.lower[k], rows.upper[k]);
+      kind[k] = kindOf(rows.basis[k], rows.mu[k], rows.lower[k], rows.upper[k], rows.slippery[k]);
     }
     return { rows, x, y, column, row, kind, side, west, north, steps };
   };

@@ -1,48 +1,59 @@
 // The page: one state, one window on the world, one panel at a time.
 import { alertsPanel, beep, begun } from "./alerts.js";
+import { dress, moveDivider } from "./appearance.js";
 import { BaseMap } from "./basemap.js";
 import { Cells } from "./cells.js";
+import { addControls } from "./controls.js";
 import { kindOf, setColours } from "./colours.js";
 import { byId, make } from "./elements.js";
 import { CELLS, CELL_LEVEL, cellAt, cellOf, latitudeOf, localOfCell, longitudeOf, middleOf, tileOfCell, worldX, worldY } from "./grid.js";
 import { healthPanel } from "./health.js";
 import { legend } from "./legend.js";
 import { Live } from "./live.js";
+import { overviewPanel } from "./overview.js";
 import { paint, scaleBar } from "./paint.js";
 import { placePanel } from "./place.js";
+import { Roads } from "./roads.js";
 import { ask, open, routePanel } from "./route.js";
 import { fromHash, sharePanel, toHash } from "./share.js";
-import { ago, clock, loadTexts, say } from "./texts.js";
+import { stateCard } from "./states.js";
+import { ago, clock, loadTexts, say, zone } from "./texts.js";
 import { Timeline } from "./timeline.js";
+import { VectorMap } from "./vector.js";
 import { View } from "./view.js";
+import { alertWords, bySeverity } from "./words.js";
 
-const TABS = ["legend", "cell", "alerts", "route", "health", "share"];
-const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000;
+const TABS = ["now", "legend", "cell", "alerts", "route", "health", "share"];
+const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000, ROADS_MS = 1500;
+const FAR = 1e-3;  // of the world: some 40 km
 const WORLD = [-180, -85, 180, 85];
 
 class App {
   constructor(settings, now) {
-    Object.assign(this, { settings, now, alerts: [], route: [], routeFound: null, routeError: "", chosen: null, comparing: false, pinned: null, tab: "legend", away: [] });
-    this.show = { bounds: true, overlay: false, borrowed: false, recent: 0, sound: false };
+    Object.assign(this, { settings, now, alerts: [], route: [], routeFound: null, routeError: "", chosen: null, comparing: false, pinned: null, tab: "now", away: [], areas: [], roads: null, swipe: .5, failed: false });
+    this.show = { roads: true, bounds: true, overlay: false, borrowed: false, recent: 0, sound: false };
     this.past = null;
     this.view = new View(byId("map"));
     this.view.moved = () => this.moved();
     this.view.clicked = (px, py) => this.click(px, py);
-    this.base = settings.base_map ? new BaseMap(settings.base_map, () => this.draw()) : null;
+    this.base = settings.base_map ? new (settings.base_map.vector ? VectorMap : BaseMap)(settings.base_map, () => this.draw()) : null;
     this.live = new Live({ blocks: found => this.blocks(found), alerts: found => this.alerted(found), beat: state => this.beat(state), reload: () => this.reload() });
     this.timeline = new Timeline(byId("timeline"), this);
+    this.moreRoads = 0;
     this.now.changed = () => this.draw();
     this.frame = 0;
     this.looking = 0;
     this.started = this.asked = this.missed = false;
   }
 
-  // What is shown in the large map: a moment, or now.
-  get cells() { return this.past ?? this.now; }
+  get cells() { return this.past ?? this.now; }  // what the large map shows: a moment, or now
   degreesOf(x, y) { return [longitudeOf(x), latitudeOf(y)]; }
 
   async start() {
-    this.controls();
+    this.dark = matchMedia("(prefers-color-scheme: dark)");
+    this.dark.addEventListener("change", () => dress(this));
+    addControls(this, TABS);
+    dress(this);
     this.resize();
     new ResizeObserver(() => this.resize()).observe(byId("map"));
     addEventListener("hashchange", () => this.restore(fromHash(location.hash)));
@@ -51,15 +62,13 @@ class App {
     byId("map").addEventListener("keydown", e => { if (e.key === "a" && this.alerts.length) this.jump(this.alerts[0]); });
     setInterval(() => this.tick(), CLOCK_MS);
     setInterval(() => this.tab === "health" && this.panel(), HEALTH_MS);
-    setInterval(() => { this.now.list(); this.timeline.load(); this.tab === "alerts" && this.panel(); }, LIST_MS);
-    const state = fromHash(location.hash), beside = Promise.all([this.timeline.load(), this.settings.overlay ? this.loadTruth() : null]);
+    setInterval(() => { this.now.list().catch(() => {}); this.timeline.load(); this.loadAreas(); this.loadRoads(); this.tab === "alerts" && this.panel(); }, LIST_MS);
+    const state = fromHash(location.hash), beside = Promise.all([this.timeline.load(), this.loadAreas(), this.loadRoads(), this.settings.overlay ? this.loadTruth() : null]);
     if (state.at !== undefined || state.compare !== undefined) await beside;
     this.started = true;
     if (state.x) await this.restore(state);
     else {
-      this.all();
-      await this.look();
-      this.all();  // now to the cells, not to their tiles
+      await this.begin();
     }
     this.open(this.tab);
     this.tick();
@@ -73,6 +82,9 @@ class App {
     const number = (name, other) => Number.isFinite(Number(state[name])) && state[name] !== undefined ? Number(state[name]) : other;
     for (const name of ["overlay", "borrowed", "sound"]) this.show[name] = state[name] === "1";
     this.show.bounds = state.passed !== "0";
+    this.show.roads = state.cells !== "1";
+    this.theme = state.theme ?? this.theme;
+    dress(this);
     this.show.recent = number("recent", 0);
     this.now.borrowed = this.show.borrowed;
     this.tab = TABS.includes(state.tab) ? state.tab : this.tab;
@@ -86,26 +98,48 @@ class App {
     this.open(this.tab);
   }
 
-  controls() {
-    const button = (key, sign, act) => make("button", { type: "button", "aria-label": say(key), title: say(key), onclick: act }, sign);
-    byId("controls").append(button("zoom.in", "+", () => this.view.turn(2)), button("zoom.out", "−", () => this.view.turn(.5)), button("zoom.all", say("zoom.all.sign"), () => this.all()));
-    byId("map").setAttribute("aria-label", say("map.label"));
-    byId("tabs").append(...TABS.map(name => make("button", { type: "button", role: "tab", id: `tab-${name}`, "aria-controls": "panel", "aria-selected": "false", onclick: () => this.open(name) }, say(`tab.${name}`))));
-    byId("panel").setAttribute("role", "tabpanel");
-    byId("tabs").addEventListener("keydown", e => {
-      const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
-      if (!step) return;
-      this.open(TABS[(TABS.indexOf(this.tab) + step + TABS.length) % TABS.length]);
-      byId(`tab-${this.tab}`).focus();
-    });
+  roadAt(longitude, latitude) { return this.roads?.nearest(worldX(longitude), worldY(latitude)) ?? ""; }
+
+  async loadRoads() {
+    if (this.roads && !this.roads.learned) return;
+    const answer = await fetch("/roads").catch(() => null);
+    if (!answer?.ok) return;
+    this.roads = new Roads(await answer.json());
+    this.draw();
+  }
+
+  async loadAreas() {
+    const answer = await fetch("/areas").catch(() => null);
+    if (!answer?.ok) return;
+    const before = JSON.stringify(this.areas);
+    this.areas = await answer.json();
+    if (this.tab === "now" && before !== JSON.stringify(this.areas)) this.panel();
+  }
+
+  showArea({ box: [west, south, east, north] }) { this.view.fit({ west: worldX(west), east: worldX(east), north: worldY(north), south: worldY(south) }); }
+
+  showPlace(x, y) {
+    this.view.go(x, y, Math.max(this.view.zoom, 18));
+    const { tile, local } = cellAt(x, y);
+    this.choose(tile, local);
+    this.open("cell");
+  }
+
+  // The area with most alerts where several lie far apart, else the whole map.
+  async begin() {
+    const extent = this.now.extent;
+    if (extent && extent.east - extent.west > FAR) await this.loadAreas();
+    if (this.areas.length < 2) { await this.all(); return; }
+    this.showArea(this.areas[0]);
+    await this.look();
   }
 
   // The whole map, and what comes to it, until somebody looks elsewhere.
-  all() {
-    const extent = this.cells.extent;
-    if (!extent) return;
-    this.view.fit(extent);
-    this.view.gone = false;
+  async all() {
+    const fit = () => { const extent = this.cells.extent; if (extent) { this.view.fit(extent); this.view.gone = false; } };
+    fit();
+    await this.look();
+    if (!this.view.gone) fit();  // to the cells, where only their tiles were known before
   }
 
   follow() {
@@ -115,8 +149,8 @@ class App {
 
   resize() {
     const ratio = devicePixelRatio || 1;
-    byId("view").classList.toggle("two", this.comparing);
-    byId("beside").hidden = !this.comparing;
+    for (const id of ["beside", "divider"]) byId(id).hidden = !this.comparing;
+    this.slide(this.swipe);
     let changed = false;
     for (const canvas of [byId("map"), byId("beside")]) {
       const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
@@ -129,6 +163,8 @@ class App {
     this.view.height = byId("map").clientHeight;
     this.moved();
   }
+
+  slide(share) { this.swipe = moveDivider(share); }
 
   moved() {
     this.draw();
@@ -166,6 +202,7 @@ class App {
     this.follow();
     this.refreshPlace();
     this.draw();
+    if (!this.moreRoads && (this.roads?.learned ?? true)) this.moreRoads = setTimeout(() => { this.moreRoads = 0; this.loadRoads(); this.loadAreas(); }, ROADS_MS);
     document.body.dataset.pushed = Number(document.body.dataset.pushed || 0) + found.length;
   }
 
@@ -179,14 +216,14 @@ class App {
   alerted(found) {
     const fresh = this.heardAlerts ? begun(this.alerts, found) : [];
     this.heardAlerts = true;
-    this.alerts = found;
+    this.alerts = bySeverity(found);
     for (const alert of fresh) {
-      this.note(say("alerts.new", { length: Math.round(alert.length_m), direction: alert.direction }));
+      this.note(say("alerts.new", { words: alertWords(alert, this.roadAt(alert.longitude, alert.latitude)) }));
       if (this.show.sound) beep();
     }
     byId("tab-alerts").textContent = found.length ? `${say("tab.alerts")} (${found.length})` : say("tab.alerts");
     document.body.dataset.alerts = found.length;
-    if (this.tab === "alerts") this.panel();
+    if (this.tab === "alerts" || this.tab === "now") this.panel();
     this.draw();
   }
 
@@ -202,6 +239,7 @@ class App {
   tick() {
     const words = this.live.words(this.past?.at ?? null), place = byId("live");
     if (place.textContent !== words) place.textContent = words;
+    stateCard(this);
     place.dataset.state = words === say("live") ? "live" : "late";
   }
 
@@ -215,7 +253,7 @@ class App {
 
   drawNow() {
     const extra = {
-      base: this.base, away: this.past ? [] : this.away, alerts: this.past ? [] : this.alerts, route: this.route, bounds: this.show.bounds,
+      base: this.base, roads: this.show.roads && !this.show.borrowed ? this.roads : null, away: this.past ? [] : this.away, alerts: this.past ? [] : this.alerts, route: this.route, bounds: this.show.bounds,
       oldest: this.show.recent ? (this.cells.at ?? this.live.now()) - this.show.recent : 0, truth: this.show.overlay ? this.truth : null, chosen: this.chosen,
     };
     const drawn = paint(byId("map").getContext("2d"), this.view, this.cells, extra);
@@ -227,7 +265,7 @@ class App {
   drawBeside(extra) {
     const now = this.pinned.at === null;
     paint(byId("beside").getContext("2d"), this.view, this.pinned, { ...extra, away: now ? this.away : [], alerts: now ? this.alerts : [] });
-    for (const [id, at] of [["moment-left", this.cells.at], ["moment-right", this.pinned.at]]) byId(id).textContent = at === null ? say("time.now") : clock(at);
+    for (const [id, at] of [["moment-left", this.cells.at], ["moment-right", this.pinned.at]]) byId(id).textContent = at === null ? say("time.now") : `${clock(at)} ${zone(at)}`;
   }
 
   click(px, py) {
@@ -260,7 +298,7 @@ class App {
 
   async panel() {
     const name = this.tab, made = await ({
-      legend: () => legend(this), cell: () => placePanel(this, this.chosen), alerts: () => alertsPanel(this), route: () => routePanel(this),
+      now: () => overviewPanel(this), legend: () => legend(this), cell: () => placePanel(this, this.chosen), alerts: () => alertsPanel(this), route: () => routePanel(this),
       health: () => healthPanel(this), share: () => sharePanel(this),
     })[name]();
     if (name === this.tab) byId("panel").replaceChildren(...made);
@@ -339,7 +377,7 @@ class App {
   remember() {
     const { view, show, chosen } = this, state = {
       x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: this.past?.at, compare: this.comparing ? this.pinned.at ?? "now" : null, tab: this.tab,
-      cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", overlay: show.overlay, borrowed: show.borrowed,
+      cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", cells: show.roads ? null : "1", theme: this.theme, overlay: show.overlay, borrowed: show.borrowed,
       recent: show.recent || null, sound: show.sound, route: this.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
     };
     if (this.view.gone || this.cells.known.size) history.replaceState(null, "", toHash(state));

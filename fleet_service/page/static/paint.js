@@ -1,21 +1,23 @@
-// Drawing: squares where the map is far, four headings to a square where it is near; a bound is hollow, nobody is nothing.
+// Drawing: base map, roads as ribbons, squares where the map is far or cells are asked for; a bound is hollow, nobody is
+// nothing.
 import { BORROWED } from "./blocks.js";
-import { HOLLOW, alertColour, fills, groundColour } from "./colours.js";
+import { HOLLOW, alertColour, fills, groundColour, inks, themeName } from "./colours.js";
 import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
 import { Pixels } from "./pixels.js";
+import { ribbons, ribbonWidth, streets } from "./ribbons.js";
+import { write } from "./vector.js";
 
-const NEAR_PX = 14, pixels = new Pixels();
-const BOUND_INK = "#7d7d7d", TRUTH_INK = "#000000", ROUTE_INK = "#0a4fb3";
+const NEAR_PX = 14, MOST_RECORDS = 9000, LEAST_RIBBON_ZOOM = 14.7, pixels = new Pixels();
 
-let hatch = null;
+const hatches = {};
 function hatching(pen) {
-  if (hatch) return hatch;
+  if (hatches[themeName()]) return hatches[themeName()];
   const tile = document.createElement("canvas");
   tile.width = tile.height = 8;
   const ink = tile.getContext("2d");
-  ink.strokeStyle = "#b9b9b9";
+  ink.strokeStyle = inks().hatch;
   ink.beginPath(); ink.moveTo(0, 8); ink.lineTo(8, 0); ink.stroke();
-  return hatch = pen.createPattern(tile, "repeat");
+  return hatches[themeName()] = pen.createPattern(tile, "repeat");
 }
 
 // Returns how many places were drawn, by kind.
@@ -23,50 +25,87 @@ export function paint(pen, view, cells, extra) {
   const drawn = new Array(8).fill(0), box = view.box, near = view.scale / CELLS >= NEAR_PX, passes = passing(extra);
   const seen = [...cells.tiles.values()].filter(({ west, north }) =>
     west <= box.east && north <= box.south && west + 1 / TILES >= box.west && north + 1 / TILES >= box.north);
-  const parted = tile => near && tile.block.level === CELL_LEVEL, below = extra.base || extra.away.length || extra.route.length;
+  const records = seen.reduce((sum, tile) => sum + tile.block.count, 0), roads = extra.roads;
+  const asRoads = roads && view.zoom >= LEAST_RIBBON_ZOOM && records <= MOST_RECORDS && seen.every(tile => tile.block.level === CELL_LEVEL);
+  const named = roads && !roads.learned, below = extra.base || named || asRoads || extra.away.length || extra.route.length;
   if (below) {
     pen.fillStyle = groundColour();
     pen.fillRect(0, 0, view.width, view.height);
     extra.base?.paint(pen, view);
+    if (named && !extra.base?.label && view.zoom >= LEAST_RIBBON_ZOOM - 2) streets(pen, view, roads);
     if (extra.route.length) corridor(pen, view, extra.route);
     for (const region of extra.away) regionAway(pen, view, region.box);
   }
-  pixels.begin(pen.canvas.width, pen.canvas.height, pen.canvas.width / view.width, !below);
-  for (const tile of seen) if (!parted(tile)) pixels.squares(view, tile.squares, passes, drawn);
-  pixels.show(pen);
-  for (const tile of seen) if (parted(tile)) headings(pen, view, tile.parts, passes, drawn);
+  if (asRoads) {
+    for (const alert of extra.alerts) halo(pen, view, alert);
+    const left = roads.lay(seen, passes, drawn, box);
+    ribbons(pen, view, roads);
+    for (const [tile, rows] of left) dots(pen, view, tile.parts, rows);
+  } else {
+    const parted = tile => near && tile.block.level === CELL_LEVEL;
+    pixels.begin(pen.canvas.width, pen.canvas.height, pen.canvas.width / view.width, !below);
+    for (const tile of seen) if (!parted(tile)) pixels.squares(view, tile.squares, passes, drawn);
+    pixels.show(pen);
+    for (const tile of seen) if (parted(tile)) headings(pen, view, tile.parts, passes, drawn);
+    for (const alert of extra.alerts) halo(pen, view, alert);
+  }
   if (extra.truth) truthDots(pen, view, extra.truth);
-  for (const alert of extra.alerts) ring(pen, view, alert);
+  if (extra.base?.label) extra.base.label(pen, view);
+  else if (named) names(pen, view, roads);
+  extra.alerts.forEach((alert, k) => badge(pen, view, alert, k + 1));
   if (extra.route.length) stops(pen, view, extra.route);
   if (extra.chosen) mark(pen, view, extra.chosen);
   return drawn;
 }
 
-// What a person asked to see, or null: all.
+// What a person asked to see, or null: all. What is known to be slippery is no mere bound, whatever its basis.
 const passing = extra => extra.oldest === 0 && extra.bounds ? null : (rows, k) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== 255);
 
 // 0 east, 1 north, 2 west, 3 south: the triangle on that side of the square.
 export const SIDES = [[1, 0, 1, 1], [1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 1, 1]];
 
-function headings(pen, view, { rows, x, y, kind, side }, passes, drawn) {
-  const px = side * view.scale, colours = fills(), box = view.box;
+function triangle(pen, left, top, px, sector) {
+  const [ax, ay, bx, by] = SIDES[sector], cx = left + px / 2, cy = top + px / 2, inset = px * .04, toward = (v, middle) => v + Math.sign(middle - v) * inset;
+  pen.beginPath();
+  pen.moveTo(cx + (ax + bx - 1) * inset, cy + (ay + by - 1) * inset);
+  pen.lineTo(toward(left + ax * px, cx), toward(top + ay * px, cy));
+  pen.lineTo(toward(left + bx * px, cx), toward(top + by * px, cy));
+  pen.closePath();
+}
+
+function headings(pen, view, tile, passes, drawn) {
+  const { rows, x, y, kind, side } = tile, box = view.box, shown = [];
   for (let k = 0; k < rows.count; k++) {
     if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north || passes && !passes(rows, k)) continue;
-    const left = view.left(x[k]), top = view.top(y[k]), [ax, ay, bx, by] = SIDES[rows.place[k] & 3];
     drawn[kind[k]]++;
-    const cx = left + px / 2, cy = top + px / 2, inset = px * .04, toward = (v, middle) => v + Math.sign(middle - v) * inset;
-    pen.beginPath();
-    pen.moveTo(cx + (ax + bx - 1) * inset, cy + (ay + by - 1) * inset);
-    pen.lineTo(toward(left + ax * px, cx), toward(top + ay * px, cy));
-    pen.lineTo(toward(left + bx * px, cx), toward(top + by * px, cy));
-    pen.closePath();
-    if (kind[k] === HOLLOW) {
-      pen.strokeStyle = BOUND_INK; pen.lineWidth = 1; pen.stroke();
-      continue;
-    }
+    shown.push(k);
+  }
+  parts(pen, view, tile, shown);
+}
+
+// Headings of cells, a triangle each; too small for that, a square.
+function parts(pen, view, { rows, x, y, kind, side }, shown) {
+  const px = side * view.scale, colours = fills(), ink = inks();
+  for (const k of shown) {
+    const left = view.left(x[k]), top = view.top(y[k]);
+    if (px >= NEAR_PX) triangle(pen, left, top, px, rows.place[k] & 3);
+    else { pen.beginPath(); pen.rect(left + .5, top + .5, Math.max(2, px - 1), Math.max(2, px - 1)); }
+    if (kind[k] === HOLLOW) { pen.strokeStyle = ink.bound; pen.lineWidth = 1; pen.stroke(); continue; }
     pen.fillStyle = colours[kind[k]];
     pen.fill();
-    if (rows.basis[k] === BORROWED) { pen.strokeStyle = TRUTH_INK; pen.lineWidth = 1; pen.setLineDash([2, 2]); pen.stroke(); pen.setLineDash([]); }
+    if (rows.basis[k] === BORROWED) { pen.strokeStyle = ink.text; pen.lineWidth = 1; pen.setLineDash([2, 2]); pen.stroke(); pen.setLineDash([]); }
+  }
+}
+
+// Cells that lie on no road of the map, such as a turn into a yard.
+function dots(pen, view, { x, y, kind, side }, shown) {
+  const radius = Math.max(1.5, Math.min(6, ribbonWidth(view) * .3)), colours = fills(), ink = inks();
+  for (const k of shown) {
+    pen.beginPath();
+    pen.arc(view.left(x[k] + side / 2), view.top(y[k] + side / 2), radius, 0, 2 * Math.PI);
+    if (kind[k] === HOLLOW) { pen.strokeStyle = ink.bound; pen.lineWidth = 1; pen.stroke(); continue; }
+    pen.fillStyle = colours[kind[k]];
+    pen.fill();
   }
 }
 
@@ -74,31 +113,67 @@ function regionAway(pen, view, [west, south, east, north]) {
   const left = view.left(worldX(west)), top = view.top(worldY(north)), right = view.left(worldX(east)), bottom = view.top(worldY(south));
   pen.fillStyle = hatching(pen);
   pen.fillRect(left, top, right - left, bottom - top);
-  pen.strokeStyle = "#8a8a8a";
+  pen.strokeStyle = inks().bound;
   pen.lineWidth = 2;
   pen.strokeRect(left, top, right - left, bottom - top);
 }
 
-function ring(pen, view, { bbox: [west, south, east, north] }) {
-  const middle = [view.left(worldX((west + east) / 2)), view.top((worldY(south) + worldY(north)) / 2)];
-  const half = [worldX(east) - worldX(west), worldY(south) - worldY(north)].map(size => Math.max(11, size / 2 * view.scale + 8));
+// A stretch under alert: a broad outline around its road, and its number in the list beside it.
+function halo(pen, view, alert) {
+  const width = Math.max(22, 3.6 * ribbonWidth(view)), path = new Path2D();
+  const points = alert.points?.length ? alert.points.map(([latitude, longitude]) => [view.left(worldX(longitude)), view.top(worldY(latitude))]) : [middle(view, alert)];
+  points.forEach(([x, y], k) => k ? path.lineTo(x, y) : path.moveTo(x, y));
+  if (points.length === 1) path.lineTo(points[0][0] + .01, points[0][1]);
+  pen.lineJoin = pen.lineCap = "round";
+  for (const [wide, ink] of [[width + 6, alertColour()], [width, groundColour()]]) { pen.lineWidth = wide; pen.strokeStyle = ink; pen.stroke(path); }
+  pen.globalAlpha = .16;
+  pen.strokeStyle = alertColour();
+  pen.stroke(path);
+  pen.globalAlpha = 1;
+  pen.lineCap = "butt";
+}
+
+const middle = (view, { bbox: [west, south, east, north] }) => [view.left(worldX((west + east) / 2)), view.top((worldY(south) + worldY(north)) / 2)];
+
+function badge(pen, view, alert, number) {
+  const [x, y] = middle(view, alert), up = Math.max(22, 3.6 * ribbonWidth(view)) * .5 + 16;
   pen.beginPath();
-  pen.roundRect(middle[0] - half[0], middle[1] - half[1], 2 * half[0], 2 * half[1], Math.min(...half));
-  for (const [width, ink] of [[6, "#ffffff"], [3, alertColour()]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
+  pen.moveTo(x, y - up + 18);
+  pen.arc(x, y - up, 12, .8, Math.PI - .8, true);
+  pen.closePath();
+  for (const [paintIt, ink, wide] of [["stroke", groundColour(), 4], ["fill", alertColour(), 0]]) { pen.lineWidth = wide; pen[`${paintIt}Style`] = ink; pen[paintIt](); }
+  pen.font = "700 13px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.textBaseline = "middle";
+  pen.fillStyle = themeName() === "dark" ? "#000000" : "#ffffff";
+  pen.fillText(String(number), x, y - up + .5);
+}
+
+// Names of roads where no base map has them.
+function names(pen, view, roads) {
+  const placed = [], said = new Set(), ink = inks();
+  if (view.zoom < LEAST_RIBBON_ZOOM) return;
+  for (const line of roads.lines) {
+    if (!line.name || said.has(line.name)) continue;
+    const at = Math.floor(line.count / 2), step = Math.min(4, line.count - at), a = [view.left(line.x[at]), view.top(line.y[at])], b = [view.left(line.x[at + step]), view.top(line.y[at + step])];
+    if (!step || a[0] < 0 || a[1] < 0 || a[0] > view.width || a[1] > view.height || line.length * view.scale < line.name.length * 7) continue;
+    const turn = Math.atan2(b[1] - a[1], b[0] - a[0]), flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn, off = ribbonWidth(view) * 1.6 + 9;
+    if (write(pen, ink, line.name, a[0] + Math.sin(flat) * off, a[1] - Math.cos(flat) * off, flat, 12.5, placed, view)) said.add(line.name);
+  }
 }
 
 // Along a route, below the cells: as broad as they are, so that none is hidden.
 function corridor(pen, view, points) {
-  const px = Math.max(8, 1.3 * view.scale / CELLS);
+  const px = Math.max(10, 2.6 * ribbonWidth(view));
   pen.lineJoin = pen.lineCap = "round";
   pen.beginPath();
   for (const [longitude, latitude] of points) pen.lineTo(view.left(worldX(longitude)), view.top(worldY(latitude)));
-  for (const [width, ink] of [[px + 5, ROUTE_INK], [px, groundColour()]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
+  for (const [width, ink] of [[px + 5, inks().route], [px, groundColour()]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
   pen.lineCap = "butt";
 }
 
 function stops(pen, view, points) {
-  pen.fillStyle = ROUTE_INK;
+  pen.fillStyle = inks().route;
   for (const [longitude, latitude] of points.length <= 60 ? points : [points[0], points.at(-1)]) {
     pen.beginPath();
     pen.arc(view.left(worldX(longitude)), view.top(worldY(latitude)), 5, 0, 2 * Math.PI);
@@ -107,9 +182,8 @@ function stops(pen, view, points) {
 }
 
 function mark(pen, view, { x, y, side }) {
-  pen.lineWidth = 3; pen.strokeStyle = ROUTE_INK;
-  const px = Math.max(side * view.scale, 8), middle = .5 * (px - side * view.scale);
-  pen.strokeRect(view.left(x) - middle - 2, view.top(y) - middle - 2, px + 4, px + 4);
+  const px = Math.max(side * view.scale, 10), cx = view.left(x + side / 2), cy = view.top(y + side / 2);
+  for (const [wide, ink] of [[5, groundColour()], [2.5, inks().route]]) { pen.lineWidth = wide; pen.strokeStyle = ink; pen.strokeRect(cx - px / 2 - 2, cy - px / 2 - 2, px + 4, px + 4); }
 }
 
 function truthDots(pen, view, truth) {
@@ -122,7 +196,9 @@ function truthDots(pen, view, truth) {
     pen.arc(left, top, radius, 0, 2 * Math.PI);
     pen.fillStyle = colours[kind];
     pen.fill();
-    if (px >= NEAR_PX) { pen.strokeStyle = TRUTH_INK; pen.lineWidth = 1; pen.stroke(); }
+    pen.strokeStyle = inks().text;
+    pen.lineWidth = 1;
+    pen.stroke();
   }
 }
 

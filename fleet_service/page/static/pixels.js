@@ -1,9 +1,9 @@
 // Squares as numbers in memory: of twenty thousand, each a call of the canvas, a browser without a graphics card paints
 // some eight pictures a second; written into one picture it is as many as it shows.
 import { BORROWED } from "./blocks.js";
-import { HOLLOW, fills, groundColour } from "./colours.js";
+import { HOLLOW, fills, groundColour, inks } from "./colours.js";
 
-const BOUND_INK = "#7d7d7d", DASH_INK = "#000000", LEAST_PX = 3, DASH_PX = 2;
+const LEAST_PX = 3, DASH_PX = 2;
 const TIE = 1e-4;  // of a point: neighbours, of two tiles too, round their common edge to the same side
 
 const word = colour => {  // "#rrggbb" as the four bytes of a point
@@ -24,8 +24,8 @@ export class Pixels {
     Object.assign(this, { width, height, ratio, opaque, line: Math.max(1, Math.round(ratio)) });
     this.ground = word(groundColour());
     this.inks = fills().map(word);
-    this.bound = word(BOUND_INK);
-    this.dash = word(DASH_INK);
+    this.bound = word(inks().bound);
+    this.dash = word(inks().text);
     this.points.fill(opaque ? this.ground : 0);
   }
 

@@ -3,7 +3,9 @@ import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
 import { density, history } from "./charts.js";
 import { make } from "./elements.js";
 import { HEADINGS, cellOf } from "./grid.js";
-import { ago, clock, say } from "./texts.js";
+import { kindOf, rankOf } from "./colours.js";
+import { ago, clock, say, zone } from "./texts.js";
+import { certainty, coordinates } from "./words.js";
 
 const BASES = { [MEASURED]: "measured", [BORROWED]: "borrowed" };
 
@@ -15,9 +17,10 @@ export function safeSpeed(lower, sight, reaction) {
 // A record in numbers; `mu` is null where nothing was measured.
 export function numbers(record, settings) {
   const { mu_steps: steps, share_steps: shares } = settings;
-  const basis = BASES[record.basis] ?? "bound";
+  const sure = record.slippery > shares / 2, basis = BASES[record.basis] ?? (sure ? "measured" : "bound");  // known ice is never a mere bound
+  const mu = basis === "bound" ? null : record.mu === NO_NUMBER ? (record.lower + record.upper) / 2 / steps : record.mu / steps;
   return {
-    ...record, basis, mu: basis === "bound" || record.mu === NO_NUMBER ? null : record.mu / steps, lower: record.lower / steps, upper: record.upper / steps,
+    ...record, basis, mu, lower: record.lower / steps, upper: record.upper / steps,
     slippery: Math.min(1, record.slippery / shares), unknown: record.unknown / shares,
   };
 }
@@ -29,11 +32,21 @@ const percent = value => value > .995 ? say("percent.over", { n: 99 }) : value <
 
 export function placePanel(app, chosen) {
   if (!chosen) return [make("p", {}, say("cell.none"))];
-  if (!chosen.records.length) return [make("h2", {}, say("tab.cell")), make("p", { class: "nobody" }, say("cell.nobody"))];
-  return chosen.records.map(record => one(app, chosen, numbers(record, app.settings)));
+  const head = placeHead(app, chosen);
+  if (!chosen.records.length) return [...head, make("p", { class: "nobody" }, say("cell.nobody"))];
+  const kind = record => kindOf(record.basis, record.mu, record.lower, record.upper, record.slippery);
+  const ordered = [...chosen.records].sort((a, b) => rankOf(kind(a)) - rankOf(kind(b)));
+  return [...head, ...ordered.map(record => one(app, chosen, numbers(record, app.settings), kind(record)))];
 }
 
-function one(app, chosen, cell) {
+// Where it is: road, coordinates to copy, and the number of the cell.
+function placeHead(app, chosen) {
+  const [longitude, latitude] = app.degreesOf(chosen.middleX, chosen.middleY), where = coordinates(longitude, latitude), road = app.roadAt(longitude, latitude);
+  const copy = make("button", { type: "button", onclick: async e => { await navigator.clipboard?.writeText(`${latitude.toFixed(6)}, ${longitude.toFixed(6)}`); e.target.textContent = say("cell.copied"); } }, say("cell.copy"));
+  return [make("h2", {}, road || say("tab.cell")), make("p", { class: "line place" }, make("span", { "data-value": "coordinates" }, where), copy)];
+}
+
+function one(app, chosen, cell, kind) {
   const now = app.cells.at ?? app.live.now(), whole = cell.level === 21, limit = app.settings.colours.slippery;
   const list = make("dl", {}), line = (name, value, id) => list.append(make("dt", {}, name), make("dd", { "data-value": id }, value));
   line(say("cell.grip"), cell.mu === null ? say("cell.grip.bound", { lower: down(cell.lower) }) : say("cell.grip.value", { mu: two(cell.mu), lower: down(cell.lower), upper: two(cell.upper) }), "grip");
@@ -42,11 +55,11 @@ function one(app, chosen, cell) {
   const speeds = cell.basis === "measured" ? app.settings.sights_m.map(sight => say("cell.speed.value", { speed: Math.floor(3.6 * safeSpeed(cell.lower, sight, app.settings.reaction_s)), sight })) : [say("cell.speed.unknown")];
   line(say("cell.speed"), speeds.join("; "), "speed");
   line(say("cell.vehicles"), cell.vehicles === 255 ? "255+" : String(cell.vehicles), "vehicles");
-  line(say("cell.age"), say("cell.age.value", { ago: ago(now - cell.last), time: clock(cell.last) }), "age");
-  for (const alert of alertsAt(app, chosen, whole ? HEADINGS[cell.sector] : null)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, reason: alert.reason }), "alert");
+  line(say("cell.age"), say("cell.age.value", { ago: ago(now - cell.last), time: `${clock(cell.last)} ${zone(cell.last)}` }), "age");
+  for (const alert of alertsAt(app, chosen, whole ? HEADINGS[cell.sector] : null)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, percent: certainty(alert.p_slippery) }), "alert");
   const past = make("div", { class: "history" });
   const section = make("section", { class: "heading", "data-sector": cell.sector },
-    make("h2", {}, whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("cell.square")), list,
+    make("div", { class: "headline" }, make("span", { class: `swatch ${kind === 7 ? "hollow" : `k${kind}`}` }), make("h3", {}, `${say(`cell.headline.${kind}`)}, ${whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("cell.square")}`)), list,
     cell.basis === "measured" ? make("p", { class: "note" }, say("cell.speed.note", { reaction: app.settings.reaction_s })) : null,
     make("figure", {}, density(cell, limit), make("figcaption", {}, say(cell.mu === null ? "cell.density.bound" : "cell.density"))), past);
   if (whole) fillIn(app, chosen, cell, list, past);

@@ -1,7 +1,8 @@
 // The whole state as a link, and what is seen as a file.
 import { numbers } from "./place.js";
 import { byId, make } from "./elements.js";
-import { HEADINGS, latitudeOf, longitudeOf } from "./grid.js";
+import { HEADINGS, cellOf, latitudeOf, longitudeOf } from "./grid.js";
+import { SIDES } from "./paint.js";
 import { say } from "./texts.js";
 
 export function toHash(state) {
@@ -34,11 +35,11 @@ function seen(app) {
       if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north) continue;
       const raw = Object.fromEntries(["last", "mu", "lower", "upper", "slippery", "basis", "vehicles", "unknown"].map(name => [name, records[name][k]]));
       const cell = numbers(raw, app.settings), level = tile.block.level;
-      rows.push({
-        west: longitudeOf(x[k]), south: latitudeOf(y[k] + side), east: longitudeOf(x[k] + side), north: latitudeOf(y[k]), zoom: level,
-        heading: level === 21 ? HEADINGS[records.place[k] & 3] : "all", basis: cell.basis, mu: cell.mu, mu_lower: cell.lower, mu_upper: cell.upper,
-        p_slippery: cell.slippery, unknown_share: cell.unknown, vehicles: cell.vehicles, last_time: new Date(cell.last * 1000).toISOString(),
-      });
+      const corner = (cx, cy) => [longitudeOf(x[k] + cx * side), latitudeOf(y[k] + cy * side)], whole = level === 21;
+      const sector = records.place[k] & 3, [ax, ay, bx, by] = SIDES[sector], middle = corner(.5, .5);
+      const ring = whole ? [middle, corner(ax, ay), corner(bx, by), middle] : [[0, 1], [1, 1], [1, 0], [0, 0], [0, 1]].map(([cx, cy]) => corner(cx, cy));
+      rows.push({ ring, cell: whole ? cellOf(tile.block.tile, records.place[k] >> 2) : null, sector: whole ? sector : null, heading: whole ? HEADINGS[sector] : "all", mu: cell.mu, mu_lower: cell.lower, mu_upper: cell.upper,
+        p_slippery: cell.slippery, basis: cell.basis, vehicles: cell.vehicles, last_time: new Date(cell.last * 1000).toISOString(), latitude: middle[1], longitude: middle[0], zoom: level, unknown_share: cell.unknown });
     }
   }
   return rows;
@@ -47,15 +48,16 @@ function seen(app) {
 const short = value => typeof value === "number" ? Number(value.toFixed(7)) : value;
 
 function geojson(rows) {
-  return JSON.stringify({ type: "FeatureCollection", features: rows.map(({ west, south, east, north, ...rest }) => ({
-    type: "Feature", geometry: { type: "Polygon", coordinates: [[[west, south], [east, south], [east, north], [west, north], [west, south]].map(point => point.map(short))] },
+  return JSON.stringify({ type: "FeatureCollection", features: rows.map(({ ring, ...rest }) => ({
+    type: "Feature", geometry: { type: "Polygon", coordinates: [ring.map(point => point.map(short))] },
     properties: Object.fromEntries(Object.entries(rest).map(([name, value]) => [name, short(value)])),
   })) });
 }
 
 function csv(rows) {
   if (!rows.length) return "";
-  return [Object.keys(rows[0]).join(","), ...rows.map(row => Object.values(row).map(value => value === null ? "" : short(value)).join(","))].join("\r\n") + "\r\n";
+  const plain = rows.map(({ ring, ...rest }) => rest);
+  return [Object.keys(plain[0]).join(","), ...plain.map(row => Object.values(row).map(value => value === null ? "" : short(value)).join(","))].join("\r\n") + "\r\n";
 }
 
 function download(name, kind, text) {

@@ -25,3 +25,9 @@ export function clock(seconds) {
   const at = new Date(seconds * 1000), two = n => String(n).padStart(2, "0");
   return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
 }
+
+// The browser's time zone, as it was at a moment.
+export function zone(seconds = Date.now() / 1000) {
+  const minutes = -new Date(seconds * 1000).getTimezoneOffset(), two = n => String(n).padStart(2, "0"), size = Math.abs(minutes);
+  return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "−" : "+"}${two(Math.floor(size / 60))}:${two(size % 60)}`;
+}

@@ -1,6 +1,6 @@
 // The kept moments as a slider: its last place is now. The moment that is shown is always said.
 import { make } from "./elements.js";
-import { clock, say } from "./texts.js";
+import { clock, say, zone } from "./texts.js";
 
 const PLAY_MS = 700;
 
@@ -40,12 +40,13 @@ export class Timeline {
   }
 
   say(printed = false) {
-    const now = printed ? say("time.printed", { moment: clock(this.app.live.now()) }) : say("time.now");
-    const words = this.at === null ? now : say("time.shown", { moment: clock(this.at) });
+    const stamp = at => `${clock(at)} ${zone(at)}`, now = printed ? say("time.printed", { moment: stamp(this.app.live.now()) }) : say("time.now");
+    const words = this.at === null ? now : say("time.shown", { moment: stamp(this.at) });
     this.shown.textContent = words;
     this.slider.setAttribute("aria-valuetext", words);
     const any = this.moments.length > 0;
     this.none.hidden = any;
+    this.none.textContent = say(this.app.settings.archive ? "time.none.archive" : "time.none");
     for (const one of [this.play, this.slider, this.compare]) one.disabled = !any;
     this.compare.textContent = say(this.app.comparing ? "time.compare.stop" : "time.compare");
     this.compare.setAttribute("aria-pressed", String(this.app.comparing));

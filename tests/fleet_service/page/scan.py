@@ -7,7 +7,7 @@ from typing import Any, Final
 from tests.browser import Opened
 from tests.npm import file_of
 
-TABS: Final = ("legend", "cell", "alerts", "route", "health", "share")
+TABS: Final = ("now", "legend", "cell", "alerts", "route", "health", "share")
 SERIOUS: Final = ("serious", "critical")
 _RUN: Final = "async () => (await axe.run(document)).violations"
 MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with npm"

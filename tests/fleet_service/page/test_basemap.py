@@ -12,7 +12,7 @@ from typing import Final
 
 import pytest
 
-from fleet_service.page.basemap import OWN, ZOOMS, base_map
+from fleet_service.page.basemap import OWN, ZOOMS, BaseMap, base_map
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -62,14 +62,14 @@ def test_mbtiles_rows_count_from_the_south_and_requests_from_the_north(tmp_path:
     assert [of.file.picture(*place) for place in ((1, 1, 0), (2, 4, 0), (2, -1, 0), (-1, 0, 0), (99, 0, 0))] == [
         None
     ] * 5
-    assert base_map("https://t.example/{z}/{x}/{y}.png") == ("https://t.example/{z}/{x}/{y}.png", ZOOMS, None)
+    assert base_map("https://t.example/{z}/{x}/{y}.png") == BaseMap("https://t.example/{z}/{x}/{y}.png", ZOOMS)
 
 
 def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
     (tmp_path / "text.mbtiles").write_text("no table")
     names = {
         "missing.mbtiles": "is not there", "text.mbtiles": "cannot be read",
-        tiles_in(tmp_path / "vector.mbtiles", {(0, 0, 0): b"x"}, "pbf").name: "holds pbf tiles",
+        tiles_in(tmp_path / "other.mbtiles", {(0, 0, 0): b"x"}, "svg").name: "holds svg tiles",
         tiles_in(tmp_path / "empty.mbtiles", {}).name: "holds no tile",
     }  # fmt: skip
     for name, problem in names.items():

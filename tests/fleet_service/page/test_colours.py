@@ -3,34 +3,50 @@
 from __future__ import annotations
 
 import colorsys
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import pytest
 
-from fleet_service.page.colours import EDGES, FOUR, GROUND, LITTLE, TWO, colour_of
+from fleet_service.page.colours import EDGES, colour_of
+from schemas.runtime.palette import DARK_FOUR, DARK_GROUND, DARK_LITTLE, DARK_TWO, FOUR, GROUND, LITTLE, TWO
 from tests.sight import SIGHTS, difference, lab
 
 LEAST = 10.0
+STEP = 5.0  # of lightness between two classes that follow each other in danger
 ALL = (*FOUR, *TWO, LITTLE, GROUND)
+DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
+
+
+def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
+    """Ice, snow, rather slippery, wet, rather not, good grip."""
+    return (four[0], four[1], two[0], four[2], two[1], four[3])
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_any_two_classes_and_the_ground_are_told_apart(sight: str) -> None:
-    assert len(set(ALL)) == 8
-    assert min(difference(lab(a, sight), lab(b, sight)) for a, b in combinations(ALL, 2)) >= LEAST
+@pytest.mark.parametrize("palette", [ALL, DARK], ids=["light", "dark"])
+def test_any_two_classes_and_the_ground_are_told_apart(sight: str, palette: tuple[str, ...]) -> None:
+    assert len(set(palette)) == 8
+    assert min(difference(lab(a, sight), lab(b, sight)) for a, b in combinations(palette, 2)) >= LEAST
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_lightness_is_the_order_of_danger(sight: str) -> None:
+    """On light ground the most dangerous is the darkest, on dark ground the lightest; grey paper shows the same."""
+    for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
+        light = [sign * float(lab(colour, sight)[0]) for colour in ladder]
+        assert min(b - a for a, b in pairwise(light)) >= STEP
+
+
+def test_known_slippery_is_never_grey() -> None:
+    assert colour_of(0.35, 0.05, 1.1, 0.51) == TWO[0]
+    assert colour_of(0.35, 0.05, 1.1, 0.5) == LITTLE
 
 
 def test_nothing_is_green() -> None:
-    for colour in ALL:
+    for colour in (*ALL, *DARK):
         red, green, blue = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
         hue, saturation, _ = colorsys.rgb_to_hsv(red, green, blue)
         assert saturation < 0.05 or not 75 < 360 * hue < 170, colour
-
-
-def test_darker_is_more_slippery_on_grey_paper_too() -> None:
-    four, two = ([float(lab(colour)[0]) for colour in some] for some in (FOUR, TWO))
-    assert four == sorted(four)
-    assert two == sorted(two)
 
 
 def test_the_less_is_known_the_fewer_colours() -> None:

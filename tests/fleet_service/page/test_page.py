@@ -14,6 +14,7 @@ import pytest
 from fleet_service.archive.format import snapshots
 from fleet_service.page import colours
 from schemas import grid
+from schemas.runtime import palette
 from tests.browser import Opened, opened
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage
@@ -88,7 +89,7 @@ def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningP
         assert found[HOLLOW] == street.known("passed")
         assert sum(found[WET : DRY + 1]) + found[RATHER_NOT] == street.known("wet", "dry", "avenue")
         look(seen, "near")
-        ice = colours.FOUR[0]
+        ice = palette.FOUR[0]
         named = ",".join(str(int(ice[k : k + 2], 16)) for k in (1, 3, 5))
         painted: int = seen.page.evaluate(_POINTS, named)
         assert painted > 100
@@ -157,7 +158,7 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
         hollow = seen.page.evaluate(
             "async () => { const { kindOf } = await import('/static/colours.js'); return kindOf(0, 160, 150, 170) }"
         )
-    names = [*colours.FOUR, *colours.TWO, colours.LITTLE]
+    names = [*palette.FOUR, *palette.TWO, palette.LITTLE]
     assert [names[k] for k in there] == [colours.colour_of(*(v / 200 for v in one)) for one in triples]
     assert hollow == HOLLOW
     assert len(set(there)) == 7
@@ -174,7 +175,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(page: RunningPa
         assert told["basis"] == "measured"
         assert told["vehicles"] == str(len(street.CARS)) == told["observations"]
         assert "km/h with 50 m of sight" in told["speed"]
-        alert = re.match(r"(\d+) vehicles found it slippery; P\(mu < 0.4\)", told["alert"])
+        alert = re.match(r"(\d+) vehicles found it slippery, (over )?\d+ % sure", told["alert"])
         assert alert is not None, told["alert"]
         assert 2 <= int(alert[1]) <= len(street.CARS), "as many as had been heard when it was raised"
         assert seen.page.locator(".chart .density").count() == 2
@@ -207,7 +208,8 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(page: Runni
         waits(seen, "document.getElementById('live').dataset.state === 'live'")
         seen.page.locator("#tab-alerts").click()
         said = seen.page.locator("[data-alert]").inner_text()
-        assert "P(mu < 0.4)" in said
+        assert re.search(r"Ice, eastbound and westbound, at [\d.]+° N", said)
+        assert re.search(r"\d+ % sure that it is slippery", said)
         assert " vehicles" in said
         assert not seen.page.evaluate("gripmap.show.sound"), "off unless it was asked for"
         seen.page.evaluate("gripmap.view.go(.1, .1, 5)")

@@ -55,7 +55,7 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
         moments = [int(at) for at, _ in played[:-1]]
         assert moments == sorted(moments)
         assert len(set(moments)) >= 2
-        assert moments[0] == first
+        assert abs(moments[0] - first) <= 10, "a moment from memory may come before the first snapshot"
         ice = [int(drawn.split(",")[ICE]) for _, drawn in played]
         assert (ice[0], ice[-1]) == (0, street.known("ice"))
         waits(seen, "gripmap.timeline.timer === null")
@@ -87,10 +87,12 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPa
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         seen.page.emulate_media(media="print")
         seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
-        assert re.fullmatch(r"as of \d{4}-\d\d-\d\d \d\d:\d\d:\d\d", seen.page.locator("#moment").inner_text())
-        for selector in ("#tabs", "#controls", "#play", "#slider"):
-            assert not seen.page.locator(selector).is_visible(), selector
-        for selector in ("#map", "#panel", "#scale", "#moment"):
+        assert re.fullmatch(r"as of \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC.*", seen.page.locator("#moment").inner_text())
+        assert "as of 20" in seen.page.locator("#paper h2").inner_text()
+        assert seen.page.locator("#paper .ladder li").count() == 8
+        for selector in ("#tabs", "#controls", "#play", "#slider", "#panel button", "#searching"):
+            assert not any(one.is_visible() for one in seen.page.locator(selector).all()), selector
+        for selector in ("#map", "#panel", "#scale", "#moment", "#paper"):
             assert seen.page.locator(selector).is_visible(), selector
         panel = seen.page.evaluate("(p => [p.scrollHeight, p.clientHeight])(document.getElementById('panel'))")
         assert panel[0] <= panel[1] + 1, "no word is cut off"

@@ -6,9 +6,9 @@ from typing import Any, Final
 
 import pytest
 
-from fleet_service.page import colours
 from schemas import grid
 from schemas.config import ZenohSettings
+from schemas.runtime import palette
 from tests.browser import opened
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
@@ -38,7 +38,7 @@ _ALL: Final = """() => {
   const points = document.getElementById("map"), { width, height } = points;
   const bytes = points.getContext("2d").getImageData(0, 0, width, height).data;
   let n = 0;
-  for (let k = 0; k < bytes.length; k += 4) n += bytes[k] + bytes[k + 1] + bytes[k + 2] < 765;
+  for (let k = 0; k < bytes.length; k += 4) n += bytes[k] + bytes[k + 1] + bytes[k + 2] < 660;
   return n;
 }"""
 
@@ -74,6 +74,7 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: Runn
             " CanvasRenderingContext2D.prototype.stroke = function () {"
             " if (this.getLineDash().length) dashed.push(this.lineWidth); return real.apply(this, arguments); } }"
         )
+        seen.page.locator("#tab-legend").click()
         seen.page.locator("#show-borrowed").click()
         waits(seen, "dashed.length > 10")
         assert set(seen.page.evaluate("dashed")) == {1}
@@ -82,7 +83,7 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: Runn
 
 def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
     drive("ice")
-    ice = ",".join(str(int(colours.FOUR[0][k : k + 2], 16)) for k in (1, 3, 5))
+    ice = ",".join(str(int(palette.FOUR[0][k : k + 2], 16)) for k in (1, 3, 5))
     ends = [[float(v) for v in reversed(grid.centre(street.cells(street.PARTS["ice"])[k]))] for k in (0, 4)]
     with shown(page) as seen:
         for zoom in (16.0, 18.0):
@@ -132,6 +133,8 @@ def test_words_stand_beside_what_they_name_on_every_screen(router: ZenohSettings
     with page_of(router) as address, opened(address) as seen:
         seen.page.set_viewport_size(size)
         seen.page.wait_for_selector(READY, state="attached")
+        seen.page.locator("#tab-legend").click()
+        waits(seen, "document.querySelector('label.line')")
         beside = seen.page.evaluate(
             "[...document.querySelectorAll('label.line:has([type=checkbox])')].map(label => {"
             " const words = document.createRange(); words.selectNodeContents(label);"
@@ -143,5 +146,5 @@ def test_words_stand_beside_what_they_name_on_every_screen(router: ZenohSettings
         tops: list[float] = seen.page.evaluate(
             "[...document.querySelectorAll('#tabs button')].map(one => one.offsetTop)"
         )
-        assert len(tops) == 6
+        assert len(tops) == 7
         assert len(set(tops)) == 1

@@ -155,3 +155,12 @@ def test_options_that_say_nothing_are_refused(
 ) -> None:
     assert main(["analyze", *words, "--archive", str(archive)]) == 2
     assert capsys.readouterr().err.startswith(f"error: {field}: ")
+
+
+def test_a_breach_lies_within_the_measurements() -> None:
+    """Half an hour of reports that begins in the middle of a slot: no breach is older or longer than the reports."""
+    begin = 100 * SLOT_S + 1300
+    span = (begin, begin + 1897)
+    by_mean, least, most, since = measured((100, 0.2), (101, 0.2), span=span)
+    assert least <= by_mean <= most == 1897
+    assert since == begin

@@ -1,0 +1,112 @@
+"""Course of the demo: start the parts, let the fleet drive, compare the map with the truth, report."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import time
+import webbrowser
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from deploy.demo import compare, page, picture, processes, screenshot
+from deploy.demo.listener import Listener
+from edge_agent.lab.simulation.scenarios import scenario_named
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.cli.common import stop_on_signals
+from schemas.config import ZenohSettings
+from schemas.runtime import figures
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+
+FOLDER = Path(".demo")
+REPORT_S = 5.0
+
+
+def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, float]]:
+    """Let the fleet drive; return the received data and the fleet's counts."""
+    session = open_session(ZenohSettings(connect=[endpoint]))
+    if session is None:
+        raise processes.DemoError(f"no session to {endpoint}")
+    listener = Listener(session)
+    fleet = processes.fleet(folder, args.vehicles, args.duration, args.seed, args.warned)
+    began = time.monotonic()
+
+    def tick() -> None:
+        print(f"  {time.monotonic() - began:4.0f} s  {listener.progress()}", flush=True)
+
+    if fleet.wait(REPORT_S, tick) != 0:
+        raise processes.DemoError(f"the fleet ended with an error; see {fleet.log}")
+    return listener, fleet.report()
+
+
+def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
+    """Show one query by a client without GripMap code, and how to read the Parquet files."""
+    sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
+    bbox = ",".join(f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max()))
+    print("\nA client that knows only Zenoh asks for the map:", flush=True)
+    subprocess.run([sys.executable, "-m", "deploy.demo.plain_client", endpoint, bbox], check=True)
+    compact(folder / "archive")
+    print(f"""
+The observations, as any Parquet reader sees them:
+  import duckdb
+  print(duckdb.sql("select sector, count(*), median(mu), count(distinct vehicle)
+                    from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
+
+
+def report(
+    folder: Path,
+    comparison: compare.MapComparison,
+    measured: list[figures.Figure],
+    grip: compare.LostGrip,
+    seed: int,
+) -> list[figures.Figure]:
+    """Write and print all figures, draw the map next to the truth and the passes that lost grip; return the figures."""
+    found = [*measured, *grip.figures()]
+    figures.write(folder / "figures.json", "demo", [seed], found)
+    picture.draw(comparison, folder / "map.png", grip)
+    page.write(comparison, found, folder / "map.html")
+    table = figures.markdown(found)
+    print(f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end="")
+    print(f"figures {folder}/figures.json", flush=True)
+    return found
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demo; exit code 1 if a bar of a promise does not hold.
+
+    The delay of the first alert, the number of passes and the duration are goals: a miss is reported in figures and
+    README, but does not fail the demo.
+    """
+    began = time.monotonic()
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    FOLDER.mkdir()
+    appears_s = scenario_named(processes.SCENARIO).events[0].start
+    print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black ice appears.")
+    with (
+        processes.system(FOLDER) as (endpoint, service),
+        processes.page(FOLDER, endpoint, service, args.page_port) as address,
+    ):
+        print(f"\n  See it: {address}\n", flush=True)
+        if args.open:
+            webbrowser.open(address)
+        listener, counts = drive(FOLDER, endpoint, args)
+        visits = pq.read_table(FOLDER / "truth.parquet")
+        changed_ns = compare.start_time(visits) + int(appears_s * NS)
+        comparison = compare.compare(listener.whole_map(), visits, changed_ns)
+        compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
+        show(FOLDER, endpoint, comparison)
+        listener.close()
+        wall_s = time.monotonic() - began
+        measured = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
+        grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
+        found = report(FOLDER, comparison, measured, grip, args.seed)
+        if args.screenshot is not None:
+            screenshot.take(address, args.screenshot)
+        if args.stay:
+            print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
+            stop_on_signals().wait()
+    return 0 if compare.works(found) else 1

@@ -1,0 +1,149 @@
+"""Reasons why a live agent publishes nothing, as sentences for the person who started it."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+
+from edge_agent.inputs.block import Block
+from edge_agent.publish.publisher import Counts
+from schemas.runtime.process import LogLine
+from schemas.signals import S
+
+FIRST_S: Final = 3.0  # after the first block: a session opens and a receiver fixes meanwhile
+EVERY_S: Final = 1.0
+MISSING_S: Final = 2.5  # a receiver of 1 Hz may miss a fix
+UNANSWERED_S: Final = 4.0
+STANDING: Final = 0.5  # rad/s of every wheel: slower than a walking pace
+_NUMBER: Final = re.compile(r"\d+(\.\d+)?")
+
+
+class PublisherState(Protocol):
+    """Part of a publisher that tells whether its records arrive."""
+
+    @property
+    def links(self) -> int:
+        """Return the number of open sessions."""
+        ...
+
+    @property
+    def cut_off(self) -> bool:
+        """Return True if an open session has no router."""
+        ...
+
+    @property
+    def unanswered_s(self) -> float:
+        """Return the time for which nothing sent was answered [s]."""
+        ...
+
+    @property
+    def counts(self) -> Counts:
+        """Return the records by kind and result."""
+        ...
+
+
+class SignalWatch:
+    """Times at which the blocks of a source last had a position, a wheel speed and a turning wheel.
+
+    Args:
+        clock: monotonic [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.began = clock()
+        self._seen: dict[str, float] = {}
+
+    def blocks(self, source: Iterator[Block]) -> Iterator[Block]:
+        """Yield the blocks of a source and record their contents."""
+        for block in source:
+            self.add(block)
+            yield block
+
+    def add(self, block: Block) -> None:
+        """Record the contents of a block."""
+        signals, now = block.signals, self._clock()
+        if not self._seen:
+            self.began = now
+            self._seen = dict.fromkeys(("position", "wheels", "turning"), now)
+        wheels = signals[..., S.OMEGA : S.OMEGA + 4]
+        present = {
+            "position": np.isfinite(signals[..., [S.LATITUDE, S.LONGITUDE]]).all(axis=-1).any(),
+            "wheels": np.isfinite(wheels).any(),
+            "turning": (np.abs(np.nan_to_num(wheels)) > STANDING).any(),
+        }
+        self._seen.update({name: now for name, here in present.items() if here})
+
+    def missing(self, name: str) -> bool:
+        """Return True if the blocks have lacked something for MISSING_S."""
+        return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
+
+
+def reasons(
+    watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
+) -> list[str]:
+    """Return the reasons why nothing is published, the first cause first; empty if records can be published.
+
+    Args:
+        watch: has seen the blocks.
+        publisher: of the records.
+        endpoints: routers that it tries to reach.
+        troubles: of the sources and of the signal doctor.
+    """
+    found = list(troubles)
+    if watch.missing("wheels"):
+        found.append("no wheel speed in the signals: compare the profile with what the car sends")
+    elif watch.missing("turning"):
+        found.append("the vehicle stands: only a moving vehicle visits cells")
+    if watch.missing("position"):
+        found.append("no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and longitude")
+    where = ", ".join(endpoints)
+    if not publisher.links:
+        found.append(f"no router answers at {where}: start one with `gripmap router`, or correct zenoh.connect")
+    elif publisher.cut_off:
+        found.append(f"the router at {where} is away: records wait on disk and are sent when it returns")
+    elif publisher.unanswered_s > UNANSWERED_S:
+        found.append("no service acknowledges the records: start `fleet-service run` on the same router")
+    if any(publisher.counts.rejected.values()) and not any(publisher.counts.acknowledged.values()):
+        found.append("a service refuses all records: the reason stands in its log and in its metrics")
+    return found
+
+
+class ReasonReporter:
+    """Prints the reasons within FIRST_S + EVERY_S, and again whenever they change.
+
+    Args:
+        find: returns the present reasons.
+        say: prints a line.
+        clock: monotonic [s].
+    """
+
+    def __init__(
+        self,
+        find: Callable[[], list[str]],
+        say: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._find, self._say, self._clock = find, say, clock
+        self._due: float | None = None
+        self._told: list[str] = []
+
+    def look(self) -> None:
+        """Print the reasons if they are due and differ from those that were printed last."""
+        now = self._clock()
+        if self._due is None:
+            self._due = now + FIRST_S
+        if now < self._due:
+            return
+        self._due = now + EVERY_S
+        found = self._find()
+        alike = [_NUMBER.sub("", reason) for reason in found]
+        if alike == self._told:
+            return
+        self._told = alike
+        text = f"not published: {'; '.join(found)}" if found else "publishing: every reason is gone"
+        self._say(LogLine(text, event="unpublished" if found else "publishing", reasons=found))

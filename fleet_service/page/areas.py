@@ -1,0 +1,61 @@
+"""Areas with data: neighbouring tiles together, with their cells, alerts and the nearest place name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from fleet_service.client.stretches import link_cells
+from fleet_service.page.world import MapMirror
+from schemas import grid
+from schemas.thresholds import METRES_PER_DEGREE
+
+NEAR_M: Final = 30_000.0  # from a place's centre: its name is said of the area
+MOST: Final = 100
+
+
+def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
+    """Return the areas: `name` (empty if none is near), `box`, `latitude`, `longitude`, `cells` and `alerts`.
+
+    Args:
+        world: the mirrored map.
+        named: names of places with longitude and latitude [deg].
+    """
+    cell, _ = world.places()
+    cell = np.unique(cell)
+    tile = np.asarray(grid.tile_of(cell))
+    tiles, of_tile = np.unique(tile, return_inverse=True)
+    label = link_cells(tiles)[of_tile]
+    standing = world.standing()
+    found: list[dict[str, Any]] = []
+    for number in range(int(label.max(initial=-1)) + 1):
+        own = cell[label == number]
+        west, south, east, north = grid.bounds(own)
+        box = [float(west.min()), float(south.min()), float(east.max()), float(north.max())]
+        latitude, longitude = (box[1] + box[3]) / 2, (box[0] + box[2]) / 2
+        alerts = sum(_inside(box, one["longitude"], one["latitude"]) for one in standing)
+        found.append(
+            {
+                "name": _name(latitude, longitude, named),
+                "box": box,
+                "latitude": latitude,
+                "longitude": longitude,
+                "cells": len(own),
+                "alerts": alerts,
+            }
+        )
+    return sorted(found, key=lambda one: (-one["alerts"], -one["cells"]))[:MOST]
+
+
+def _inside(box: Sequence[float], longitude: float, latitude: float) -> bool:
+    return box[0] <= longitude <= box[2] and box[1] <= latitude <= box[3]
+
+
+def _name(latitude: float, longitude: float, named: Sequence[tuple[str, float, float]]) -> str:
+    scale = METRES_PER_DEGREE * math.cos(math.radians(latitude))
+    far = [(math.hypot((x - longitude) * scale, (y - latitude) * METRES_PER_DEGREE), name) for name, x, y in named]
+    distance, name = min(far, default=(math.inf, ""))
+    return name if distance <= NEAR_M else ""

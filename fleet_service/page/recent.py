@@ -1,0 +1,48 @@
+"""Recent moments of the live map, kept in memory: the past of the first hour, before any snapshot exists. Pure."""
+
+from __future__ import annotations
+
+import itertools
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Final
+
+from fleet_service.page.records import Records
+
+STEP_S: Final = 10
+MOST: Final = 180  # half an hour in steps of STEP_S
+THIN: Final = 60  # moments; older ones are kept in steps of THINNED_S
+THINNED_S: Final = 60
+
+
+class RecentMoments:
+    """Records of all tiles at moments [s since 1970], oldest first; arrays are shared, never copied."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
+
+    def keep(self, now: float, tiles: Mapping[int, Records]) -> None:
+        """Keep the tiles of a moment, unless the last one is too near or nothing has changed since."""
+        moment = int(now)
+        last = next(reversed(self._kept), None)
+        if not tiles or (last is not None and (moment < last + STEP_S or _same(self._kept[last], tiles))):
+            return
+        self._kept[moment] = dict(tiles)
+        old = list(self._kept)[:-THIN]
+        for before, one in itertools.pairwise(old):
+            if one // THINNED_S == before // THINNED_S:
+                del self._kept[before]
+        while len(self._kept) > MOST:
+            self._kept.popitem(last=False)
+
+    def times(self) -> list[int]:
+        """Return the moments, oldest first."""
+        return list(self._kept)
+
+    def at(self, moment: int) -> dict[int, Records] | None:
+        """Return the tiles of a moment; None if it is not kept."""
+        return self._kept.get(moment)
+
+
+def _same(before: Mapping[int, Records], tiles: Mapping[int, Records]) -> bool:
+    return before.keys() == tiles.keys() and all(before[tile] is tiles[tile] for tile in tiles)

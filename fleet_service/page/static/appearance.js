@@ -1,0 +1,54 @@
+// How the page looks: light or dark, the sheet of a phone, the divider between two moments, paper.
+import { setTheme } from "./colours.js";
+import { byId, make } from "./elements.js";
+import { ladder, mapKey } from "./legend.js";
+import { clock, say, zone } from "./texts.js";
+
+const HEIGHTS = ["44%", "86%", "9.5rem"];  // of the sheet: half, most, or a strip of the screen
+
+export const isDark = app => (app.theme ?? (app.dark.matches ? "dark" : "light")) === "dark";
+
+// Light or dark: as the device has it, or as was chosen here.
+export function dress(app) {
+  const dark = isDark(app), name = dark ? "dark" : "light";
+  document.documentElement.dataset.theme = name;
+  setTheme(name);
+  Object.assign(byId("theme"), { textContent: dark ? "☀" : "☾", title: say(`theme.${name}`), ariaLabel: say(`theme.${name}`) });
+  byId("sheet").ariaLabel = say("sheet.more");
+  mapKey();
+  app.draw();
+}
+
+export function lift() {
+  const style = document.documentElement.style, now = style.getPropertyValue("--covered") || HEIGHTS[0], next = HEIGHTS[(HEIGHTS.indexOf(now) + 1) % HEIGHTS.length];
+  style.setProperty("--covered", next);
+  Object.assign(byId("sheet"), { ariaLabel: say(next === HEIGHTS[1] ? "sheet.less" : "sheet.more"), ariaExpanded: String(next !== HEIGHTS[2]) });
+}
+
+// Two moments lie upon each other; the divider shows more of one or of the other. Returns the share that was set.
+export function moveDivider(share) {
+  const kept = Math.min(.98, Math.max(.02, share)), percent = Math.round(100 * kept);
+  byId("beside").style.clipPath = `inset(0 0 0 ${percent}%)`;
+  byId("divider").style.left = `${percent}%`;
+  byId("divider").setAttribute("aria-valuenow", percent);
+  return kept;
+}
+
+export function listenToDivider(slide, share) {
+  const divider = byId("divider"), view = byId("view");
+  divider.setAttribute("aria-label", say("time.swipe"));
+  divider.addEventListener("pointerdown", e => divider.setPointerCapture(e.pointerId));
+  divider.addEventListener("pointermove", e => { if (divider.hasPointerCapture(e.pointerId)) slide((e.clientX - view.getBoundingClientRect().left) / view.clientWidth); });
+  divider.addEventListener("keydown", e => {
+    const step = { ArrowLeft: -.05, ArrowRight: .05 }[e.key];
+    if (!step) return;
+    slide(share() + step);
+    e.preventDefault();
+  });
+}
+
+// What paper needs beside the map: the moment with its zone, and the legend.
+export function preparePaper(at) {
+  byId("paper")?.remove();
+  byId("side").append(make("section", { id: "paper" }, make("h2", {}, say("print.head", { moment: clock(at), zone: zone(at) })), ladder()));
+}

@@ -1,0 +1,83 @@
+// Drawing roads: the street itself, then a ribbon per direction: wide where the grip is well known, narrower where it is
+// roughly known, thin and grey or hollow where it is not.
+import { DANGER, HOLLOW, LITTLE, fills, groundColour, inks } from "./colours.js";
+import { metresPerWorld } from "./grid.js";
+import { isNone } from "./roads.js";
+
+const LANE_M = 3.4, SHARE = [1, 1, 1, 1, .7, .7, .34, .34], ARROW_PX = 110, ARROWS_PX = 9;
+
+export function ribbonWidth(view) {
+  return Math.max(4.5, Math.min(26, LANE_M * view.scale / metresPerWorld(view.y)));
+}
+
+const inView = (lane, box, pad) => lane.west - pad <= box.east && lane.east + pad >= box.west && lane.north - pad <= box.south && lane.south + pad >= box.north;
+
+// The streets of the road map, where no base map draws them.
+export function streets(pen, view, roads) {
+  const width = 2 * ribbonWidth(view) + 5, ink = inks(), path = new Path2D(), pad = 30 / view.scale, box = view.box;
+  for (const line of roads.lines) {
+    for (let i = 0; i <= line.count; i++) {
+      const x = view.left(line.x[i]), y = view.top(line.y[i]);
+      if (i) path.lineTo(x, y); else path.moveTo(x, y);
+    }
+  }
+  pen.lineJoin = pen.lineCap = "round";
+  for (const [wide, colour] of [[width + 2, ink.edge], [width, ink.road]]) { pen.lineWidth = wide; pen.strokeStyle = colour; pen.stroke(path); }
+  return { pad, box };
+}
+
+export function ribbons(pen, view, roads) {
+  const wide = ribbonWidth(view), ground = groundColour(), ink = inks(), colours = fills(), paths = DANGER.map(() => new Path2D()), box = view.box, pad = 40 / view.scale;
+  const arrows = [];
+  for (const lane of roads.lanes) {
+    if (!lane.any || !inView(lane, box, pad)) continue;
+    const off = lane.both || roads.learned ? wide * .56 : 0;
+    const left = i => view.left(lane.x[i]) + lane.nx[i] * off, top = i => view.top(lane.y[i]) + lane.ny[i] * off;
+    for (let i = 0; i < lane.count; i++) {
+      const kind = lane.kind[i];
+      if (isNone(kind)) continue;
+      const path = paths[kind];
+      let end = i;
+      while (end < lane.count && lane.kind[end] === kind) end++;
+      path.moveTo(left(i), top(i));
+      for (let k = i + 1; k <= end; k++) path.lineTo(left(k), top(k));
+      if (wide > ARROWS_PX && kind < LITTLE) mark(arrows, lane, left, top, i, end, kind);
+      i = end - 1;
+    }
+  }
+  pen.lineJoin = "round";
+  pen.lineCap = "butt";
+  const line = (kind, width, colour) => { pen.lineWidth = width; pen.strokeStyle = colour; pen.stroke(paths[kind]); };
+  line(HOLLOW, Math.max(3, wide * SHARE[HOLLOW]), ink.bound);
+  line(HOLLOW, Math.max(1.2, wide * SHARE[HOLLOW] - 2.2), ground);
+  line(LITTLE, Math.max(2.5, wide * SHARE[LITTLE]), colours[LITTLE]);
+  pen.lineCap = "round";
+  for (const kind of [...DANGER].reverse()) if (kind < LITTLE) line(kind, wide * SHARE[kind] + 2, ink.casing);
+  for (const kind of [...DANGER].reverse()) if (kind < LITTLE) line(kind, wide * SHARE[kind], colours[kind]);
+  pen.lineCap = "butt";
+  for (const [x, y, ax, ay, kind] of arrows) arrow(pen, x, y, ax, ay, wide * .26, contrastOf(colours[kind]));
+}
+
+function mark(arrows, lane, left, top, first, end, kind) {
+  let run = ARROW_PX * .5;
+  for (let k = first; k < end; k++) {
+    const dx = left(k + 1) - left(k), dy = top(k + 1) - top(k), size = Math.hypot(dx, dy);
+    run += size;
+    if (run >= ARROW_PX && size) { arrows.push([left(k), top(k), dx / size, dy / size, kind]); run = 0; }
+  }
+}
+
+function arrow(pen, x, y, ax, ay, size, colour) {
+  pen.beginPath();
+  pen.moveTo(x - ax * size - ay * size, y - ay * size + ax * size);
+  pen.lineTo(x + ax * size * .6, y + ay * size * .6);
+  pen.lineTo(x - ax * size + ay * size, y - ay * size - ax * size);
+  pen.lineWidth = Math.max(1.5, size * .45);
+  pen.strokeStyle = colour;
+  pen.stroke();
+}
+
+const contrastOf = colour => {
+  const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
+  return .3 * r + .59 * g + .11 * b > 130 ? "#00000099" : "#ffffffcc";
+};

@@ -1,0 +1,19 @@
+// Plain words for places and alerts, with the names of roads where they are known.
+import { say } from "./texts.js";
+
+const BOUNDS = { east: "eastbound", north: "northbound", west: "westbound", south: "southbound" };
+
+export const coordinates = (longitude, latitude) => `${Math.abs(latitude).toFixed(5)}° ${latitude < 0 ? "S" : "N"}, ${Math.abs(longitude).toFixed(5)}° ${longitude < 0 ? "W" : "E"}`;
+
+// The most dangerous first: ice before snow, then the longer one.
+export const bySeverity = alerts => [...alerts].sort((a, b) => surfaceRank(a.mu) - surfaceRank(b.mu) || b.p_slippery - a.p_slippery || b.length_m - a.length_m);
+
+const surfaceRank = mu => mu < .2 ? 0 : 1;
+
+export function alertWords(alert, road) {
+  const what = say(alert.mu < .2 ? "alert.ice" : "alert.slippery"), ways = alert.headings.length >= 4 ? say("alert.all_ways") : alert.headings.map(one => say(`alert.${BOUNDS[one]}`)).join(` ${say("and")} `);
+  return say(road ? "alert.on_road" : "alert.on_no_road", { what, road, ways, place: coordinates(alert.longitude, alert.latitude) });
+}
+
+// Percent of certainty, never rounded up to all of it.
+export const certainty = share => share > .995 ? say("percent.over", { n: 99 }) : String(Math.floor(share * 100));

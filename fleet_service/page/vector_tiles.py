@@ -1,0 +1,207 @@
+"""Vector tiles: an encoder of Mapbox Vector Tiles 2.1, and a reader of PMTiles 3. Pure but for the reader's file.
+
+The encoder is for small generated maps such as the demo's town; it writes the layers that the page's base map draws.
+The reader serves an operator's own extract, one file, without a server of tiles.
+References: github.com/mapbox/vector-tile-spec/tree/master/2.1, github.com/protomaps/PMTiles/blob/main/spec/v3.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from schemas.errors import InputError
+
+EXTENT: Final = 4096
+POINT, LINE, POLYGON = 1, 2, 3
+_MOVE, _DRAW, _CLOSE = 1, 2, 7
+_GZIP: Final = b"\x1f\x8b"
+_MAGIC: Final = b"PMTiles\x03"
+_HEAD: Final = struct.Struct("<7sB11Q6B")
+_NO_COMPRESSION, _GZIP_COMPRESSION, _MVT = 1, 2, 1
+_MOST_DIRECTORY: Final = 16 << 20
+
+
+class TileShape(NamedTuple):
+    """Shape of a layer: points, lines or rings in units of the tile (EXTENT across, y down), and its tags."""
+
+    kind: int
+    parts: Sequence[Sequence[tuple[int, int]]]
+    tags: Mapping[str, str | int]
+
+
+def encode_tile(layers: Mapping[str, Iterable[TileShape]]) -> bytes:
+    """Return a tile of these layers; a layer without shapes is left out."""
+    return b"".join(_field(3, _layer(name, list(shapes))) for name, shapes in layers.items() if shapes)
+
+
+def _layer(name: str, shapes: list[TileShape]) -> bytes:
+    keys: dict[str, int] = {}
+    values: dict[str | int, int] = {}
+    found = [_number(15, 2), _field(1, name.encode())]
+    for shape in shapes:
+        tags = b"".join(
+            _varint(keys.setdefault(key, len(keys))) + _varint(values.setdefault(value, len(values)))
+            for key, value in shape.tags.items()
+        )
+        body = _field(2, tags) + _number(3, shape.kind) + _field(4, _commands(shape))
+        found.append(_field(2, body))
+    found += [_field(3, key.encode()) for key in keys]
+    found += [_field(4, _field(1, v.encode()) if isinstance(v, str) else _number(5, v)) for v in values]
+    return b"".join([*found, _number(5, EXTENT)])
+
+
+def _commands(shape: TileShape) -> bytes:
+    out, x, y = [], 0, 0
+
+    def move_to(points: Sequence[tuple[int, int]]) -> None:
+        nonlocal x, y
+        for px, py in points:
+            out.append(_varint(_zigzag(px - x)) + _varint(_zigzag(py - y)))
+            x, y = px, py
+
+    for part in shape.parts:
+        if shape.kind == POINT:
+            out.append(_varint(_MOVE | len(part) << 3))
+            move_to(part)
+            continue
+        out.append(_varint(_MOVE | 1 << 3))
+        move_to(part[:1])
+        out.append(_varint(_DRAW | (len(part) - 1) << 3))
+        move_to(part[1:])
+        if shape.kind == POLYGON:
+            out.append(_varint(_CLOSE | 1 << 3))
+    return b"".join(out)
+
+
+def _zigzag(value: int) -> int:
+    return value << 1 if value >= 0 else (-value << 1) - 1
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _number(field: int, value: int) -> bytes:
+    return _varint(field << 3) + _varint(value)
+
+
+def _field(number: int, body: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(body)) + body
+
+
+def unpack_tile(tile: bytes) -> bytes:
+    """Return a tile without the compression that most files give it."""
+    return gzip.decompress(tile) if tile.startswith(_GZIP) else tile
+
+
+class PmtilesFile:
+    """Vector tiles of a PMTiles file; thread-safe.
+
+    Args:
+        path: ends in .pmtiles.
+
+    Raises:
+        InputError: it does not exist, is no PMTiles 3, or holds no vector tiles.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            head = self._read(0, 127)
+        except OSError as error:
+            raise _refusal_of(f"{path} cannot be read ({error.strerror})") from error
+        if len(head) < 127 or not head.startswith(_MAGIC):
+            raise _refusal_of(f"{path} is no PMTiles of version 3")
+        fields = _HEAD.unpack(head[: _HEAD.size])
+        (self._root, self._root_size, about, about_size, self._leaves, _, self._data, *_) = fields[2:]
+        _, self._packing, tile_packing, kind, least, most = fields[-6:]
+        if kind != _MVT:
+            raise _refusal_of(f"{path} holds images; give an .mbtiles of them")
+        packings = (_NO_COMPRESSION, _GZIP_COMPRESSION)
+        if self._packing not in packings or tile_packing not in packings:
+            raise _refusal_of(f"{path} is packed in a way that is not known here (gzip is)")
+        self.zooms = (int(least), int(most))
+        self.metadata: dict[str, Any] = json.loads(self._part(about, about_size) or b"{}")
+
+    def tile(self, zoom: int, x: int, y: int) -> bytes | None:
+        """Return a tile, counted from the north-west, unpacked; None if there is none."""
+        wanted = _hilbert(zoom, x, y)
+        offset, size = self._root, self._root_size
+        for _ in range(4):
+            entry = _entry(self._part(offset, size), wanted)
+            if entry is None:
+                return None
+            start, size, run = entry
+            if run:
+                return unpack_tile(self._read(self._data + start, size))
+            offset = self._leaves + start
+        return None
+
+    def _part(self, offset: int, size: int) -> bytes:
+        raw = self._read(offset, min(size, _MOST_DIRECTORY))
+        return gzip.decompress(raw) if raw.startswith(_GZIP) else raw
+
+    def _read(self, offset: int, size: int) -> bytes:
+        with self._path.open("rb") as file:  # of its own, so that threads do not share a position
+            file.seek(offset)
+            return file.read(size)
+
+
+def _entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
+    """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is a leaf directory."""
+    numbers = _varints(directory)
+    count = next(numbers)
+    ids, at = [], 0
+    for _ in range(count):
+        at += next(numbers)
+        ids.append(at)
+    runs = [next(numbers) for _ in range(count)]
+    sizes = [next(numbers) for _ in range(count)]
+    offsets: list[int] = []
+    for k in range(count):
+        given = next(numbers)
+        offsets.append(offsets[-1] + sizes[k - 1] if given == 0 and k else given - 1)
+    place = max((k for k in range(count) if ids[k] <= wanted), default=-1)
+    if place < 0 or (runs[place] and wanted >= ids[place] + runs[place]):
+        return None
+    return offsets[place], sizes[place], runs[place]
+
+
+def _varints(data: bytes) -> Iterator[int]:
+    value = shift = 0
+    for byte in data:
+        value |= (byte & 127) << shift
+        if byte & 128:
+            shift += 7
+        else:
+            yield value
+            value = shift = 0
+
+
+def _hilbert(zoom: int, x: int, y: int) -> int:
+    """Return the number of a tile: those of all smaller zooms, then the place on the Hilbert curve."""
+    found: int = (4**zoom - 1) // 3
+    side = 1 << zoom >> 1
+    while side:
+        right, below = int(bool(x & side)), int(bool(y & side))
+        found += side * side * ((3 * right) ^ below)
+        if not below:
+            if right:
+                x, y = side - 1 - x, side - 1 - y
+            x, y = y, x
+        x, y, side = x & (side - 1), y & (side - 1), side >> 1
+    return found
+
+
+def _refusal_of(problem: str) -> InputError:
+    return InputError("base_map", problem, "make one with `pmtiles extract`, see the how-to of the live page")

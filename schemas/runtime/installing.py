@@ -1,0 +1,25 @@
+"""Commands that install an extra of this distribution, from where it was installed itself: it is on no index."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from importlib import metadata
+
+NAME = "gripmap"
+
+
+def install_command(extra: str) -> str:
+    """Return a command that installs an extra into this environment."""
+    try:
+        text = metadata.distribution(NAME).read_text("direct_url.json")
+    except metadata.PackageNotFoundError:
+        text = None
+    origin = json.loads(text) if text else {}
+    address = str(origin.get("url", ""))
+    if "dir_info" in origin:
+        editable = "--editable " if origin["dir_info"].get("editable") else ""
+        return f"pip install {editable}{shlex.quote(address.removeprefix('file://') + f'[{extra}]')}"
+    if address:
+        return f"pip install {shlex.quote(f'{NAME}[{extra}] @ {address}')}"
+    return f"pip install {shlex.quote(f'.[{extra}]')} in a checkout, or the wheel with [{extra}]"

@@ -1,0 +1,102 @@
+"""Reasons why nothing is published: each planted cause is named within five seconds, and once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons
+from edge_agent.inputs.block import Block
+from edge_agent.publish.publisher import Counts
+from schemas.signals import CHANNELS, S
+from schemas.wire import Kind
+
+ENDPOINTS = ("tcp/127.0.0.1:7447",)
+NAMED_S = 5.0
+REFUSED = Counts(rejected={Kind.OBSERVATION: 3})
+
+
+@dataclass
+class State:
+    """State of a publisher."""
+
+    links: int = 1
+    cut_off: bool = False
+    unanswered_s: float = 0.0
+    counts: Counts = field(default_factory=Counts)
+
+
+class Clock:
+    """Clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def block(position: bool = True, wheels: float = 20.0) -> Block:
+    signals = np.full((10, 1, len(CHANNELS)), np.nan)
+    signals[..., S.OMEGA : S.OMEGA + 4] = wheels
+    if position:
+        signals[..., S.LATITUDE], signals[..., S.LONGITUDE] = 57.7, 11.97
+    return Block(np.zeros((10, 1)), np.zeros((10, 1), np.int64), signals)
+
+
+CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
+    "silent source": (block(), State(), ["can0 is silent for 3 s"], "is silent"),
+    "doctor has not passed": (
+        block(),
+        State(),
+        ["the signal doctor: has not passed the signals yet"],
+        "doctor",
+    ),
+    "no position": (block(position=False), State(), [], "no position"),
+    "no wheel speed": (block(wheels=float("nan")), State(), [], "no wheel speed"),
+    "standing": (block(wheels=0.0), State(), [], "stands"),
+    "no router": (block(), State(links=0), [], "no router answers at tcp/127.0.0.1:7447"),
+    "router away": (block(), State(cut_off=True), [], "is away"),
+    "no service": (block(), State(unanswered_s=4.5), [], "no service acknowledges"),
+    "refused": (block(), State(counts=REFUSED), [], "refuses"),
+}
+
+
+def told_within(source: Block, find: Callable[[SignalWatch], list[str]], seconds: float) -> list[str]:
+    """Return the lines that are printed in so many seconds."""
+    clock, lines = Clock(), list[str]()
+    watch = SignalWatch(clock)
+    reporter = ReasonReporter(lambda: find(watch), lines.append, clock)
+    for _ in range(round(seconds / 0.1)):
+        watch.add(source)
+        reporter.look()
+        clock.now += 0.1
+    return lines
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_planted_cause_is_named_within_five_seconds(cause: str) -> None:
+    source, state, troubles, words = CAUSES[cause]
+    lines = told_within(source, lambda watch: reasons(watch, state, ENDPOINTS, troubles), NAMED_S)
+    assert len(lines) == 1
+    assert lines[0].startswith("not published: ")
+    assert words in lines[0]
+
+
+def test_nothing_is_printed_while_records_are_published() -> None:
+    assert told_within(block(), lambda watch: reasons(watch, State(), ENDPOINTS, []), 30.0) == []
+
+
+def test_a_reason_is_printed_again_only_when_it_changes() -> None:
+    seconds = iter(range(10**6))
+    lines = told_within(block(), lambda _: [f"can0 is silent for {next(seconds)} s"], 60.0)
+    assert len(lines) == 1
+    changing = iter([["a"], ["a"], ["b"], []] + [[]] * 100)
+    assert told_within(block(), lambda _: next(changing), 20.0) == [
+        "not published: a",
+        "not published: b",
+        "publishing: every reason is gone",
+    ]

@@ -1,0 +1,81 @@
+"""Vector tiles: numbers of PMTiles as its own library has them, a file read back, and tiles that the page can draw."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from fleet_service.page.basemap import base_map
+from fleet_service.page.vector_tiles import (
+    LINE,
+    POINT,
+    POLYGON,
+    PmtilesFile,
+    TileShape,
+    encode_tile,
+)
+from schemas.errors import InputError
+
+pmtiles_tile = pytest.importorskip("pmtiles.tile")
+pmtiles_writer = pytest.importorskip("pmtiles.writer")
+TILES = {(z, x, y): f"{z}/{x}/{y}".encode() for z in range(7) for x in range(2**z) for y in range(0, 2**z, 2)}
+
+
+def write(path: Path, kind: int = 1) -> Path:
+    """A PMTiles file with leaf directories, by the library of the format."""
+    with path.open("wb") as file:
+        writer = pmtiles_writer.Writer(file)
+        for (z, x, y), data in sorted(TILES.items(), key=lambda one: pmtiles_tile.zxy_to_tileid(*one[0])):
+            writer.write_tile(pmtiles_tile.zxy_to_tileid(z, x, y), gzip.compress(data, mtime=0))
+        head = {
+            "tile_type": pmtiles_tile.TileType(kind),
+            "tile_compression": pmtiles_tile.Compression.GZIP,
+            "min_lon_e7": 0,
+            "min_lat_e7": 0,
+            "max_lon_e7": 0,
+            "max_lat_e7": 0,
+            "center_zoom": 0,
+            "center_lon_e7": 0,
+            "center_lat_e7": 0,
+        }
+        writer.finalize(head, {"attribution": "<a href='x'>© somebody</a>"})
+    return path
+
+
+def test_every_tile_of_a_pmtiles_file_is_found_and_no_other(tmp_path: Path) -> None:
+    file = PmtilesFile(write(tmp_path / "map.pmtiles"))
+    assert file.zooms == (0, 6)
+    assert {place: file.tile(*place) for place in TILES} == TILES
+    assert file.tile(3, 1, 1) is None
+    assert file.tile(9, 1, 1) is None
+
+
+def test_the_base_map_names_its_makers_without_markup(tmp_path: Path) -> None:
+    found = base_map(str(write(tmp_path / "map.pmtiles")))
+    assert found.is_vector
+    assert found.attribution == "© somebody"
+    assert base_map(str(tmp_path / "map.pmtiles"), "me").attribution == "me"
+
+
+def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "no.pmtiles").write_bytes(b"no" * 100)
+    for path in (
+        tmp_path / "no.pmtiles",
+        tmp_path / "none.pmtiles",
+        write(tmp_path / "images.pmtiles", kind=2),
+    ):
+        with pytest.raises(InputError, match="base_map"):
+            base_map(str(path))
+
+
+def test_a_tile_is_the_bytes_of_the_specification() -> None:
+    """The example of section 4.3.5 of the specification: a point at (25, 17), a line and a polygon."""
+    point = encode_tile({"p": [TileShape(POINT, [[(25, 17)]], {})]})
+    assert bytes([9, 50, 34]) in point
+    line = encode_tile({"l": [TileShape(LINE, [[(2, 2), (2, 10), (10, 10)]], {})]})
+    assert bytes([9, 4, 4, 18, 0, 16, 16, 0]) in line
+    ring = encode_tile({"r": [TileShape(POLYGON, [[(3, 6), (8, 12), (20, 34)]], {})]})
+    assert bytes([9, 6, 12, 18, 10, 12, 24, 44, 15]) in ring
+    assert encode_tile({"empty": []}) == b""
