@@ -54,31 +54,45 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     last = pipeline.finish()
     parts += [last] if last is not None else []
     recorder.write(truth)
-    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+    columns = {
+        name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns
+    }
     return columns | {"vehicle": np.concatenate([part.vehicle for part in parts])}
 
 
 def write(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
     """Drive, and write both files into an existing folder."""
     columns = drive(fleet, duration_s, folder / "truth.parquet")
-    arrays = {name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()}
+    arrays = {
+        name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()
+    }
     pq.write_table(pa.table(arrays), folder / "observations.parquet")
     print(f"  {len(columns['cell'])} observations of {len(fleet.names)} vehicles", flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Drive and write both files."""
-    parser = argparse.ArgumentParser(prog="deploy.end_to_end", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="deploy.end_to_end", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--vehicles", type=int, default=200)
     parser.add_argument("--duration", type=float, default=60.0, help="[s] of driving")
     parser.add_argument("--seed", type=int, default=FIGURES)
-    parser.add_argument("--scenario", default="demo", help="demo (default), hills; hills-7: drawn by seed 7")
-    parser.add_argument("--rough", type=float, default=0.0, help="share of vehicles as real cars are (default 0)")
-    parser.add_argument("--winter", type=float, default=0.0, help="share with winter equipment (default 0)")
+    parser.add_argument(
+        "--scenario", default="demo", help="demo (default), hills; hills-7: drawn by seed 7"
+    )
+    parser.add_argument(
+        "--rough", type=float, default=0.0, help="share of vehicles as real cars are (default 0)"
+    )
+    parser.add_argument(
+        "--winter", type=float, default=0.0, help="share with winter equipment (default 0)"
+    )
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough, winter=args.winter)
+    fleet = SimulatedFleet(
+        args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough, winter=args.winter
+    )
     write(fleet, args.duration, args.out)
     return 0
 

@@ -55,20 +55,28 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 class Drive:
     """Result of one drive; rows are visits of a vehicle to a cell, from the simulator's truth."""
 
-    slid: set[tuple[int, int]] = field(default_factory=set)  # (vehicle, lap) that lost grip on the new ice
+    slid: set[tuple[int, int]] = field(
+        default_factory=set
+    )  # (vehicle, lap) that lost grip on the new ice
     passed: set[tuple[int, int]] = field(default_factory=set)  # ... and that were there
     alert_passes: float = float("nan")  # over the new ice until its first alert
-    inside: list[bool] = field(default_factory=list)  # whether the truth lies in the map's interval, by cell
+    inside: list[bool] = field(
+        default_factory=list
+    )  # whether the truth lies in the map's interval, by cell
     visits: int = 0  # that were fused
     alerts: int = 0  # on the new ice
     warnings: int = 0
-    known_error: list[tuple[float, float]] = field(default_factory=list)  # |error| in a known cell: with, without
+    known_error: list[tuple[float, float]] = field(
+        default_factory=list
+    )  # |error| in a known cell: with, without
 
 
 class ListeningTown:
     """One drive, second by second."""
 
-    def __init__(self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5) -> None:
+    def __init__(
+        self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5
+    ) -> None:
         self.fleet = SimulatedFleet(scenario, vehicles, seed, RATE_HZ, rough=rough)
         config = AgentConfig()
         self.bank = bank_of(config.estimator, self.fleet.vehicles)
@@ -122,8 +130,12 @@ class ListeningTown:
         true, patch = self.fleet.truth, self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
         places = cells * grid.SECTORS + grid.sector_of(true.yaw[-1])
-        self._true |= dict(zip(places.tolist(), true.mu_wheel[-1].mean(axis=1).tolist(), strict=True))
-        on = (np.abs(true.x - patch.x) <= patch.length / 2) & (np.abs(true.y - patch.y) <= patch.width / 2)
+        self._true |= dict(
+            zip(places.tolist(), true.mu_wheel[-1].mean(axis=1).tolist(), strict=True)
+        )
+        on = (np.abs(true.x - patch.x) <= patch.length / 2) & (
+            np.abs(true.y - patch.y) <= patch.width / 2
+        )
         on &= (now >= patch.start) & (true.mu_wheel.mean(axis=2) < SLIPPERY_MU)
         here = on.any(axis=0)
         self._lap += here & ~self._on
@@ -183,21 +195,25 @@ class ListeningTown:
             return
         key: IntArray = self.pipeline.places
         map_beliefs: dict[int, FloatArray | None] = {
-            k: self.heard.belief(int(key[k]), self._now()) if key[k] >= 0 else None for k in self.prior.enters(key)
+            k: self.heard.belief(int(key[k]), self._now()) if key[k] >= 0 else None
+            for k in self.prior.enters(key)
         }
         informed = self.prior.step(key, *beliefs, map_beliefs)
         alone = np.exp(beliefs[0])
         truth = self.fleet.truth.mu_wheel[-1].mean(axis=1)
         for k, belief in map_beliefs.items():
             if belief is not None:
-                errors = [abs(float(mugrid.quantiles(p[k], 0.5)) - truth[k]) for p in (informed, alone)]
+                errors = [
+                    abs(float(mugrid.quantiles(p[k], 0.5)) - truth[k]) for p in (informed, alone)
+                ]
                 self.drive.known_error.append((errors[0], errors[1]))
 
     def _on_ice(self, latitude: float, longitude: float) -> bool:
         x, y = self.fleet.scenario.from_latlon(np.array([latitude]), np.array([longitude]))
         near = 12.0
         return bool(
-            abs(x[0] - self.ice.x) <= self.ice.length / 2 + near and abs(y[0] - self.ice.y) <= self.ice.width / 2 + near
+            abs(x[0] - self.ice.x) <= self.ice.length / 2 + near
+            and abs(y[0] - self.ice.y) <= self.ice.width / 2 + near
         )
 
     def _now(self) -> int:
@@ -207,13 +223,17 @@ class ListeningTown:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Drive all seeds both ways and write the figures."""
-    parser = argparse.ArgumentParser(prog="deploy.listening", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="deploy.listening", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=FIGURES, help="seed")
     parser.add_argument("--vehicles", type=int, default=36)
     parser.add_argument("--duration", type=float, default=150.0, help="[s] of driving")
-    parser.add_argument("--scenario", default="hills-SEED", help="hills-SEED: drawn anew by each seed")
+    parser.add_argument(
+        "--scenario", default="hills-SEED", help="hills-SEED: drawn anew by each seed"
+    )
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     with_: list[Drive] = []
@@ -226,17 +246,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             out.append(drive)
             passes = f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after {drive.alert_passes:.0f}"
             more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
-            print(f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}", flush=True)
+            print(
+                f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}",
+                flush=True,
+            )
     found = measure(with_, without)
     campaign = "deploy.listening" + (f" --seeds {args.seeds}" if args.seeds < SEEDS else "")
-    figures.write(args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found)
+    figures.write(
+        args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found
+    )
     print(figures.markdown(found))
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
 
 
 def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
     """Return the figures of drives with and without listening."""
-    slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
+    slid, before = (
+        sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without)
+    )
     laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))
     errors = np.array([pair for drive in with_ for pair in drive.known_error]).reshape(-1, 2)
     inside = [[row for drive in drives for row in drive.inside] for drives in (with_, without)]
@@ -247,12 +274,24 @@ def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
         Figure("ahead.lost_grip_ratio", slid / before if before else float("nan"), "", 0.5),
         Figure("ahead.lost_grip.with", laps, "passes"),
         Figure("ahead.lost_grip.without", laps_before, "passes"),
-        Figure("ahead.lost_grip.passes", sum(len(drive.passed) for drive in with_), "over new ice, with"),
-        Figure("ahead.alert_passes", float(np.median(alert_passes)) if alert_passes else float("nan"), "median"),
+        Figure(
+            "ahead.lost_grip.passes",
+            sum(len(drive.passed) for drive in with_),
+            "over new ice, with",
+        ),
+        Figure(
+            "ahead.alert_passes",
+            float(np.median(alert_passes)) if alert_passes else float("nan"),
+            "median",
+        ),
         Figure("prior.map_loop", abs(covered[0] - covered[1]), "", 0.02),
         Figure("prior.map_loop.coverage90", covered[0], "of cells, all listen"),
         Figure("prior.map_loop.coverage90.deaf", covered[1], "of cells, none does"),
-        Figure("prior.map_loop.visits", float(sum(drive.visits for drive in with_)), "fused, all listen"),
+        Figure(
+            "prior.map_loop.visits",
+            float(sum(drive.visits for drive in with_)),
+            "fused, all listen",
+        ),
         Figure("prior.entry_error_ratio.town", float(with_map / alone), "", None),
     ]
 

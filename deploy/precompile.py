@@ -19,7 +19,17 @@ from edge_agent import known_estimators
 
 SERVICE: Final = "from fleet_service.app.precompile import warm_up; warm_up()"
 AGENT: Final = "import sys; from edge_agent.cli import main; sys.exit(main())"
-DRIVE: Final = ("straight", "--duration", "1", "--seed", "0", "--out", "drive.parquet", "--vehicle-out", "car.json")
+DRIVE: Final = (
+    "straight",
+    "--duration",
+    "1",
+    "--seed",
+    "0",
+    "--out",
+    "drive.parquet",
+    "--vehicle-out",
+    "car.json",
+)
 DEFAULT: Final = "aco-fckf"
 
 
@@ -27,12 +37,17 @@ def main(words: list[str]) -> int:
     """Compile with one process per core; always return 0."""
     began = time.monotonic()
     papers = words == ["papers"]
-    print(f"compiling {'the filters of the papers' if papers else 'kernels'}, once on this machine", flush=True)
+    print(
+        f"compiling {'the filters of the papers' if papers else 'kernels'}, once on this machine",
+        flush=True,
+    )
     names = [name for name, _ in known_estimators() if name != DEFAULT] if papers else [DEFAULT]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as workers:
         service = [] if papers else [workers.submit(_run, folder, SERVICE)]
         lines = _run(folder, AGENT, "simulate", *DRIVE)
-        replays = [workers.submit(_run, folder, AGENT, "replay", *_estimate(name)) for name in names]
+        replays = [
+            workers.submit(_run, folder, AGENT, "replay", *_estimate(name)) for name in names
+        ]
         for done in (*service, *replays):
             lines += done.result()
     print(f"compiled in {time.monotonic() - began:.0f} s", *lines, sep="\n", flush=True)
@@ -45,7 +60,9 @@ def _estimate(name: str) -> tuple[str, ...]:
 
 def _run(folder: str, code: str, *words: str) -> list[str]:
     """Run a process; return its lines with errors."""
-    done = subprocess.run([sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True
+    )
     return [line for line in (done.stdout + done.stderr).splitlines() if "error" in line.lower()]
 
 

@@ -35,14 +35,20 @@ def configuration(config: Path = CONFIG, listen: str | Sequence[str] | None = No
     try:
         settings = zenoh.Config.from_file(str(config))
     except zenoh.ZError as error:
-        raise InputError("config", f"cannot use {config} ({error})", "give a Zenoh configuration file") from error
+        raise InputError(
+            "config", f"cannot use {config} ({error})", "give a Zenoh configuration file"
+        ) from error
     if listen is not None:
-        settings.insert_json5("listen/endpoints", json.dumps([listen] if isinstance(listen, str) else list(listen)))
+        settings.insert_json5(
+            "listen/endpoints", json.dumps([listen] if isinstance(listen, str) else list(listen))
+        )
         settings.insert_json5("adminspace/enabled", "true")  # tells the port that port 0 became
     return settings
 
 
-def open_router(config: Path = CONFIG, listen: str | Sequence[str] | None = None) -> tuple[zenoh.Session, list[str]]:
+def open_router(
+    config: Path = CONFIG, listen: str | Sequence[str] | None = None
+) -> tuple[zenoh.Session, list[str]]:
     """Start a router in this process; return its session and the endpoints that it listens on.
 
     Raises:
@@ -52,7 +58,9 @@ def open_router(config: Path = CONFIG, listen: str | Sequence[str] | None = None
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:
-        raise InputError("listen", f"the router cannot start ({error})", "free the port or give another") from error
+        raise InputError(
+            "listen", f"the router cannot start ({error})", "free the port or give another"
+        ) from error
     if listen is None:
         return session, list(json.loads(settings.get_json("listen/endpoints")))
     reply = next(iter(session.get(f"@/{session.zid()}/router"))).ok
@@ -63,17 +71,27 @@ def open_router(config: Path = CONFIG, listen: str | Sequence[str] | None = None
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)")
     parser.add_argument(
-        "--listen", nargs="+", help="endpoints instead of the file's, e.g. tcp/127.0.0.1:0 for a free port"
+        "--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)"
     )
-    parser.add_argument("--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port")
-    parser.add_argument("--metrics-host", default="127.0.0.1", help="listen address of it (default 127.0.0.1)")
+    parser.add_argument(
+        "--listen",
+        nargs="+",
+        help="endpoints instead of the file's, e.g. tcp/127.0.0.1:0 for a free port",
+    )
+    parser.add_argument(
+        "--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port"
+    )
+    parser.add_argument(
+        "--metrics-host", default="127.0.0.1", help="listen address of it (default 127.0.0.1)"
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a router until a signal ends it."""
-    parser = argparse.ArgumentParser(prog="deploy.router", description="A Zenoh router for GripMap.")
+    parser = argparse.ArgumentParser(
+        prog="deploy.router", description="A Zenoh router for GripMap."
+    )
     add_arguments(parser)
     return run(parser.parse_args(argv))
 

@@ -21,13 +21,17 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 class Settings(BaseModel):
     """Base of every settings table: unknown names are refused, so that a misspelt one is not silently ignored."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True)  # what is written can be read
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, serialize_by_alias=True
+    )  # what is written can be read
 
 
 class ZenohSettings(Settings):
     """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh configuration file)."""
 
-    connect: list[str] = Field(default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn")
+    connect: list[str] = Field(
+        default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn"
+    )
     config: dict[str, Any] = Field(
         default_factory=dict, description="any Zenoh setting; {name} in it is the session's name"
     )
@@ -37,12 +41,18 @@ class MonitoringSettings(Settings):
     """Settings for metrics, health and log format."""
 
     metrics_port: int | None = Field(
-        default=None, ge=0, le=65535, description="/metrics (OpenMetrics) and /healthz; 0: a free port; null: off"
+        default=None,
+        ge=0,
+        le=65535,
+        description="/metrics (OpenMetrics) and /healthz; 0: a free port; null: off",
     )
     metrics_host: str = Field(
-        default="127.0.0.1", description="listen address for both; everyone who can reach it may read"
+        default="127.0.0.1",
+        description="listen address for both; everyone who can reach it may read",
     )
-    log: Literal["text", "json"] = Field(default="text", description="form of log lines: text, or JSON")
+    log: Literal["text", "json"] = Field(
+        default="text", description="form of log lines: text, or JSON"
+    )
 
 
 class AgentConfig(MonitoringSettings):
@@ -52,24 +62,31 @@ class AgentConfig(MonitoringSettings):
     estimator: str = Field(default="aco-fckf", description="estimator by name")
     state_rate_hz: Positive = Field(default=2.0, le=10.0, description="state records per second")
     flush_s: Positive = Field(default=1.0, description="longest time a record waits for its batch")
-    batch_rows: int = Field(default=50, ge=1, le=50, description="maximum number of records per batch")
+    batch_rows: int = Field(
+        default=50, ge=1, le=50, description="maximum number of records per batch"
+    )
     slippery_mu: Positive = Field(
         default=SLIPPERY_MU, description="a visit with an upper bound below this is sent at once"
     )
     position_std: Positive = Field(default=1.5, description="[m] of the satellite receiver")
     yaw_std: Positive = Field(default=0.02, description="[rad] of the satellite receiver")
     spool: Path = Field(
-        default=Path("spool.sqlite"), description="file of the outbox; {name} in it is the vehicle's name"
+        default=Path("spool.sqlite"),
+        description="file of the outbox; {name} in it is the vehicle's name",
     )
     spool_mb: Positive = Field(
-        default=256.0, description="[MB] limit; the oldest states are dropped first, then observations"
+        default=256.0,
+        description="[MB] limit; the oldest states are dropped first, then observations",
     )
     resend_s: Positive = Field(
         default=2.0,
         description="first wait before a batch is sent again; doubles up to 6 s, or to minutes without any answer",
     )
     trip_end_m: float = Field(
-        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip that are not published"
+        default=0.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="[m] at both ends of a trip that are not published",
     )
     trip_end_s: float = Field(
         default=0.0,
@@ -77,7 +94,9 @@ class AgentConfig(MonitoringSettings):
         allow_inf_nan=False,
         description="[s] at both ends of a trip that are not published; both limits apply",
     )
-    tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
+    tyre_season: int = Field(
+        default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season"
+    )
 
     def spool_of(self, name: str) -> Path:
         """Return the path of a vehicle's outbox, or of a process's."""
@@ -87,7 +106,9 @@ class AgentConfig(MonitoringSettings):
 class ArchiveSettings(Settings):
     """Location of the archive."""
 
-    path: Path | None = Field(default=None, description="folder, one service per archive; `--archive` takes precedence")
+    path: Path | None = Field(
+        default=None, description="folder, one service per archive; `--archive` takes precedence"
+    )
     second: str | None = Field(
         default=None,
         alias="copy",
@@ -109,7 +130,9 @@ class ServiceConfig(MonitoringSettings):
     """Settings of a fleet service."""
 
     zenoh: ZenohSettings = ZenohSettings()
-    name: VehicleName = Field(default="shard-0", description="name of this service; part of its segment names")
+    name: VehicleName = Field(
+        default="shard-0", description="name of this service; part of its segment names"
+    )
     regions: list[Annotated[str, Field(pattern=REGION_PATTERN)]] = Field(
         default=["*/*/*"],
         min_length=1,
@@ -120,28 +143,43 @@ class ServiceConfig(MonitoringSettings):
         default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
     )
     standby: bool = Field(
-        default=False, description="run as standby: take over when the active service on this replica stops"
+        default=False,
+        description="run as standby: take over when the active service on this replica stops",
     )
     lease_s: Positive = Field(
         default=5.0, ge=1.0, description="time after which a standby may replace a silent service"
     )
-    segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
-    put_s: Positive = Field(default=1.0, description="minimum time between two publications of one tile")
-    lateness_s: Positive = Field(default=120.0, description="observations older than this are fused as old news")
+    segment_s: Positive = Field(
+        default=0.5, le=1.0, description="longest time an admitted row waits for its segment"
+    )
+    put_s: Positive = Field(
+        default=1.0, description="minimum time between two publications of one tile"
+    )
+    lateness_s: Positive = Field(
+        default=120.0, description="observations older than this are fused as old news"
+    )
     weather: Path | None = Field(
-        default=None, description="Parquet file of road weather to read at the start; reports over Zenoh are added"
+        default=None,
+        description="Parquet file of road weather to read at the start; reports over Zenoh are added",
     )
     public_vehicles: int = Field(
         default=1,
         ge=1,
         description="minimum number of vehicles of a visible cell; from 2 on, within the last 12 to 24 h (privacy)",
     )
-    clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
+    clock_ahead_s: Positive = Field(
+        default=30.0, description="records further in the future are refused"
+    )
     oldest_s: Positive = Field(
-        default=30 * 86400.0, le=30 * 86400.0, description="records older than this are refused; at most 30 days"
+        default=30 * 86400.0,
+        le=30 * 86400.0,
+        description="records older than this are refused; at most 30 days",
     )  # a start reads 31 days back for what it holds: an older batch would be taken twice
     compact_s: float = Field(
-        default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two compactions of the archive; 0: never"
+        default=3600.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="time between two compactions of the archive; 0: never",
     )
     checkpoint_s: float = Field(
         default=300.0,
@@ -150,26 +188,36 @@ class ServiceConfig(MonitoringSettings):
         description="time between two checkpoints, from which a restart begins",
     )
     snapshot_s: float = Field(
-        default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two snapshots of the map; 0: never"
+        default=3600.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="time between two snapshots of the map; 0: never",
     )
     raw_days: int = Field(
-        default=0, ge=0, description="days of raw rows that stay in the archive, 31 at least; roll-ups stay; 0: all"
+        default=0,
+        ge=0,
+        description="days of raw rows that stay in the archive, 31 at least; roll-ups stay; 0: all",
     )
-    put_to: str | None = Field(default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a")
+    put_to: str | None = Field(
+        default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a"
+    )
     queue_batches: int = Field(
         default=20_000,
         ge=1,
         description="maximum number of waiting batches; further ones stay unacknowledged with their senders",
     )
     vehicle_kb_s: Positive = Field(
-        default=40.0, description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with it"
+        default=40.0,
+        description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with it",
     )
     vehicle_burst_kb: Positive = Field(
         default=2000.0,
         ge=64.0,
         description="[kB] at once, for example after an outage of an hour; the largest batch must fit",
     )
-    fleet: Path | None = Field(default=None, description="enrolment file; reports of other vehicles are ignored")
+    fleet: Path | None = Field(
+        default=None, description="enrolment file; reports of other vehicles are ignored"
+    )
 
     @field_validator("archive", mode="before")
     @classmethod
@@ -189,9 +237,13 @@ def moment(text: str, field: str) -> int:
     try:
         found = nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
-        raise InputError(field, f"{text[:60]!r} is no time", "write it like 2026-01-31T07:00:00Z") from error
+        raise InputError(
+            field, f"{text[:60]!r} is no time", "write it like 2026-01-31T07:00:00Z"
+        ) from error
     if not 0 <= found < 1 << 63:
-        raise InputError(field, f"{text[:60]!r} lies before 1970 or after 2261", "give a time between")
+        raise InputError(
+            field, f"{text[:60]!r} lies before 1970 or after 2261", "give a time between"
+        )
     return found
 
 
@@ -215,7 +267,9 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
     try:
         return model.model_validate_json(Path(path).read_bytes())
     except OSError as error:
-        raise InputError("config", f"cannot read {path} ({error.strerror})", "give the path of a JSON file") from error
+        raise InputError(
+            "config", f"cannot read {path} ({error.strerror})", "give the path of a JSON file"
+        ) from error
     except ValidationError as error:
         raise explain(error, f"configuration {path}") from error
 
@@ -228,6 +282,8 @@ def explain(error: ValidationError, where: str) -> InputError:
     given = "…" if secret else json.dumps(first["input"], default=str)
     shown = given if len(given) <= 60 else given[:57] + "..."
     problem = (
-        "is missing" if first["type"] == "missing" else f"{first['msg'][0].lower()}{first['msg'][1:]} (got {shown})"
+        "is missing"
+        if first["type"] == "missing"
+        else f"{first['msg'][0].lower()}{first['msg'][1:]} (got {shown})"
     )
     return InputError(field, problem, f"correct it in the {where}")

@@ -29,7 +29,9 @@ ZONE_ZOOM: Final = 7
 MAX_LATITUDE: Final = 85.05112877980659
 SECTORS: Final = 4
 HEADINGS: Final = ("east", "north", "west", "south")  # of the sectors
-SECTOR_MARGIN: Final = np.radians(15.0)  # a heading this near to a sector's edge belongs to both sectors
+SECTOR_MARGIN: Final = np.radians(
+    15.0
+)  # a heading this near to a sector's edge belongs to both sectors
 
 # spreading the bits of a 32-bit number to the even places of a 64-bit one: shift, then keep
 _SPREAD: Final = (
@@ -46,7 +48,9 @@ def _spread(v: IntArray) -> IntArray:
 
 def _gather(v: IntArray) -> IntArray:
     v = v & 0x5555555555555555
-    for (shift, _), mask in zip(reversed(_SPREAD), (*(m for _, m in reversed(_SPREAD[:-1])), 0xFFFFFFFF), strict=True):
+    for (shift, _), mask in zip(
+        reversed(_SPREAD), (*(m for _, m in reversed(_SPREAD[:-1])), 0xFFFFFFFF), strict=True
+    ):
         v = (v | (v >> shift)) & mask
     return v
 
@@ -105,7 +109,9 @@ def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
     return _latitude(y + 0.5, zoom), _longitude(x + 0.5, zoom)
 
 
-def bounds(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def bounds(
+    cell: ArrayLike, zoom: int = CELL_ZOOM
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return west, south, east, north [deg] of a cell."""
     x, y = deinterleave(cell)
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
@@ -119,11 +125,16 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
     the sectors of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
-    x, y = np.stack([west, east, east, west], axis=-1), np.stack([south, south, north, north], axis=-1)
+    x, y = (
+        np.stack([west, east, east, west], axis=-1),
+        np.stack([south, south, north, north], axis=-1),
+    )
     if sector is None:
         return x, y
     latitude, longitude = centre(cell)
-    first = np.mod(np.asarray(sector, dtype=np.int64) + 1, SECTORS)  # east: from the south-east to the north-east
+    first = np.mod(
+        np.asarray(sector, dtype=np.int64) + 1, SECTORS
+    )  # east: from the south-east to the north-east
     row = np.arange(len(first))
     sides = [(side[row, first], side[row, (first + 1) % SECTORS]) for side in (x, y)]
     return np.stack([longitude, *sides[0]], axis=-1), np.stack([latitude, *sides[1]], axis=-1)
@@ -167,6 +178,10 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else -1)."""
     angle = np.asarray(yaw, dtype=np.float64)
-    first, left, right = sector_of(angle), sector_of(angle + SECTOR_MARGIN), sector_of(angle - SECTOR_MARGIN)
+    first, left, right = (
+        sector_of(angle),
+        sector_of(angle + SECTOR_MARGIN),
+        sector_of(angle - SECTOR_MARGIN),
+    )
     second = np.where(left != first, left, np.where(right != first, right, -1))
     return first, second.astype(np.int8)

@@ -179,13 +179,23 @@ def parse(key: str) -> Parsed:
     head, _, rest = key.removeprefix(ROOT + "/").partition("/")
     topic = TOPICS.get(head)
     if not key.startswith(ROOT + "/") or topic is None:
-        raise InputError("key", f"{key[:80]!r} is none of ours", f"use {ROOT}/ and one of {', '.join(TOPICS)}")
+        raise InputError(
+            "key", f"{key[:80]!r} is none of ours", f"use {ROOT}/ and one of {', '.join(TOPICS)}"
+        )
     parts = rest.split("/")
     name = parts.pop() if topic.named else None
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise InputError("key", f"{name[:80]!r} is no name", f"use {NAME_PATTERN}")
     digits = "".join(parts)
     sizes = _CHUNKS[: len(parts)] if topic.zoom else ()
-    if (topic.zoom or 0) != len(digits) or [len(part) for part in parts] != list(sizes) or set(digits) - set("0123"):
-        raise InputError("key", f"{key[:80]!r} names no place", f"cut {topic.zoom or 0} quadkey digits by {_CHUNKS}")
+    if (
+        (topic.zoom or 0) != len(digits)
+        or [len(part) for part in parts] != list(sizes)
+        or set(digits) - set("0123")
+    ):
+        raise InputError(
+            "key",
+            f"{key[:80]!r} names no place",
+            f"cut {topic.zoom or 0} quadkey digits by {_CHUNKS}",
+        )
     return Parsed(topic, grid.from_quadkey(digits) if topic.zoom else None, name)

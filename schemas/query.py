@@ -13,7 +13,9 @@ from schemas import wire
 from schemas.errors import InputError
 
 MAX_ROUTE_POINTS: Final = 500
-MAX_TEXT: Final = 32 * 1024  # of all parameters; a route of 500 points with seven decimals takes 13 kB
+MAX_TEXT: Final = (
+    32 * 1024
+)  # of all parameters; a route of 500 points with seven decimals takes 13 kB
 FIRST_YEAR: Final = 1971  # nanoseconds since 1970 stay positive, whatever the zone
 _FIXES: Final = {
     "bbox": "give bbox=west,south,east,north in degrees, west < east and south < north",
@@ -60,7 +62,9 @@ class MapQuery(BaseModel):
 
     @field_validator("bbox")
     @classmethod
-    def _ordered(cls, value: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+    def _ordered(
+        cls, value: tuple[float, float, float, float] | None
+    ) -> tuple[float, float, float, float] | None:
         if value is not None and not (value[0] < value[2] and value[1] < value[3]):
             raise ValueError("west < east and south < north do not hold")
         return value
@@ -102,7 +106,13 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
         because = f" ({first['msg'].removeprefix('Value error, ')})" if own else ""
         if not unknown and "&" in parameters[name]:
             raise InputError(
-                name[:60], "holds a '&'", "part the parameters by ';', as in bbox=W,S,E,N;format=json"
+                name[:60],
+                "holds a '&'",
+                "part the parameters by ';', as in bbox=W,S,E,N;format=json",
             ) from error
-        problem = "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
-        raise InputError(name[:60], problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error
+        problem = (
+            "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
+        )
+        raise InputError(
+            name[:60], problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")
+        ) from error

@@ -26,7 +26,9 @@ Box = tuple[float, float, float, float]
 
 def overlap(one: str, other: str) -> bool:
     """Whether two expressions have a region in common."""
-    return all(a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True))
+    return all(
+        a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
+    )
 
 
 def covers(wide: str, narrow: str) -> bool:
@@ -53,7 +55,9 @@ def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
     return list(_without(asked.bbox, served, (), 0))
 
 
-def _without(box: Box | None, served: Collection[str], above: tuple[str, ...], parent: int) -> Iterator[str]:
+def _without(
+    box: Box | None, served: Collection[str], above: tuple[str, ...], parent: int
+) -> Iterator[str]:
     depth = len(above)
     digits = _ZOOMS[depth] - (_ZOOMS[depth - 1] if depth else 0)
     inside = np.arange(1 << 2 * digits) + (parent << 2 * digits)
@@ -81,7 +85,10 @@ class Rank:
 
     def order(self, cells: IntArray, sectors: IntArray) -> IntArray:
         """Sorts cells and sectors (n,): indices (n,)."""
-        ranks = [self.of(cell, sector) for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)]
+        ranks = [
+            self.of(cell, sector)
+            for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)
+        ]
         return np.argsort(np.array(ranks, np.int64), kind="stable")
 
 
@@ -97,14 +104,18 @@ def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
     lengths = np.hypot(*steps.T)
     if lengths.sum() > ROUTE_MOST_M:
         raise InputError(
-            "route", f"is {lengths.sum() / 1e3:.0f} km long", f"ask for {ROUTE_MOST_M / 1e3:.0f} km at most"
+            "route",
+            f"is {lengths.sum() / 1e3:.0f} km long",
+            f"ask for {ROUTE_MOST_M / 1e3:.0f} km at most",
         )
     counts = np.maximum(np.ceil(lengths / ROUTE_STEP_M), 1).astype(np.int64)
     leg = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(len(leg)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[leg]
     longitude, latitude = (points[leg] + share[:, None] * np.diff(points, axis=0)[leg]).T
     cell = np.append(grid.cell_of(latitude, longitude), grid.cell_of(points[-1, 1], points[-1, 0]))
-    sector = grid.sector_of(np.arctan2(steps[:, 1], steps[:, 0]))[np.append(leg, leg[-1])].astype(np.int64)
+    sector = grid.sector_of(np.arctan2(steps[:, 1], steps[:, 0]))[np.append(leg, leg[-1])].astype(
+        np.int64
+    )
     keys = cell * grid.SECTORS + sector
     _, first = np.unique(keys, return_index=True)
     return np.asarray(keys[np.sort(first)])

@@ -34,7 +34,11 @@ CHANNELS: Final = tuple(UNITS)
 
 # Context: what a car's controllers and its surroundings say, beside the channels that estimators read. A block of it is
 # a float array (T, N, len(CONTEXT)); NaN is unknown. All of it is optional: most cars have some, some have none.
-FLAGS: Final = ("abs_active", "esc_active", "tcs_active")  # slip controllers: anti-lock, stability, traction control
+FLAGS: Final = (
+    "abs_active",
+    "esc_active",
+    "tcs_active",
+)  # slip controllers: anti-lock, stability, traction control
 CONTEXT_UNITS: Final = {
     **dict.fromkeys(FLAGS, "0 no, 1 yes"),
     "air_temperature": "degC outside",
@@ -80,4 +84,6 @@ class Health(IntFlag):
     OUTLIER = 64  # a reading that was refused
     SLIDING = 128  # a wheel past its peak (locked or spinning)
     RESET = 256  # the filter was started anew
-    CONTRADICTION = 512  # no friction explains what is measured: friction is the prior's, and its evidence flat
+    CONTRADICTION = (
+        512  # no friction explains what is measured: friction is the prior's, and its evidence flat
+    )

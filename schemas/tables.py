@@ -35,20 +35,34 @@ US_STEP: Final = 1_000  # [ns]
 LIKELIHOOD = pa.binary(mugrid.BINS)
 F32, F64, I8, I32, I64 = pa.float32(), pa.float64(), pa.int8(), pa.int32(), pa.int64()
 
-_MU_STEP, _DEGREE_STEP, _RADIAN_STEP, _SPEED_STEP = 2.0**-10, 2.0**-23, 2.0**-9, 2.0**-6  # the second is 13 mm
+_MU_STEP, _DEGREE_STEP, _RADIAN_STEP, _SPEED_STEP = (
+    2.0**-10,
+    2.0**-23,
+    2.0**-9,
+    2.0**-6,
+)  # the second is 13 mm
 _MU_RANGE: Final = (0.0, 2.0)  # beyond what a road tyre reaches on any road
 _SPEED_RANGE: Final = (-100.0, 100.0)
 _MAX_I32: Final = 2**31 - 1
 
 _MU = (
-    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP, _MU_RANGE),
+    Field(
+        "mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP, _MU_RANGE
+    ),
     Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, _MU_RANGE),
     Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, _MU_RANGE),
 )
 _POSE = (
     Field("latitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-grid.MAX_LATITUDE, grid.MAX_LATITUDE)),
     Field("longitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-180.0, 180.0)),
-    Field("position_std", F32, "m", "standard deviation of the position, each axis", 2.0**-5, (0.0, 100.0)),
+    Field(
+        "position_std",
+        F32,
+        "m",
+        "standard deviation of the position, each axis",
+        2.0**-5,
+        (0.0, 100.0),
+    ),
     Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP, (-1000.0, 1000.0)),
 )
 
@@ -85,7 +99,9 @@ OBSERVATION: Final = (
 STATE: Final = (
     Field("time", NS, "ns since 1970, UTC", "of the sample"),
     *_POSE,
-    Field("vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE),
+    Field(
+        "vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE
+    ),
     Field("vy", F32, "m/s", "lateral speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE),
     Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12, (-20.0, 20.0)),
     Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12, (-4.0, 4.0)),
@@ -96,7 +112,12 @@ STATE: Final = (
 # Who sent a row: the identity of its batch. In the archive the vehicle is a keyed hash.
 IDENTITY: Final = (
     Field("vehicle", pa.string(), "-", "enrolled name on the wire; keyed hash in the archive"),
-    Field("boot", I64, "-", "keyed hash of the agent's start, with the month's key; in archives of before, the start"),
+    Field(
+        "boot",
+        I64,
+        "-",
+        "keyed hash of the agent's start, with the month's key; in archives of before, the start",
+    ),
     Field("region", I64, "quadint z10", "region of the batch"),
     Field("seq", I64, "-", "dense from 1 per (boot, kind, region)"),
     Field("row", I32, "-", "place in the batch, from 0"),
@@ -107,18 +128,41 @@ IDENTITY: Final = (
 # What the service adds when it keeps a row.
 BOOKKEEPING: Final = (
     Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
-    Field("late", pa.bool_(), "-", "later than the lateness window: fused as old news where late_by says so"),
+    Field(
+        "late",
+        pa.bool_(),
+        "-",
+        "later than the lateness window: fused as old news where late_by says so",
+    ),
     Field("weight", F32, "-", "weight of the vehicle's vote that was used"),
-    Field("late_by", I64, "ns", "how much later than leave_time a late row was fused; 0: in time, or not fused"),
+    Field(
+        "late_by",
+        I64,
+        "ns",
+        "how much later than leave_time a late row was fused; 0: in time, or not fused",
+    ),
     Field("bias", F32, "-", "relative bias of the vehicle's values that was used"),
     Field("bias_std", F32, "-", "its standard deviation"),
-    Field("spread", F32, "-", "standard deviation of the vehicle's values over what it states that was used"),
-    Field("slope", F32, "-", "how much too low the fleet's values are for each mu that was left unused, that was used"),
+    Field(
+        "spread",
+        F32,
+        "-",
+        "standard deviation of the vehicle's values over what it states that was used",
+    ),
+    Field(
+        "slope",
+        F32,
+        "-",
+        "how much too low the fleet's values are for each mu that was left unused, that was used",
+    ),
 )
 
 # Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised` is known.
 VALUE: Final = Field(
-    "value", pa.bool_(), "-", f"mu is a value: {EXCITED_SHARE:g} of it was used; false: only a lower bound is known"
+    "value",
+    pa.bool_(),
+    "-",
+    f"mu is a value: {EXCITED_SHARE:g} of it was used; false: only a lower bound is known",
 )
 
 # Road weather of a region, as it came and as the map used it.
@@ -128,19 +172,36 @@ WEATHER: Final = (
     Field("air_temperature", F32, "degC", "NaN where unknown"),
     Field("road_temperature", F32, "degC", "of the surface; NaN where unknown"),
     Field("precipitation", F32, "mm/h", "as water; NaN where unknown"),
-    Field("prior", pa.list_(F32), "-", "probabilities of the 32 bins of the friction grid; null where there is none"),
+    Field(
+        "prior",
+        pa.list_(F32),
+        "-",
+        "probabilities of the 32 bins of the friction grid; null where there is none",
+    ),
     Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
-    Field("acts_from", NS, "ns since 1970, UTC", "from when the map used it: nothing younger had been fused"),
+    Field(
+        "acts_from",
+        NS,
+        "ns since 1970, UTC",
+        "from when the map used it: nothing younger had been fused",
+    ),
 )
 
 MAP_CELL: Final = (
     Field("cell", I64, "quadint z21", "the cell"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
-    Field("mu", F32, "-", "peak adhesion coefficient, median; null where only lower bounds are known"),
+    Field(
+        "mu", F32, "-", "peak adhesion coefficient, median; null where only lower bounds are known"
+    ),
     Field("mu_lower", F32, "-", "5 % quantile"),
     Field("mu_upper", F32, "-", "95 % quantile"),
     Field("p_slippery", F32, "-", f"P(mu < {SLIPPERY_MU})"),
-    Field("basis", pa.string(), "measured | bound | borrowed", "what the value rests on; bound: only lower bounds"),
+    Field(
+        "basis",
+        pa.string(),
+        "measured | bound | borrowed",
+        "what the value rests on; bound: only lower bounds",
+    ),
     Field("vehicles", I32, "-", "distinct vehicles"),
     Field("observations", I64, "-", "observations"),
     Field("first_time", NS, "ns since 1970, UTC", "first observation"),
@@ -152,7 +213,12 @@ MAP_CELL: Final = (
     Field("south", F64, "deg", "border of the cell"),
     Field("east", F64, "deg", "border of the cell"),
     Field("north", F64, "deg", "border of the cell"),
-    Field("safe_deceleration", F32, "m/s^2", "what the road bears with 95 % probability, g mu_lower; level road"),
+    Field(
+        "safe_deceleration",
+        F32,
+        "m/s^2",
+        "what the road bears with 95 % probability, g mu_lower; level road",
+    ),
 )
 
 # Parts of an hour's statistics of one cell and sector; those of the same hour are merged as each column says.
@@ -162,7 +228,9 @@ CELL_HOUR: Final = (
     Field("hour", US, "us since 1970, UTC", "begin of the hour of leave_time"),
     Field("observations", I64, "-", "count; add"),
     Field("late", I64, "-", "of them not fused; add"),
-    Field("vehicles", I64, "-", "distinct vehicles of this part; they do not add, see vehicle_bits"),
+    Field(
+        "vehicles", I64, "-", "distinct vehicles of this part; they do not add, see vehicle_bits"
+    ),
     Field("vehicle_bits", I64, "64 bits", "or; distinct vehicles are about -64 ln(share of zeros)"),
     Field("mu_count", I64, "-", "observations that said mu; add"),
     Field("mu_sum", F64, "-", "sum of mu; add"),
@@ -170,10 +238,20 @@ CELL_HOUR: Final = (
     Field("mu_min", F32, "-", "least mu; +inf where none was said; take the least"),
     Field("mu_max", F32, "-", "largest mu; -inf where none was said; take the largest"),
     Field("utilised_max", F32, "-", "largest grip used: mu was at least this; take the largest"),
-    Field("mu_histogram", pa.list_(I32), "-", "counts of mu on the 32 bins of the friction grid; add per bin"),
+    Field(
+        "mu_histogram",
+        pa.list_(I32),
+        "-",
+        "counts of mu on the 32 bins of the friction grid; add per bin",
+    ),
     Field("value_count", I64, "-", "values: observations that used enough of mu to tell it; add"),
     Field("value_sum", F64, "-", "sum of mu of the values; add"),
-    Field("log_likelihood_sum", pa.list_(I32), "1/16 nat", "sum of log_likelihood on the 32 bins; add per bin"),
+    Field(
+        "log_likelihood_sum",
+        pa.list_(I32),
+        "1/16 nat",
+        "sum of log_likelihood on the 32 bins; add per bin",
+    ),
 )
 
 ESTIMATES: Final = (
@@ -190,7 +268,9 @@ ESTIMATES: Final = (
     Field("mu_lower", F64, "-", "5 % quantile"),
     Field("mu_upper", F64, "-", "95 % quantile"),
     *(
-        Field(f"{wheel}{end}", F64, "-", f"{what} of this wheel; null where the estimator has one mu")
+        Field(
+            f"{wheel}{end}", F64, "-", f"{what} of this wheel; null where the estimator has one mu"
+        )
         for wheel in per_wheel("mu")
         for end, what in (("", "median"), ("_lower", "5 % quantile"), ("_upper", "95 % quantile"))
     ),
@@ -206,13 +286,16 @@ SIGNAL_LOG: Final = (
 )
 # Columns that a signal log may have beside these.
 SIGNAL_LOG_CONTEXT: Final = tuple(
-    Field(name, F64, unit, "null or NaN is unknown; the column may be missing") for name, unit in CONTEXT_UNITS.items()
+    Field(name, F64, unit, "null or NaN is unknown; the column may be missing")
+    for name, unit in CONTEXT_UNITS.items()
 )
 
 
 def arrow_schema(*fields: Field) -> pa.Schema:
     """Arrow schema of columns, with unit and meaning in the field metadata."""
-    return pa.schema([pa.field(f.name, f.type, metadata={"unit": f.unit, "meaning": f.meaning}) for f in fields])
+    return pa.schema(
+        [pa.field(f.name, f.type, metadata={"unit": f.unit, "meaning": f.meaning}) for f in fields]
+    )
 
 
 CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
@@ -220,7 +303,9 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 def kept(*fields: Field) -> tuple[Field, ...]:
     """Columns as they lie on disk: times in microseconds."""
-    return tuple(f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields)
+    return tuple(
+        f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields
+    )
 
 
 MAP_SCHEMA: Final = arrow_schema(*MAP_CELL)

@@ -32,24 +32,35 @@ class Calibration(BaseModel):
 
     version: Literal[1] = 1
     drives: Annotated[int, Field(ge=1, description="that it was learned from")]
-    radius_fl: Annotated[Learned | None, Field(description="turns faster than the mean of the four [1]")] = None
+    radius_fl: Annotated[
+        Learned | None, Field(description="turns faster than the mean of the four [1]")
+    ] = None
     radius_fr: Annotated[Learned | None, Field(description="likewise")] = None
     radius_rl: Annotated[Learned | None, Field(description="likewise")] = None
     radius_rr: Annotated[Learned | None, Field(description="likewise")] = None
-    ax: Annotated[Learned | None, Field(description="[m/s^2] read on level road at constant speed")] = None
+    ax: Annotated[
+        Learned | None, Field(description="[m/s^2] read on level road at constant speed")
+    ] = None
     ay: Annotated[Learned | None, Field(description="[m/s^2] likewise")] = None
     yaw_rate: Annotated[Learned | None, Field(description="[rad/s] read straight on")] = None
     steer_offset: Annotated[Learned | None, Field(description="[rad] read straight on")] = None
-    steer_gain: Annotated[Learned | None, Field(description="reading over the road wheels' true angle [1]")] = None
+    steer_gain: Annotated[
+        Learned | None, Field(description="reading over the road wheels' true angle [1]")
+    ] = None
     force_gain: Annotated[
         Learned | None,
         Field(description="torque over radius, over what moves the file's mass [1]"),
     ] = None
     wheel_lag: Annotated[
-        Learned | None, Field(description="[s] by which wheel speeds speak later than the inertial unit")
+        Learned | None,
+        Field(description="[s] by which wheel speeds speak later than the inertial unit"),
     ] = None
-    steer_lag: Annotated[Learned | None, Field(description="[s] likewise, the steering angle")] = None
-    understeer: Annotated[Learned | None, Field(description="[rad per m/s^2] that steering needs beyond L r/v")] = None
+    steer_lag: Annotated[Learned | None, Field(description="[s] likewise, the steering angle")] = (
+        None
+    )
+    understeer: Annotated[
+        Learned | None, Field(description="[rad per m/s^2] that steering needs beyond L r/v")
+    ] = None
 
 
 class Vehicle(BaseModel):
@@ -57,23 +68,40 @@ class Vehicle(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    name: Annotated[str, Field(min_length=1, max_length=64, description="what the vehicle is called")]
+    name: Annotated[
+        str, Field(min_length=1, max_length=64, description="what the vehicle is called")
+    ]
     mass: Annotated[float, Field(gt=0.0, lt=100_000.0, allow_inf_nan=False, description="[kg]")]
-    yaw_inertia: Annotated[float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[kg m^2]")]
+    yaw_inertia: Annotated[
+        float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[kg m^2]")
+    ]
     cg_to_front_axle: Annotated[Metres, Field(description="[m]")]
     cg_to_rear_axle: Annotated[Metres, Field(description="[m]")]
     track_front: Annotated[Metres, Field(description="[m]")]
     track_rear: Annotated[Metres, Field(description="[m]")]
     cg_height: Annotated[float, Field(gt=0.0, lt=5.0, allow_inf_nan=False, description="[m]")]
-    wheel_radius: Annotated[float, Field(gt=0.0, lt=2.0, allow_inf_nan=False, description="[m], effective")]
-    wheel_inertia: Annotated[float, Field(gt=0.0, lt=1000.0, allow_inf_nan=False, description="[kg m^2], one wheel")]
+    wheel_radius: Annotated[
+        float, Field(gt=0.0, lt=2.0, allow_inf_nan=False, description="[m], effective")
+    ]
+    wheel_inertia: Annotated[
+        float, Field(gt=0.0, lt=1000.0, allow_inf_nan=False, description="[kg m^2], one wheel")
+    ]
     longitudinal_stiffness: Annotated[
-        float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N per unit slip], one wheel at static load")
+        float,
+        Field(
+            gt=0.0,
+            lt=1e7,
+            allow_inf_nan=False,
+            description="[N per unit slip], one wheel at static load",
+        ),
     ]
     cornering_stiffness: Annotated[
-        float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N/rad], one wheel at static load")
+        float,
+        Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N/rad], one wheel at static load"),
     ]
-    wheel_radius_front: Annotated[Metres | None, Field(description="[m], where the axles' tyres differ")] = None
+    wheel_radius_front: Annotated[
+        Metres | None, Field(description="[m], where the axles' tyres differ")
+    ] = None
     wheel_radius_rear: Annotated[Metres | None, Field(description="[m], likewise")] = None
     cornering_stiffness_front: Annotated[
         float | None,
@@ -84,17 +112,32 @@ class Vehicle(BaseModel):
     ] = None
     steering_compliance: Annotated[
         float | None,
-        Field(ge=-0.1, le=0.1, description="[rad per g] that the front wheels lose to steering, bushes and roll"),
+        Field(
+            ge=-0.1,
+            le=0.1,
+            description="[rad per g] that the front wheels lose to steering, bushes and roll",
+        ),
     ] = None
-    rear_axle_locked: Annotated[bool, Field(description="whether the rear wheels turn as one: no differential")] = False
+    rear_axle_locked: Annotated[
+        bool, Field(description="whether the rear wheels turn as one: no differential")
+    ] = False
     drive_split_front: Annotated[
-        float | None, Field(ge=0.0, le=1.0, description="share of the driving torque at the front axle, where known")
+        float | None,
+        Field(
+            ge=0.0, le=1.0, description="share of the driving torque at the front axle, where known"
+        ),
     ] = None
     steering_ratio: Annotated[
         float | None,
-        Field(gt=1.0, lt=60.0, description="angle of the steering wheel over the road wheels', where known"),
+        Field(
+            gt=1.0,
+            lt=60.0,
+            description="angle of the steering wheel over the road wheels', where known",
+        ),
     ] = None
-    calibration: Annotated[Calibration | None, Field(description="learned by edge-agent calibrate")] = None
+    calibration: Annotated[
+        Calibration | None, Field(description="learned by edge-agent calibrate")
+    ] = None
 
     def axle_radius(self, axle: int) -> float:
         """Return the wheel radius [m] of the front (0) or rear (1) axle."""
@@ -130,15 +173,16 @@ def load_vehicle(path: Path | str) -> Vehicle:
     try:
         vehicle = Vehicle.model_validate_json(Path(path).read_bytes())
     except OSError as error:
-        raise InputError("vehicle", f"cannot read {path} ({error.strerror})", "name a vehicle file") from error
+        raise InputError(
+            "vehicle", f"cannot read {path} ({error.strerror})", "name a vehicle file"
+        ) from error
     except ValidationError as error:
         raise explain(error, f"vehicle file {path}") from error
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
     gyration = math.sqrt(vehicle.yaw_inertia / vehicle.mass)
     if not LEAST_GYRATION < gyration / wheelbase < MOST_GYRATION:
-        problem = (
-            f"{vehicle.mass:g} with yaw_inertia {vehicle.yaw_inertia:g} has a radius of gyration of {gyration:.3g} m"
-        )
+        of_both = f"{vehicle.mass:g} with yaw_inertia {vehicle.yaw_inertia:g}"
+        problem = f"{of_both} has a radius of gyration of {gyration:.3g} m"
         fix = f"give kg and kg m^2: that of cars is half the wheelbase, here {wheelbase:.3g} m"
         raise InputError("mass", problem, fix)
     return vehicle

@@ -18,7 +18,9 @@ FRONT_PER_LOAD: Final = 13.0  # [1/rad] cornering stiffness over load, rim angle
 REAR_PER_LOAD: Final = 20.0
 ALONG_PER_LOAD: Final = 20.0  # [1] longitudinal slip stiffness over load
 WHEEL_INERTIA: Final = 1.3  # [kg m^2]
-INERTIA_SHARE: Final = 0.97  # yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
+INERTIA_SHARE: Final = (
+    0.97  # yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
+)
 
 
 class Size(NamedTuple):
@@ -58,7 +60,9 @@ def fields_of_class(name: str) -> dict[str, str | float | None]:
         InputError: there is no such class.
     """
     if name not in CLASSES:
-        raise InputError("vehicle", f"there is no class {name!r}", f"choose one of {', '.join(CLASSES)}")
+        raise InputError(
+            "vehicle", f"there is no class {name!r}", f"choose one of {', '.join(CLASSES)}"
+        )
     size = CLASSES[name]
     load = 0.5 * size.mass * GRAVITY / (size.to_front + size.to_rear)
     wheel_load = 0.25 * size.mass * GRAVITY

@@ -60,13 +60,25 @@ def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireE
     """The first rule that a report breaks."""
     for name, (least, most) in RANGES.items():
         if not (np.isnan(values[name]) or least <= values[name] <= most):
-            return WireError(name, f"{values[name]:g} lies outside [{least:g}, {most:g}]", "leave out what is unknown")
+            return WireError(
+                name,
+                f"{values[name]:g} lies outside [{least:g}, {most:g}]",
+                "leave out what is unknown",
+            )
     if prior is None:
         if all(np.isnan(value) for value in values.values()):
             return WireError("weather", "says nothing", f"give one of {', '.join(RANGES)} or prior")
         return None
     if prior.shape != (mugrid.BINS,):
-        return WireError("prior", f"has {prior.size} bins", f"give {mugrid.BINS}, those of the friction grid, or none")
-    if not (np.isfinite(prior).all() and (prior >= 0.0).all() and abs(prior.sum() - 1.0) <= PRIOR_SUM_ERROR):
+        return WireError(
+            "prior",
+            f"has {prior.size} bins",
+            f"give {mugrid.BINS}, those of the friction grid, or none",
+        )
+    if not (
+        np.isfinite(prior).all()
+        and (prior >= 0.0).all()
+        and abs(prior.sum() - 1.0) <= PRIOR_SUM_ERROR
+    ):
         return WireError("prior", "is no probability", "give finite numbers from 0 that sum to 1")
     return None

@@ -36,7 +36,9 @@ class Opened:
         self.errors: list[str] = []
         self.requests: list[str] = []
         page.on("pageerror", lambda error: self.errors.append(str(error)))
-        page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        page.on(
+            "console", lambda said: self.errors.append(said.text) if said.type == "error" else None
+        )
         page.on("request", lambda request: self.requests.append(request.url))
 
     @property
@@ -51,7 +53,9 @@ class Opened:
 
 
 @contextmanager
-def opened(path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False) -> Iterator[Opened]:
+def opened(
+    path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False
+) -> Iterator[Opened]:
     """A file of this machine, or an address, in the browser; skips the test where there is none.
 
     `unbound`: as many pictures a second as it can paint, not as many as a screen shows.
@@ -59,11 +63,18 @@ def opened(path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound
     program = executable()
     if program is None:
         pytest.skip("no Chromium on this machine: apt install chromium")
-    api: Any = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'gripmap[dev]'")
+    api: Any = pytest.importorskip(
+        "playwright.sync_api", reason="no Playwright: pip install 'gripmap[dev]'"
+    )
     with api.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=program, args=["--no-sandbox", *(UNBOUND if unbound else ())])
+        browser = play.chromium.launch(
+            executable_path=program, args=["--no-sandbox", *(UNBOUND if unbound else ())]
+        )
         context = browser.new_context(
-            viewport=PHONE if phone else DESK, device_scale_factor=ratio, has_touch=phone, is_mobile=phone
+            viewport=PHONE if phone else DESK,
+            device_scale_factor=ratio,
+            has_touch=phone,
+            is_mobile=phone,
         )
         try:
             found = Opened(context.new_page())

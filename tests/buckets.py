@@ -70,7 +70,9 @@ class BucketServer:
     def objects(self) -> dict[str, bytes]:
         """All that is there."""
         base = self._folder / BUCKET / PREFIX
-        found = [path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")]
+        found = [
+            path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")
+        ]
         return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
 
     def place(self, name: str) -> Path:

@@ -46,11 +46,29 @@ def _published(system: System, log: Path) -> tuple[Cells, list[str]]:
     session = open_session(ZenohSettings(connect=[system.endpoint]))
     assert session is not None
     with session:
-        held = session.declare_subscriber("gripmap/v1/alert/**", lambda sample: alerts.append(str(sample.key_expr)))
-        assert edge_agent(["import", str(BLF), str(NMEA), "--profile", "toyota", *car, "--out", str(log)]) == 0
+        held = session.declare_subscriber(
+            "gripmap/v1/alert/**", lambda sample: alerts.append(str(sample.key_expr))
+        )
+        assert (
+            edge_agent(
+                ["import", str(BLF), str(NMEA), "--profile", "toyota", *car, "--out", str(log)]
+            )
+            == 0
+        )
         assert edge_agent(["check", str(log), *car]) == 0
         for name in VEHICLES:
-            words = ["replay", str(log), *car, "--out", out, "--publish", "--name", name, "--config", str(system.agent)]
+            words = [
+                "replay",
+                str(log),
+                *car,
+                "--out",
+                out,
+                "--publish",
+                "--name",
+                name,
+                "--config",
+                str(system.agent),
+            ]
             with redirect_stdout(StringIO()) as told:
                 assert edge_agent([*words, "--start", "now"]) == 0
             said = json.loads(told.getvalue().splitlines()[-1])

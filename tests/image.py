@@ -26,7 +26,18 @@ from tests.waiting import until
 
 DOCKERFILE: Final = ROOT / "deploy" / "Dockerfile"
 PLACES: Final = ("/src", "/etc/gripmap", "/var/lib/gripmap", "/var/cache/gripmap")
-OURS: Final = ("PIP_", "SSL_", "REQUESTS_", "CURL_", "HTTP", "HTTPS", "NO_PROXY", "http_", "https_", "no_proxy")
+OURS: Final = (
+    "PIP_",
+    "SSL_",
+    "REQUESTS_",
+    "CURL_",
+    "HTTP",
+    "HTTPS",
+    "NO_PROXY",
+    "http_",
+    "https_",
+    "no_proxy",
+)
 START_S: Final = 60.0
 
 
@@ -83,7 +94,9 @@ class Image:
         assert version, base
         asked = "import sys; print('%d.%d' % sys.version_info[:2])"
         for command in candidates(version[1]):
-            done = subprocess.run([command, "-c", asked], capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                [command, "-c", asked], capture_output=True, text=True, check=False
+            )
             if done.stdout.strip() == version[1]:
                 subprocess.run([command, "-m", "venv", self.root / "usr"], check=True)
                 self.environment["PATH"] = f"{self.root / 'usr' / 'bin'}:/usr/bin:/bin"
@@ -111,8 +124,17 @@ def starts(image: Image) -> float:
         config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
         began = time.monotonic()
         with lines.open("w") as out:
-            words = ["fleet-service", "run", "--config", str(config), "--archive", str(image.folder / "archive")]
-            service = subprocess.Popen(words, cwd=image.folder, env=image.environment, stdout=out, stderr=out)
+            words = [
+                "fleet-service",
+                "run",
+                "--config",
+                str(config),
+                "--archive",
+                str(image.folder / "archive"),
+            ]
+            service = subprocess.Popen(
+                words, cwd=image.folder, env=image.environment, stdout=out, stderr=out
+            )
         until(lambda: service.poll() is not None or "ready: " in lines.read_text(), START_S)
         took = time.monotonic() - began
         for process in (service, router):
@@ -131,11 +153,15 @@ def main() -> int:
         for name, words in steps(DOCKERFILE.read_text()):
             began = time.monotonic()
             image.take(name, words)
-            print(f"{time.monotonic() - began:6.1f} s  {name} {shlex.quote(words)[:100]}", flush=True)
+            print(
+                f"{time.monotonic() - began:6.1f} s  {name} {shlex.quote(words)[:100]}", flush=True
+            )
         user, _, group = image.user.partition(":")
         assert user.isdecimal(), "Kubernetes must see that it is not root"
         assert int(user) > 0 < int(group)
-        print(f"a service of the image is ready after {starts(image):.1f} s, with kernels that the build has compiled")
+        print(
+            f"a service of the image is ready after {starts(image):.1f} s, with kernels that the build has compiled"
+        )
     return 0
 
 

@@ -63,7 +63,17 @@ IRREGULAR: Final = (
     "spent split spoken spread stood stuck swept sworn taken taught thought thrown told torn understood woken won worn "
     "written"
 )
-PARTICIPLES: Final = set(IRREGULAR.split()) - {"bound", "fit", "let", "put", "read", "run", "set", "split", "spread"}
+PARTICIPLES: Final = set(IRREGULAR.split()) - {
+    "bound",
+    "fit",
+    "let",
+    "put",
+    "read",
+    "run",
+    "set",
+    "split",
+    "spread",
+}
 DUNDER: Final = re.compile(r"__\w+__")
 
 
@@ -96,7 +106,9 @@ def functions(package: str) -> Iterator[Named]:
     """Yield the functions and methods of a package, tests and properties included, dunder methods not."""
     for path in sources(ROOT, package):
         for node in ast.walk(parse(path)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not DUNDER.fullmatch(node.name):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not DUNDER.fullmatch(
+                node.name
+            ):
                 yield Named(f"{path.relative_to(ROOT)}:{node.lineno}", node.name)
 
 
@@ -132,10 +144,16 @@ def measure(package: str) -> dict[str, float]:
     return {
         "openings": float(sum(bool(OPENING.match(text)) for text in texts)),
         "stop_words": float(sum(len(stop_words(text)) for text in texts)),
-        "free_relatives": rounded(1e3 * sum(len(free_relatives(text)) for text in texts) / max(words, 1)),
+        "free_relatives": rounded(
+            1e3 * sum(len(free_relatives(text)) for text in texts) / max(words, 1)
+        ),
         "participles": rounded(100 * sum(map(is_participle, others)) / max(len(others), 1)),
-        "one_word": rounded(100 * sum("_" not in name.strip("_") for name in others) / max(len(others), 1)),
-        "long_test_names": rounded(100 * sum(len(name) > LONGEST_TEST_NAME for name in tests) / max(len(tests), 1)),
+        "one_word": rounded(
+            100 * sum("_" not in name.strip("_") for name in others) / max(len(others), 1)
+        ),
+        "long_test_names": rounded(
+            100 * sum(len(name) > LONGEST_TEST_NAME for name in tests) / max(len(tests), 1)
+        ),
     }
 
 
@@ -148,7 +166,11 @@ def prose(text: str) -> str:
     """Return the prose of a Markdown page: without code, tables, generated parts, headings, links and markers."""
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    kept = [line for line in text.splitlines() if not re.match(r"\s*(\||#|    \S|\[[^\]]+\]:|\(.*\)=|:)", line)]
+    kept = [
+        line
+        for line in text.splitlines()
+        if not re.match(r"\s*(\||#|    \S|\[[^\]]+\]:|\(.*\)=|:)", line)
+    ]
     text = "\n".join(kept)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
     return re.sub(r"`[^`]*`", "Code", text)
@@ -172,7 +194,9 @@ def long_sentences(page: Path) -> list[str]:
 
 def page_stop_words(page: Path) -> list[str]:
     """Return the words on the stop list in the prose and tables of a page."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(
+        r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+    )
     return stop_words(re.sub(r"`[^`]*`", "", text))
 
 
@@ -205,12 +229,17 @@ def ceilings() -> dict[str, dict[str, dict[str, float]]]:
 
 def lower_ceilings() -> None:
     """Lower each ceiling to the figure of today where that is less; add those that are missing."""
-    today = {"packages": {package: measure(package) for package in PACKAGES}, "pages": measure_pages()}
+    today = {
+        "packages": {package: measure(package) for package in PACKAGES},
+        "pages": measure_pages(),
+    }
     before = ceilings() if CEILINGS.exists() else today
     lowered: dict[str, dict[str, dict[str, float]]] = {"packages": {}, "pages": {}}
     for package, figures in today["packages"].items():
         old = before["packages"].get(package, figures)
-        lowered["packages"][package] = {name: min(value, old.get(name, value)) for name, value in figures.items()}
+        lowered["packages"][package] = {
+            name: min(value, old.get(name, value)) for name, value in figures.items()
+        }
     for page, old in before["pages"].items():
         figures = today["pages"].get(page, {})
         left = {name: min(value, figures.get(name, 0.0)) for name, value in old.items()}
@@ -233,7 +262,11 @@ def print_faults(rule: str) -> None:
         for place, name in functions(package):
             if rule == "participles" and is_participle(name):
                 print(f"{place}: {name}")
-            if rule == "long_test_names" and name.startswith("test_") and len(name) > LONGEST_TEST_NAME:
+            if (
+                rule == "long_test_names"
+                and name.startswith("test_")
+                and len(name) > LONGEST_TEST_NAME
+            ):
                 print(f"{place}: {name}")
     if rule == "pages":
         for page in pages():

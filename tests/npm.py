@@ -44,7 +44,10 @@ PACKAGES: Final = {
 def file_of(name: str, path: str) -> Path | None:
     """A file of a package; None where it was not fetched, or is not the pinned one."""
     found = FOLDER / name / Path(path).name
-    if not found.is_file() or hashlib.sha256(found.read_bytes()).hexdigest() != PACKAGES[name].files[path]:
+    if (
+        not found.is_file()
+        or hashlib.sha256(found.read_bytes()).hexdigest() != PACKAGES[name].files[path]
+    ):
         return None
     return found
 
@@ -59,7 +62,14 @@ def fetch(name: str) -> None:
     if all(file_of(name, path) for path in package.files):
         return
     with tempfile.TemporaryDirectory() as folder:
-        words = ["npm", "pack", "--silent", f"{name}@{package.version}", "--pack-destination", folder]
+        words = [
+            "npm",
+            "pack",
+            "--silent",
+            f"{name}@{package.version}",
+            "--pack-destination",
+            folder,
+        ]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         with tarfile.open(next(Path(folder).glob("*.tgz"))) as packed:
             (FOLDER / name).mkdir(parents=True, exist_ok=True)

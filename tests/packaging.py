@@ -29,7 +29,10 @@ from pathlib import Path
 for package in (schemas, edge_agent, fleet_service, deploy):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package
 """
-HIDING = {"schemas": ("gripmap", "edge_agent", "fleet_service"), "deploy": ("gripmap",)}  # what says so
+HIDING = {
+    "schemas": ("gripmap", "edge_agent", "fleet_service"),
+    "deploy": ("gripmap",),
+}  # what says so
 VERSIONS = ("3.11", "3.12", "3.13")
 WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 
@@ -40,7 +43,9 @@ def interpreters() -> list[str]:
     for version in VERSIONS:
         why = "no such command on this machine"
         for here in candidates(version):
-            said = subprocess.run([here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60)
+            said = subprocess.run(
+                [here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60
+            )
             if said.stdout.strip() == version:
                 found.append(here)
                 break
@@ -64,9 +69,13 @@ def candidates(version: str) -> list[str]:
 
 def main() -> int:
     """Build, install, use; exit code 1 with what went wrong."""
-    parser = argparse.ArgumentParser(prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument(
-        "--python", nargs="*", help=f"interpreters (default: {', '.join(VERSIONS)} where there are such)"
+        "--python",
+        nargs="*",
+        help=f"interpreters (default: {', '.join(VERSIONS)} where there are such)",
     )
     pythons = parser.parse_args().python or interpreters()
     if not pythons:
@@ -98,7 +107,15 @@ def use(python: str, wheel: Path, folder: Path) -> None:
     log: list[str | Path] = ["--out", "drive.parquet", "--vehicle-out", "car.json"]
     run([scripts / "edge-agent", "simulate", "slalom", "--mu", ".6", *log], folder)
     run(
-        [scripts / "edge-agent", "replay", "drive.parquet", "--vehicle", "car.json", "--out", "estimates.parquet"],
+        [
+            scripts / "edge-agent",
+            "replay",
+            "drive.parquet",
+            "--vehicle",
+            "car.json",
+            "--out",
+            "estimates.parquet",
+        ],
         folder,
     )
     run([scripts / "fleet-service", "--help"], folder)
@@ -111,17 +128,30 @@ def use(python: str, wheel: Path, folder: Path) -> None:
                 [scripts / "python", "-c", f"import {module}"],
                 cwd=own.parent, capture_output=True, text=True, check=False, timeout=60,
             )  # fmt: skip
-            if hidden.returncode == 0 or str(own) not in hidden.stderr or "rename it" not in hidden.stderr:
-                raise SystemExit(f"a package `{name}` of the user's own is not named: {hidden.stderr}")
+            if (
+                hidden.returncode == 0
+                or str(own) not in hidden.stderr
+                or "rename it" not in hidden.stderr
+            ):
+                raise SystemExit(
+                    f"a package `{name}` of the user's own is not named: {hidden.stderr}"
+                )
 
 
 def run(command: list[str | Path], folder: Path) -> None:
     """Run a command in a folder, with the seconds it took; SystemExit with its output where it fails."""
     began = time.monotonic()
     done = subprocess.run(
-        [str(part) for part in command], cwd=folder, capture_output=True, text=True, check=False, timeout=600
+        [str(part) for part in command],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
     )
-    line = " ".join(Path(str(part)).name if "/" in str(part) else str(part) for part in command).split("\n")[0]
+    line = " ".join(
+        Path(str(part)).name if "/" in str(part) else str(part) for part in command
+    ).split("\n")[0]
     print(f"{time.monotonic() - began:6.1f} s  {line[:100]}", flush=True)
     if done.returncode != 0:
         raise SystemExit(f"{done.stdout}\n{done.stderr}")

@@ -29,8 +29,14 @@ from schemas import tables
 from schemas.config import AgentConfig, ServiceConfig
 from schemas.runtime.metrics import PREFIX, Metric
 
-COMMAND_LINES: Final[dict[str, Any]] = {"edge-agent": edge_agent.cli, "fleet-service": fleet_service.cli}
-SETTINGS: Final[dict[str, type[BaseModel]]] = {"edge-agent": AgentConfig, "fleet-service": ServiceConfig}
+COMMAND_LINES: Final[dict[str, Any]] = {
+    "edge-agent": edge_agent.cli,
+    "fleet-service": fleet_service.cli,
+}
+SETTINGS: Final[dict[str, type[BaseModel]]] = {
+    "edge-agent": AgentConfig,
+    "fleet-service": ServiceConfig,
+}
 TABLES: Final = {
     "Signal log": tables.SIGNAL_LOG,
     "Estimates": tables.ESTIMATES,
@@ -61,7 +67,11 @@ def command_page(program: str) -> str:
             parts.append("\n| option | |\n|---|---|\n")
         for action in actions:
             about = (action.help or "") % {"default": action.default} if action.help else ""
-            choices = f" ({', '.join(map(str, action.choices))})" if action.choices and not action.metavar else ""
+            choices = (
+                f" ({', '.join(map(str, action.choices))})"
+                if action.choices and not action.metavar
+                else ""
+            )
             parts.append(f"| `{_cell(_action_name(action))}` | {_cell(about + choices)} |\n")
     return "".join(parts)
 
@@ -90,17 +100,22 @@ def settings_rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[st
         if isinstance(nested, type) and issubclass(nested, BaseModel):
             yield from settings_rows(nested, f"{prefix}{name}.")
         else:
-            default = "" if field.is_required() else repr(field.get_default(call_default_factory=True))
+            default = (
+                "" if field.is_required() else repr(field.get_default(call_default_factory=True))
+            )
             yield f"{prefix}{field.alias or name}", default, field.description or ""
 
 
 def settings_page() -> str:
     """Return the page of all settings."""
-    parts = ["# Configuration\n\nSettings are a JSON file, given with `--config`. Unknown names are refused.\n"]
+    parts = [
+        "# Configuration\n\nSettings are a JSON file, given with `--config`. Unknown names are refused.\n"
+    ]
     for program, model in SETTINGS.items():
         parts.append(f"\n## `{program}`\n\n| setting | default | |\n|---|---|---|\n")
         parts += [
-            f"| `{name}` | `{_cell(default)}` | {_cell(about)} |\n" for name, default, about in settings_rows(model)
+            f"| `{name}` | `{_cell(default)}` | {_cell(about)} |\n"
+            for name, default, about in settings_rows(model)
         ]
     return "".join(parts)
 
@@ -110,7 +125,9 @@ def tables_page() -> str:
     parts = ["# Tables\n\nNames, types, units and meanings come from `schemas/tables.py`.\n"]
     for title, fields in TABLES.items():
         parts.append(f"\n## {title}\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
-        parts += [f"| `{f.name}` | {f.type} | {_cell(f.unit)} | {_cell(f.meaning)} |\n" for f in fields]
+        parts += [
+            f"| `{f.name}` | {f.type} | {_cell(f.unit)} | {_cell(f.meaning)} |\n" for f in fields
+        ]
     return "".join(parts)
 
 
@@ -124,7 +141,13 @@ def all_metrics(root: Path) -> Shown:
     finally:
         engine.close()
     counts: Any = SimpleNamespace(
-        published={}, acknowledged={}, rejected={}, late={}, resent_batches=0, bad_acks=0, failures=0
+        published={},
+        acknowledged={},
+        rejected={},
+        late={},
+        resent_batches=0,
+        bad_acks=0,
+        failures=0,
     )
     publisher: Any = SimpleNamespace(
         unanswered=0,
@@ -149,7 +172,9 @@ def stored_name(metric: Metric) -> str:
 
 def metrics_page(found: Shown) -> str:
     """Return the page of all metrics."""
-    parts = ["# Metrics\n\nNames as Prometheus stores them.\n\n| metric | of | kind | |\n|---|---|---|---|\n"]
+    parts = [
+        "# Metrics\n\nNames as Prometheus stores them.\n\n| metric | of | kind | |\n|---|---|---|---|\n"
+    ]
     for half, metrics in found.items():
         for metric in metrics:
             kind = metric.kind + (metric.label and f", by {metric.label}")

@@ -27,9 +27,13 @@ def changelog_section(text: str, version: str) -> str:
     Raises:
         InputError: it is missing or empty.
     """
-    found = re.search(rf"^## {re.escape(version)}\b[^\n]*\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    found = re.search(
+        rf"^## {re.escape(version)}\b[^\n]*\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL
+    )
     if found is None or not found[1].strip():
-        raise InputError("changelog", f"has no section '## {version}'", "rename the section Unreleased")
+        raise InputError(
+            "changelog", f"has no section '## {version}'", "rename the section Unreleased"
+        )
     return found[1].strip()
 
 
@@ -46,14 +50,19 @@ def with_version(text: str, pattern: str, version: str) -> str:
     """
     changed, count = re.subn(pattern + r"[^\"\n]+", rf"\g<1>{version}", text, flags=re.MULTILINE)
     if count != 1:
-        raise InputError("version", f"{pattern!r} matches {count} times", "correct the file or the pattern")
+        raise InputError(
+            "version", f"{pattern!r} matches {count} times", "correct the file or the pattern"
+        )
     return changed
 
 
 def set_version(root: Path, version: str, day: str) -> None:
     """Write version and date into `pyproject.toml` and `CITATION.cff`."""
     project = root / "pyproject.toml"
-    project.write_text(with_version(project.read_text(encoding="utf-8"), r'^(version = ")', version), encoding="utf-8")
+    project.write_text(
+        with_version(project.read_text(encoding="utf-8"), r'^(version = ")', version),
+        encoding="utf-8",
+    )
     citation = root / "CITATION.cff"
     text = with_version(citation.read_text(encoding="utf-8"), r"^(version: )", version)
     citation.write_text(with_version(text, r'^(date-released: ")', day), encoding="utf-8")
@@ -71,7 +80,9 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    subprocess.run([sys.executable, "-m", "build", "--outdir", "dist", str(ROOT)], cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--outdir", "dist", str(ROOT)], cwd=ROOT, check=True
+    )
     sbom = ROOT / "dist" / f"gripmap-{version}.cdx.json"
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(sbom)]
     subprocess.run(command, cwd=ROOT, check=True)

@@ -52,8 +52,12 @@ class Campaign(NamedTuple):
 
 
 CAMPAIGNS: Final = {
-    "edge": Campaign("edge-agent evaluate --out .evaluation/edge", ".evaluation/edge", "edge-agent evaluate"),
-    "fleet": Campaign("fleet-service evaluate --out .evaluation/fleet", ".evaluation/fleet", "fusion"),
+    "edge": Campaign(
+        "edge-agent evaluate --out .evaluation/edge", ".evaluation/edge", "edge-agent evaluate"
+    ),
+    "fleet": Campaign(
+        "fleet-service evaluate --out .evaluation/fleet", ".evaluation/fleet", "fusion"
+    ),
     "demo": Campaign("make demo", ".demo", "demo"),
     "inputs": Campaign(
         "edge-agent evaluate --only inputs --recorded tests/data/rav4.blf --out .evaluation/inputs",
@@ -66,9 +70,13 @@ CAMPAIGNS: Final = {
         "edge-agent evaluate --only ahead",
     ),
     "listening": Campaign(
-        "python -m deploy.listening --out .evaluation/listening", ".evaluation/listening", "deploy.listening"
+        "python -m deploy.listening --out .evaluation/listening",
+        ".evaluation/listening",
+        "deploy.listening",
     ),
-    "study": Campaign("edge-agent tune --study .evaluation/study", ".evaluation/study", "edge-agent tune --study"),
+    "study": Campaign(
+        "edge-agent tune --study .evaluation/study", ".evaluation/study", "edge-agent tune --study"
+    ),
     "faults": Campaign("make faults", ".faults", "faults"),
     "cluster": Campaign("make cluster-faults", ".faults/cluster", "cluster"),
     "bench": Campaign("make bench", ".bench", "bench"),
@@ -100,7 +108,9 @@ class Table(NamedTuple):
 
 
 def _study(values: dict[str, float]) -> str:
-    return study_report.markdown([Figure(name, value, "") for name, value in values.items()]).rstrip()
+    return study_report.markdown(
+        [Figure(name, value, "") for name, value in values.items()]
+    ).rstrip()
 
 
 TABLES: Final = (
@@ -110,7 +120,12 @@ TABLES: Final = (
         re.compile(f"({'|'.join(map(re.escape, printed.names()))})$"),
         report.table,
     ),
-    Table("edge", "All estimators on rough drives in hilly towns", re.compile(r"world\."), report.world),
+    Table(
+        "edge",
+        "All estimators on rough drives in hilly towns",
+        re.compile(r"world\."),
+        report.world,
+    ),
     Table(
         "edge",
         "Sensor faults",
@@ -123,7 +138,12 @@ TABLES: Final = (
         re.compile(re.escape(fading.PREFIX)),
         fading.table,
     ),
-    Table("study", "Fuzzy memberships of paper 004's filter, held-out drives", re.compile(r"tuning\."), _study),
+    Table(
+        "study",
+        "Fuzzy memberships of paper 004's filter, held-out drives",
+        re.compile(r"tuning\."),
+        _study,
+    ),
 )
 
 
@@ -151,7 +171,10 @@ LINES: Final = (
 def pages() -> list[Path]:
     """Return every Markdown page that is part of the repository, sorted."""
     folders = ("schemas", "edge_agent", "fleet_service", "deploy", "tests", ".github")
-    found = [*ROOT.glob("*.md"), *(page for folder in folders for page in (ROOT / folder).rglob("*.md"))]
+    found = [
+        *ROOT.glob("*.md"),
+        *(page for folder in folders for page in (ROOT / folder).rglob("*.md")),
+    ]
     return sorted(page for page in found if not {"node_modules", "generated"} & set(page.parts))
 
 
@@ -193,11 +216,21 @@ def keep(name: str, source: Path) -> str:
     if runs.get(commit, header)["date"] > header["date"]:
         return f"{name}: unchanged; {source} is older than the kept run"
     runs[commit] = {key: header[key] for key in ("date", "machine", "seeds")}
-    rows = [row for row in rows if runs[before.get(row["name"], {}).get("commit", commit)]["date"] <= header["date"]]
-    newer = {row["name"]: {**row, "commit": commit} for row in rows if _is_wanted(name, row, before)}
+    rows = [
+        row
+        for row in rows
+        if runs[before.get(row["name"], {}).get("commit", commit)]["date"] <= header["date"]
+    ]
+    newer = {
+        row["name"]: {**row, "commit": commit} for row in rows if _is_wanted(name, row, before)
+    }
     found = before | newer
     used = {row["commit"] for row in found.values()}
-    about = {"campaign": campaign.title, "command": campaign.command, "runs": {c: runs[c] for c in runs if c in used}}
+    about = {
+        "campaign": campaign.title,
+        "command": campaign.command,
+        "runs": {c: runs[c] for c in runs if c in used},
+    }
     FOLDER.mkdir(exist_ok=True)
     body = ",\n".join(json.dumps(line, ensure_ascii=False) for line in (about, *found.values()))
     (FOLDER / f"{name}.json").write_text(f"[\n{body}\n]\n", encoding="utf-8")
@@ -214,7 +247,9 @@ def _is_wanted(name: str, row: Row, before: dict[str, Row]) -> bool:
 
 def results_page() -> str:
     """Return the text of `deploy/docs/results.md`, made from the kept figures and nothing else."""
-    judged = [(name, row) for name in CAMPAIGNS for row in kept(name).values() if row["bar"] is not None]
+    judged = [
+        (name, row) for name in CAMPAIGNS for row in kept(name).values() if row["bar"] is not None
+    ]
     missed = [(name, row) for name, row in judged if not row["holds"]]
     parts = [
         "# Results\n",
@@ -243,13 +278,17 @@ def _campaign_section(name: str) -> Iterator[str]:
     for commit, run in _runs(name).items():
         yield f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, seeds {seeds(run['seeds'])}"
     tables = [table for table in TABLES if table.campaign == name]
-    rows = [row for row in found.values() if row["bar"] is not None or not _is_in_table(row, tables)]
+    rows = [
+        row for row in found.values() if row["bar"] is not None or not _is_in_table(row, tables)
+    ]
     rows.sort(key=lambda row: (row["bar"] is None, row["holds"]))
     if rows:
         yield "\n|figure| |value|bar|unit|commit|\n|---|---|---|---|---|---|"
     for row in rows:
         mark = "" if row["bar"] is None else HOLDS if row["holds"] else MISSED
-        yield (f"|`{row['name']}`|{mark}|{number(row['value'])}|{bar(row)}|{text(row['unit'])}|{row['commit']}|")
+        yield (
+            f"|`{row['name']}`|{mark}|{number(row['value'])}|{bar(row)}|{text(row['unit'])}|{row['commit']}|"
+        )
     values = {key: math.nan if row["value"] is None else row["value"] for key, row in found.items()}
     for table in tables:
         yield f"\n### {table.title}\n"
@@ -258,7 +297,9 @@ def _campaign_section(name: str) -> Iterator[str]:
 
 def _rendered(table: Table, values: dict[str, float]) -> str:
     try:
-        return table.render({name: value for name, value in values.items() if table.names.match(name)})
+        return table.render(
+            {name: value for name, value in values.items() if table.names.match(name)}
+        )
     except KeyError as missing:
         return f"Not complete: the kept run has no figure {missing.args[0]}."
 
@@ -338,9 +379,15 @@ def write_pages() -> None:
 
 def main() -> int:
     """Keep the figures of all campaigns that ran, and write the pages."""
-    parser = argparse.ArgumentParser(prog="make figures", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--pages-only", action="store_true", help="write the pages from the figures that are kept")
-    parser.add_argument("sources", nargs="*", metavar="NAME=FILE", help=f"NAME is one of {', '.join(CAMPAIGNS)}")
+    parser = argparse.ArgumentParser(
+        prog="make figures", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--pages-only", action="store_true", help="write the pages from the figures that are kept"
+    )
+    parser.add_argument(
+        "sources", nargs="*", metavar="NAME=FILE", help=f"NAME is one of {', '.join(CAMPAIGNS)}"
+    )
     arguments = parser.parse_args()
     given = dict(word.partition("=")[::2] for word in arguments.sources)
     if unknown := set(given) - set(CAMPAIGNS):

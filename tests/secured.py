@@ -32,8 +32,15 @@ RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1
 
 def enrolment(**changed: object) -> Enrolment:
     """Two routers, a service, a reader and two vehicles."""
-    names = {"services": [SERVICE], "readers": [READER], "weather": [WEATHER], "vehicles": list(VEHICLES)}
-    return Enrolment.model_validate({"routers": dict.fromkeys(ROUTERS, Router()), **names, **changed})
+    names = {
+        "services": [SERVICE],
+        "readers": [READER],
+        "weather": [WEATHER],
+        "vehicles": list(VEHICLES),
+    }
+    return Enrolment.model_validate(
+        {"routers": dict.fromkeys(ROUTERS, Router()), **names, **changed}
+    )
 
 
 def registry(folder: Path) -> Registry:
@@ -50,7 +57,10 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
         "enable_mtls": True,
         "verify_name_on_connect": True,
     }
-    return ZenohSettings(connect=[endpoint], config={"transport/link/tls": {**tls, **changed}, "connect/retry": RETRY})
+    return ZenohSettings(
+        connect=[endpoint],
+        config={"transport/link/tls": {**tls, **changed}, "connect/retry": RETRY},
+    )
 
 
 @dataclass
@@ -77,7 +87,9 @@ class Network:
         Raises:
             zenoh.ZError: the router does not want it.
         """
-        return zenoh.open(configuration(settings(self.endpoints[router], self.folder, **changed), name))
+        return zenoh.open(
+            configuration(settings(self.endpoints[router], self.folder, **changed), name)
+        )
 
     def session_at(self, name: str, endpoints: Sequence[str]) -> zenoh.Session:
         """A session under a name of the folder that tries these endpoints in turn."""
@@ -102,7 +114,10 @@ class Network:
         listen = [places[protocol] or FREE[protocol] for protocol in protocols]
         command = ["--config", str(running), "--listen", *listen]
         process = subprocess.Popen(
-            [sys.executable, "-m", "deploy.router", *command], stdout=subprocess.PIPE, text=True, cwd=ROOT
+            [sys.executable, "-m", "deploy.router", *command],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
         )
         self.routers[router] = process
         assert process.stdout is not None
@@ -144,7 +159,12 @@ def _heard(there: zenoh.Session, arrived: threading.Event) -> bool:
 
 @contextmanager
 def network(
-    folder: Path, *, guarded: bool = True, fleet: Enrolment | None = None, protocol: str = "tls", capped: bool = False
+    folder: Path,
+    *,
+    guarded: bool = True,
+    fleet: Enrolment | None = None,
+    protocol: str = "tls",
+    capped: bool = False,
 ) -> Iterator[Network]:
     """Certificates in a folder, and both routers."""
     registry(folder).enrol(fleet or enrolment())

@@ -24,9 +24,13 @@ def cores(count: int) -> Iterator[Any]:
 
     if (other := SparkSession.getActiveSession()) is not None:
         other.stop()  # it would be taken, with its own cores
-    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # as `spark.session` does, for what it then finds
+    os.environ.setdefault(
+        "PYSPARK_PYTHON", sys.executable
+    )  # as `spark.session` does, for what it then finds
     # of the environment, Spark looks only at what it holds when its Java starts: the second session would be the first
-    builder = SparkSession.builder.master(f"local[{count},{TRIES}]").config("spark.ui.showConsoleProgress", "false")
+    builder = SparkSession.builder.master(f"local[{count},{TRIES}]").config(
+        "spark.ui.showConsoleProgress", "false"
+    )
     found = builder.config(map={**spark.SETTINGS}).getOrCreate()
     try:
         yield spark.session()

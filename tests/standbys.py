@@ -112,7 +112,10 @@ def hosts(
     """Hosts, whose services are not started, each of its own name if `named`; they are gone after the block."""
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]
-        made = [Host(folder / name, router, bucket, **settings, **one) for name, one in zip(names, own, strict=True)]
+        made = [
+            Host(folder / name, router, bucket, **settings, **one)
+            for name, one in zip(names, own, strict=True)
+        ]
         for host in made:
             stack.callback(host.close)
         yield made

@@ -103,7 +103,9 @@ def light_import(root: Path) -> tuple[float, int, list[str]]:
         f"print(1e3 * (time.perf_counter() - begun), len(set(sys.modules) - before), "
         f"*[name for name in {HEAVY!r} if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", words], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", words], cwd=root, capture_output=True, text=True, check=True
+    )
     milliseconds, modules, *heavy = done.stdout.split()
     return float(milliseconds), int(modules), heavy
 
@@ -137,7 +139,9 @@ def room_arrows(root: Path, folder: str) -> Places:
         for line, name in imported(parse(path)):
             if name.startswith(f"{base}."):
                 other = name.removeprefix(f"{base}.").split(".")[0]
-                exists = (root / folder / other).is_dir() or (root / folder / f"{other}.py").exists()
+                exists = (root / folder / other).is_dir() or (
+                    root / folder / f"{other}.py"
+                ).exists()
                 if exists and other != own and own != "__init__":
                     found.setdefault((own, other), f"{path.relative_to(root)}:{line}")
     return [f"{a} -> {b}: {place}" for (a, b), place in sorted(found.items())]
@@ -156,7 +160,10 @@ def methods_of_largest_class(root: Path) -> Places:
             if isinstance(node, ast.ClassDef):
                 methods = [item for item in node.body if isinstance(item, FunctionNode)]
                 if len(methods) > len(largest):
-                    largest = [f"{path.relative_to(root)}:{item.lineno} {node.name}.{item.name}" for item in methods]
+                    largest = [
+                        f"{path.relative_to(root)}:{item.lineno} {node.name}.{item.name}"
+                        for item in methods
+                    ]
     return largest
 
 
@@ -265,7 +272,11 @@ def named_constants(root: Path) -> Places:
         for owner, body in bodies:
             for node in body:
                 value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
-                target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+                target = (
+                    node.targets[0]
+                    if isinstance(node, ast.Assign)
+                    else getattr(node, "target", None)
+                )
                 if value is None or not isinstance(target, ast.Name) or not _is_number(value):
                     continue
                 if owner or target.id.isupper():
@@ -277,7 +288,10 @@ def _is_number(node: ast.AST) -> bool:
     """Return True for a number or arithmetic of numbers; a bool or a text is none."""
     parts = list(ast.walk(node))
     constants = [part.value for part in parts if isinstance(part, ast.Constant)]
-    plain = all(isinstance(part, ast.Constant | ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop) for part in parts)
+    plain = all(
+        isinstance(part, ast.Constant | ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop)
+        for part in parts
+    )
     return plain and bool(constants) and all(type(value) in (int, float) for value in constants)
 
 
@@ -288,19 +302,41 @@ def only_tests_use(root: Path) -> Places:
     with a decorator other than `property` are left out, because the decorator may register them.
     """
     texts = {path: path.read_text(encoding="utf-8") for path in sources(root, *PACKAGES)}
-    others = [root / "Makefile", root / "pyproject.toml", *root.rglob("deploy/**/*.md"), *root.glob("*/**/README.md")]
-    others += [*root.glob("*.md"), *root.rglob("deploy/**/*.ipynb"), *root.rglob("*/static/**/*.js")]
-    words = Counter(re.findall(r"\w+", "\n".join([*texts.values(), *(path.read_text("utf-8") for path in others)])))
-    tests = set(re.findall(r"\w+", "\n".join(path.read_text("utf-8") for path in sources(root, "tests"))))
+    others = [
+        root / "Makefile",
+        root / "pyproject.toml",
+        *root.rglob("deploy/**/*.md"),
+        *root.glob("*/**/README.md"),
+    ]
+    others += [
+        *root.glob("*.md"),
+        *root.rglob("deploy/**/*.ipynb"),
+        *root.rglob("*/static/**/*.js"),
+    ]
+    words = Counter(
+        re.findall(
+            r"\w+", "\n".join([*texts.values(), *(path.read_text("utf-8") for path in others)])
+        )
+    )
+    tests = set(
+        re.findall(r"\w+", "\n".join(path.read_text("utf-8") for path in sources(root, "tests")))
+    )
     found = []
     for path in texts:
         for node in ast.walk(parse(path)):
-            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) and not node.name.startswith(
-                "_"
-            ):
-                exposed = bool(getattr(node, "decorator_list", [])) and not isinstance(node, ast.ClassDef)
+            if isinstance(
+                node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+            ) and not node.name.startswith("_"):
+                exposed = bool(getattr(node, "decorator_list", [])) and not isinstance(
+                    node, ast.ClassDef
+                )
                 exposed = exposed and "property" not in ast.unparse(node.decorator_list[0])
-                if words[node.name] == 1 and node.name in tests and not exposed and not node.name.startswith("visit_"):
+                if (
+                    words[node.name] == 1
+                    and node.name in tests
+                    and not exposed
+                    and not node.name.startswith("visit_")
+                ):
                     lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
                     found += [f"{path.relative_to(root)}:{line} {node.name}" for line in lines]
     return found
@@ -335,7 +371,9 @@ class Figure(NamedTuple):
 
 
 FIGURES: Final = (
-    Figure("arrows inside archive/", 10, 6, lambda root: room_arrows(root, "fleet_service/archive")),
+    Figure(
+        "arrows inside archive/", 10, 6, lambda root: room_arrows(root, "fleet_service/archive")
+    ),
     Figure(
         "arrows inside friction_mixture/",
         22,
@@ -371,10 +409,14 @@ def main(arguments: list[str]) -> None:
         print(f"{figure.name:<44}{value:>9g}{figure.bar:>9g}{figure.ceiling:>9g}{mark}")
     for package in PACKAGES[:3]:
         loose = len(loose_modules(root, package))
-        print(f"{package}: {loose} loose modules, {len(arrows(root, package))} arrows between rooms")
+        print(
+            f"{package}: {loose} loose modules, {len(arrows(root, package))} arrows between rooms"
+        )
     print(f"class names used more than once: {len(ambiguous_classes(root))}")
     milliseconds, modules, heavy = light_import(root)
-    print(f"{LIGHT}: {milliseconds:.0f} ms, {modules} modules, {', '.join(heavy) or 'nothing heavy'}")
+    print(
+        f"{LIGHT}: {milliseconds:.0f} ms, {modules} modules, {', '.join(heavy) or 'nothing heavy'}"
+    )
 
 
 if __name__ == "__main__":

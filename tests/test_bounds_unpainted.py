@@ -47,7 +47,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     compact(root)
     rollup.complete(root)
     told = two_cells()
-    old = told.set_column(told.schema.get_field_index("mu"), "mu", pa.array([0.7, 0.7], pa.float32()))
+    old = told.set_column(
+        told.schema.get_field_index("mu"), "mu", pa.array([0.7, 0.7], pa.float32())
+    )
     snapshots.write(root, old, synthetic.START_NS + 20 * 3600 * 10**9)
     return root
 
@@ -62,12 +64,18 @@ def two_cells() -> pa.Table:
     return table
 
 
-def painted(rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str) -> list[dict[str, Any]]:
+def painted(
+    rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
+) -> list[dict[str, Any]]:
     """Rows of which nothing is known that have a number all the same; fails where there are none of either kind."""
     bounds = [row for row in rows if not known(row)]
     assert bounds
     assert any(known(row) and row[names[0]] is not None for row in rows)
-    return [row for row in bounds if any(isinstance(row[name], float) and np.isfinite(row[name]) for name in names)]
+    return [
+        row
+        for row in bounds
+        if any(isinstance(row[name], float) and np.isfinite(row[name]) for name in names)
+    ]
 
 
 def measured(row: dict[str, Any]) -> bool:
@@ -100,9 +108,14 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("ending", ["parquet", "geojson", "csv"])
 @pytest.mark.parametrize("what", ["map", "map --snapshot", "observations", "rollup"])
-def test_an_export_has_no_mu_for_a_bound(archive: Path, tmp_path: Path, what: str, ending: str) -> None:
+def test_an_export_has_no_mu_for_a_bound(
+    archive: Path, tmp_path: Path, what: str, ending: str
+) -> None:
     out = tmp_path / f"a.{ending}"
-    assert main(["export", *what.split(), "--archive", str(archive), "--to", END, "--out", str(out)]) == 0
+    assert (
+        main(["export", *what.split(), "--archive", str(archive), "--to", END, "--out", str(out)])
+        == 0
+    )
     if what.startswith("map"):
         assert painted(read(out), measured, "mu") == []
     elif what == "observations":
@@ -119,7 +132,9 @@ def test_an_answer_of_the_archive_has_no_mu_for_a_bound(
     archive: Path, tmp_path: Path, question: str, ending: str
 ) -> None:
     out = tmp_path / f"a.{ending}"
-    assert main(["analyze", question, "--archive", str(archive), "--to", END, "--out", str(out)]) == 0
+    assert (
+        main(["analyze", question, "--archive", str(archive), "--to", END, "--out", str(out)]) == 0
+    )
     colour = QUESTIONS[question].colour
     assert colour is not None
     known = measured if question == "replay" else lambda row: bool(row["values"])
@@ -150,13 +165,17 @@ def test_a_picture_hatches_what_was_not_measured() -> None:
 
 
 @pytest.mark.parametrize("page", ["deploy/docs/tutorials/first-analysis.md", "archive"])
-def test_the_sql_of_the_pages_takes_values_only(archive: Path, page: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sql_of_the_pages_takes_values_only(
+    archive: Path, page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = readme.text() if page == "archive" else (ROOT / page).read_text()
     (sql,) = re.findall(r"duckdb\.sql\((?:\"{3}|'{3})(.*?)(?:\"{3}|'{3})", text, re.DOTALL)
     monkeypatch.chdir(archive)
     ask: Callable[[str], Any] = duckdb.sql
     found = ask(re.sub(r"'[a-z/]*observations/", "'observations/", sql)).to_arrow_table()
-    valued = ask("select distinct cell, sector from 'observations/*/*/*.parquet' where value").fetchall()
+    valued = ask(
+        "select distinct cell, sector from 'observations/*/*/*.parquet' where value"
+    ).fetchall()
     rows = found.to_pylist()
     assert {(row["cell"], row["sector"]) for row in rows if row["mu"] is not None} == set(valued)
     assert any(row["mu"] is None for row in rows)
@@ -171,6 +190,11 @@ def test_rows_of_older_files_are_values_by_the_same_rule(archive: Path) -> None:
 
 
 def test_a_page_of_an_answer_without_rows_is_still_a_page(tmp_path: Path) -> None:
-    columns: dict[str, Any] = {"cell": pa.int64(), "sector": pa.int8(), "mu": pa.float32(), "p_slippery": pa.float32()}
+    columns: dict[str, Any] = {
+        "cell": pa.int64(),
+        "sector": pa.int8(),
+        "mu": pa.float32(),
+        "p_slippery": pa.float32(),
+    }
     empty = pa.schema([pa.field(name, kind) for name, kind in columns.items()]).empty_table()
     assert "<title>" in output.page(empty, QUESTIONS["replay"])

@@ -33,7 +33,9 @@ def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals
     census = take(there.journals, there.archive)
     assert (census.lost, census.doubled) == (0, 0)
     # on a busy machine the last of it may be cut off; that nothing is lost by that stands above
-    assert any(line.startswith(("status: ", "shutdown incomplete")) for line in there.service.lines())
+    assert any(
+        line.startswith(("status: ", "shutdown incomplete")) for line in there.service.lines()
+    )
 
 
 @pytest.mark.campaign

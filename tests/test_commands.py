@@ -43,7 +43,9 @@ def test_the_version_is_that_of_the_distribution(name: str, capsys: Capture) -> 
 
 
 @pytest.mark.parametrize(("name", "command", "example"), EXAMPLES)
-def test_the_example_of_each_help_is_a_command_that_is_understood(name: str, command: str, example: str) -> None:
+def test_the_example_of_each_help_is_a_command_that_is_understood(
+    name: str, command: str, example: str
+) -> None:
     words = shlex.split(example.partition(" > ")[0])
     assert words[:2] == [name, command]
     parser = commandline.parser_of(*LINES[name].LINE, command)
@@ -76,7 +78,9 @@ def test_a_minus_sign_is_a_number_behind_an_option(given: list[str], understood:
     assert commandline.join_negative_numbers(given) == understood
 
 
-def test_the_western_hemisphere_is_asked_like_the_eastern(archive: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_the_western_hemisphere_is_asked_like_the_eastern(
+    archive: Path, tmp_path: Path, capsys: Capture
+) -> None:
     words = ["export", "observations", "--archive", str(archive), "--out", str(tmp_path / "a.csv")]
     assert fleet_service.cli.main([*words, "--bbox", "-0.5,51.2,0.3,51.7"]) == 0
     assert capsys.readouterr().out.startswith("0 rows in ")
@@ -90,8 +94,12 @@ def test_ctrl_c_is_130_and_one_word(capsys: Capture) -> None:
     assert capsys.readouterr().err == "interrupted\n"
 
 
-@pytest.mark.parametrize("command", ["compact", "retention --raw-days 31", "forget --period 2026-01", "export map"])
-def test_a_folder_that_is_no_archive_is_left_as_it_is(command: str, tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize(
+    "command", ["compact", "retention --raw-days 31", "forget --period 2026-01", "export map"]
+)
+def test_a_folder_that_is_no_archive_is_left_as_it_is(
+    command: str, tmp_path: Path, capsys: Capture
+) -> None:
     (tmp_path / "README.md").write_text("mine")
     out = ["--out", str(tmp_path / "a.csv")] if command.startswith("export") else []
     assert fleet_service.cli.main([*command.split(), "--archive", str(tmp_path), *out]) == 2
@@ -109,8 +117,12 @@ def files(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("words", [["forget", "--period", "2024-10"], ["retention", "--raw-days", "31"]])
-def test_what_destroys_can_be_tried_and_asks_on_a_terminal(words: list[str], archive: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize(
+    "words", [["forget", "--period", "2024-10"], ["retention", "--raw-days", "31"]]
+)
+def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
+    words: list[str], archive: Path, capsys: Capture
+) -> None:
     command = [*words, "--archive", str(archive)]
     before = files(archive)
     assert fleet_service.cli.main([*command, "--dry-run"]) == 0
@@ -141,7 +153,9 @@ def on_terminal(command: list[str], answer: str) -> str:
     return said.decode()
 
 
-def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(archive: Path, capsys: Capture) -> None:
+def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(
+    archive: Path, capsys: Capture
+) -> None:
     words = ["forget", "--archive", str(archive), "--period", "2024-10", "--vehicle"]
     assert fleet_service.cli.main([*words, "sim-typo"]) == 0
     assert capsys.readouterr().out == "no rows of sim-typo in 2024-10: nothing removed\n"
@@ -149,7 +163,9 @@ def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(archive: Path, cap
     assert json.loads(capsys.readouterr().out)["rows"] > 0
 
 
-def test_an_export_of_the_map_is_of_now_and_says_of_when(archive: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_an_export_of_the_map_is_of_now_and_says_of_when(
+    archive: Path, tmp_path: Path, capsys: Capture
+) -> None:
     words = ["export", "map", "--archive", str(archive), "--out", str(tmp_path / "map.parquet")]
     assert fleet_service.cli.main([*words, "--to", "2024-10-04T23:59:50"]) == 0
     assert "the map as of 2024-10-04T23:59:50Z" in capsys.readouterr().out
@@ -168,18 +184,30 @@ def test_what_waits_in_the_log_is_counted(archive: Path, capsys: Capture) -> Non
     assert fleet_service.cli.main(words) == 0
     whole = capsys.readouterr()
     assert "compacted first: " in whole.err
-    visits = [sum(json.loads(line)["observations"] for line in said.out.splitlines()) for said in (without, whole)]
+    visits = [
+        sum(json.loads(line)["observations"] for line in said.out.splitlines())
+        for said in (without, whole)
+    ]
     assert visits[0] < visits[1]
 
 
 @pytest.mark.parametrize(
     ("words", "start"),
     [
-        (["grip", "--at", "2026-01-01"], "error: at: is not for grip; it is for before-after, replay"),
+        (
+            ["grip", "--at", "2026-01-01"],
+            "error: at: is not for grip; it is for before-after, replay",
+        ),
         (["worst", "--min-vehicles", "0"], "error: min-vehicles: 0 is below 1"),
-        (["grip", "--from", "2024-10-05", "--to", "2024-10-04"], "error: to: 2024-10-04 is not after --from"),
+        (
+            ["grip", "--from", "2024-10-05", "--to", "2024-10-04"],
+            "error: to: 2024-10-04 is not after --from",
+        ),
         (["grip", "--out", "nowhere/at/all.csv"], "error: out: cannot write"),
-        (["weather", "--stations", "{stations}"], "error: stations: german.csv has a value that is none"),
+        (
+            ["weather", "--stations", "{stations}"],
+            "error: stations: german.csv has a value that is none",
+        ),
     ],
 )
 def test_an_option_that_would_be_passed_over_is_refused(
@@ -198,20 +226,40 @@ def test_a_recording_is_never_replaced_by_its_estimates(tmp_path: Path, capsys: 
     assert edge_agent.cli.main(drive) == 0
     before = log.read_bytes()
     for out in (log, car, tmp_path / "." / "x.parquet"):
-        assert edge_agent.cli.main(["replay", str(log), "--out", str(out), "--estimator", "ckf"]) == 2
+        assert (
+            edge_agent.cli.main(["replay", str(log), "--out", str(out), "--estimator", "ckf"]) == 2
+        )
         assert "would replace" in capsys.readouterr().err
     assert log.read_bytes() == before
 
 
 def test_the_ending_of_a_file_decides_its_format(tmp_path: Path, capsys: Capture) -> None:
-    drive = ["simulate", "slalom", "--duration", "1", "--vehicle-out", str(tmp_path / "x.json"), "--out"]
+    drive = [
+        "simulate",
+        "slalom",
+        "--duration",
+        "1",
+        "--vehicle-out",
+        str(tmp_path / "x.json"),
+        "--out",
+    ]
     for name in ("x.parquet", "x.csv"):
         assert edge_agent.cli.main([*drive, str(tmp_path / name)]) == 0
     log = tmp_path / "x.parquet"
     assert pacsv.read_csv(tmp_path / "x.csv").num_rows == pq.read_table(log).num_rows
-    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / "e.csv"), "--estimator", "ckf"]) == 0
+    assert (
+        edge_agent.cli.main(
+            ["replay", str(log), "--out", str(tmp_path / "e.csv"), "--estimator", "ckf"]
+        )
+        == 0
+    )
     assert {"mu", "mu_lower"} <= set(pacsv.read_csv(tmp_path / "e.csv").column_names)
-    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / "e.xlsx"), "--estimator", "ckf"]) == 2
+    assert (
+        edge_agent.cli.main(
+            ["replay", str(log), "--out", str(tmp_path / "e.xlsx"), "--estimator", "ckf"]
+        )
+        == 2
+    )
     assert "error: out: e.xlsx has no known ending" in capsys.readouterr().err
     assert not (tmp_path / "e.xlsx").exists()
 
@@ -221,17 +269,36 @@ def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path
         commandline.out_folder("out", tmp_path)
     with pytest.raises(InputError, match="out: a.xls has no known ending; use one of .csv"):
         commandline.ending_of("out", Path("a.xls"), (".csv",))
-    assert commandline.ending_of("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet")) == ".geo.parquet"
+    assert (
+        commandline.ending_of("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet"))
+        == ".geo.parquet"
+    )
 
 
 @pytest.mark.parametrize("out", ["/proc/none/e.parquet", "file/e.parquet"])
-def test_unwritable_estimates_are_refused_in_one_line(out: str, tmp_path: Path, capsys: Capture) -> None:
+def test_unwritable_estimates_are_refused_in_one_line(
+    out: str, tmp_path: Path, capsys: Capture
+) -> None:
     log = tmp_path / "x.parquet"
-    drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(tmp_path / "x.json")]
+    drive = [
+        "simulate",
+        "slalom",
+        "--duration",
+        "1",
+        "--out",
+        str(log),
+        "--vehicle-out",
+        str(tmp_path / "x.json"),
+    ]
     assert edge_agent.cli.main(drive) == 0
     (tmp_path / "file").touch()
     capsys.readouterr()
-    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / out), "--estimator", "ckf"]) == 2
+    assert (
+        edge_agent.cli.main(
+            ["replay", str(log), "--out", str(tmp_path / out), "--estimator", "ckf"]
+        )
+        == 2
+    )
     assert capsys.readouterr().err.splitlines()[-1].startswith("error: out: ")
 
 

@@ -57,19 +57,25 @@ def typed(text: str) -> list[str]:
     """Return the commands in the code blocks of a page, without comments; a synopsis with brackets is none."""
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     lines = [line.strip() for block in blocks for line in block.splitlines() if "[" not in line]
-    lines += [line.strip() for line in re.findall(r"^    \S.*$", text, re.MULTILINE) if "[" not in line]
+    lines += [
+        line.strip() for line in re.findall(r"^    \S.*$", text, re.MULTILINE) if "[" not in line
+    ]
     commands = [line for line in lines if line.startswith(("edge-agent ", "fleet-service "))]
     return [re.split(r"\s{2,}|\s[#>]|\|", command)[0] for command in commands]
 
 
 def test_every_command_of_every_page_is_understood() -> None:
-    found = [(str(page.relative_to(ROOT)), line) for page in pages() for line in typed(page.read_text())]
+    found = [
+        (str(page.relative_to(ROOT)), line) for page in pages() for line in typed(page.read_text())
+    ]
     assert len({page for page, _ in found}) >= 6
     assert len(found) > 30
     for page, line in found:
         name, *words = shlex.split(line)
         try:
-            commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(commandline.join_negative_numbers(words))
+            commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(
+                commandline.join_negative_numbers(words)
+            )
         except SystemExit:
             pytest.fail(f"{page}: {line}")
 
@@ -113,9 +119,13 @@ def test_git_ignores_what_the_tutorials_make_and_every_key() -> None:
         "drives/x",
         "spool.sqlite",
     ]
-    done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.stdout.splitlines() == made
-    done = subprocess.run(["git", "check-ignore", "README.md"], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["git", "check-ignore", "README.md"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.stdout == ""
 
 
@@ -130,7 +140,9 @@ def test_links_of_pages_lead_to_files_and_headings() -> None:
     found = [
         (page, link, anchor)
         for page in pages()
-        for link, _, anchor in re.findall(r"\]\(([^)#\s]*)(#([^)]*))?\)", page.read_text(encoding="utf-8"))
+        for link, _, anchor in re.findall(
+            r"\]\(([^)#\s]*)(#([^)]*))?\)", page.read_text(encoding="utf-8")
+        )
         if "://" not in link
     ]
     assert len(found) > 40

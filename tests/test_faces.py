@@ -38,13 +38,20 @@ def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
         _ = face.no_such_name  # type: ignore[attr-defined]
     assert set(names) <= set(dir(gripmap))
     folder = Path(str(face.__file__)).parent  # type: ignore[attr-defined]
-    assert not [name for name in names if (folder / name).exists()], "a room of that name would hide it once imported"
+    assert not [name for name in names if (folder / name).exists()], (
+        "a room of that name would hide it once imported"
+    )
 
 
 def test_importing_a_face_loads_nothing_heavy() -> None:
     heavy = ("numba", "numpy", "pyarrow", "zenoh")
     words = f"import sys, edge_agent, fleet_service; print([name for name in {heavy} if name in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", words], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 @pytest.mark.parametrize("face", ["gripmap", "edge_agent.estimators", "fleet_service.client"])
@@ -53,7 +60,11 @@ def test_a_package_of_ones_own_that_hides_ours_is_named(tmp_path: Path, face: st
     own.parent.mkdir()
     own.touch()
     done = subprocess.run(
-        [sys.executable, "-c", f"import {face}"], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-c", f"import {face}"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f"ImportError: schemas: {own} stands where"), done.stderr
@@ -62,16 +73,27 @@ def test_a_package_of_ones_own_that_hides_ours_is_named(tmp_path: Path, face: st
 
 def test_a_log_is_estimated_in_three_lines_as_the_command_does(tmp_path: Path) -> None:
     log, car = tmp_path / "x.parquet", tmp_path / "x.json"
-    assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]) == 0
-    assert main(["replay", str(log), "--out", str(tmp_path / "e.parquet"), "--estimator", "ckf"]) in (0, 3)
-    found = edge_agent.estimate(edge_agent.read_log(str(log)), edge_agent.load_vehicle(str(car)), "ckf")
+    assert (
+        main(
+            ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]
+        )
+        == 0
+    )
+    assert main(
+        ["replay", str(log), "--out", str(tmp_path / "e.parquet"), "--estimator", "ckf"]
+    ) in (0, 3)
+    found = edge_agent.estimate(
+        edge_agent.read_log(str(log)), edge_agent.load_vehicle(str(car)), "ckf"
+    )
     assert found.schema.equals(ESTIMATES_SCHEMA)
     assert found.equals(pq.read_table(tmp_path / "e.parquet"))
 
 
 def test_estimates_of_one_of_many_vehicles_become_a_table() -> None:
     log, vehicle = edge_agent.simulate_manoeuvre("slalom", duration_s=0.5)
-    signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[:, None].repeat(2, axis=1)
+    signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[
+        :, None
+    ].repeat(2, axis=1)
     t = log["t"].to_numpy()[:, None].repeat(2, axis=1)
     bank = edge_agent.make_bank("ckf", [vehicle, vehicle])
     found = bank.advance(t, signals)
@@ -87,14 +109,30 @@ def test_memberships_that_tune_wrote_change_what_replay_says(tmp_path: Path) -> 
     document["memberships"] = edge_agent.Memberships().to_json()
     (tmp_path / "mine.json").write_text(json.dumps(document))
     log, car = tmp_path / "x.parquet", tmp_path / "x.json"
-    assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]) == 0
+    assert (
+        main(
+            ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]
+        )
+        == 0
+    )
     said = []
     for more in ([], ["--memberships", str(tmp_path / "mine.json")]):
-        words = ["replay", str(log), "--estimator", "paper-aco-fckf", "--out", str(tmp_path / "e.parquet"), *more]
+        words = [
+            "replay",
+            str(log),
+            "--estimator",
+            "paper-aco-fckf",
+            "--out",
+            str(tmp_path / "e.parquet"),
+            *more,
+        ]
         assert main(words) in (0, 3)
         said.append(pq.read_table(tmp_path / "e.parquet")["adaptation"])
     assert not said[0].equals(said[1])
-    assert main([*words[:2], "--out", str(tmp_path / "e.parquet"), "--estimator", "sr-ukf", *more]) == 2
+    assert (
+        main([*words[:2], "--out", str(tmp_path / "e.parquet"), "--estimator", "sr-ukf", *more])
+        == 2
+    )
 
 
 PLUGIN = """
@@ -148,25 +186,50 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     (about / "entry_points.txt").write_text(POINTS)
     (tmp_path / "their_plugin.py").write_text(PLUGIN)
     log = tmp_path / "x.parquet"
-    drive = ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(log.with_suffix(".json"))]
+    drive = [
+        "simulate",
+        "slalom",
+        "--duration",
+        "2",
+        "--out",
+        str(log),
+        "--vehicle-out",
+        str(log.with_suffix(".json")),
+    ]
     assert main(drive) == 0
 
     def command(*words: str) -> subprocess.CompletedProcess[str]:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
         line = f"import sys, gripmap; sys.exit(gripmap.{words[0]}_main())"
         return subprocess.run(
-            [sys.executable, "-c", line, *words[1:]], capture_output=True, text=True, check=False, env=environment
+            [sys.executable, "-c", line, *words[1:]],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment,
         )
 
-    done = command("edge_agent", "replay", str(log), "--estimator", "at-least", "--out", str(tmp_path / "e.parquet"))
+    done = command(
+        "edge_agent",
+        "replay",
+        str(log),
+        "--estimator",
+        "at-least",
+        "--out",
+        str(tmp_path / "e.parquet"),
+    )
     assert done.returncode in (0, 3), done.stderr
     assert pq.read_table(tmp_path / "e.parquet")["mu_lower"].to_numpy().max() > 0.11
-    done = command("edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet"))
+    done = command(
+        "edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet")
+    )
     assert "at-least" in done.stderr
     said = []
     for estimator in ("ckf", "ckf@brush"):
         out = tmp_path / "e.parquet"
-        done = command("edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(out))
+        done = command(
+            "edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(out)
+        )
         assert done.returncode in (0, 3), done.stderr
         said.append(pq.read_table(out))
     assert not said[0].equals(said[1])
@@ -174,15 +237,27 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
         ("ckf@steep", "tyre-curve: begins with slope 2"), ("ckf@no", "tyre-curve: 'no' is unknown"),
         ("sr-ukf@brush", "tyre-curve: sr-ukf has its own"),
     ):  # fmt: skip
-        done = command("edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(tmp_path / "e.parquet"))
+        done = command(
+            "edge_agent",
+            "replay",
+            str(log),
+            "--estimator",
+            estimator,
+            "--out",
+            str(tmp_path / "e.parquet"),
+        )
         assert problem in done.stderr, done.stderr
     archive = DATA / "v1.0" / "archive"
-    done = command("fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json")
+    done = command(
+        "fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json"
+    )
     assert json.loads(done.stdout)["rows"] > 0, done.stderr
     words = "from schemas.runtime.plugins import SOURCES, load_entry_point; "
     words += "print(len(list(load_entry_point(SOURCES, 'mine')('1'))))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment
+    )
     assert int(done.stdout) >= 10
 
 
@@ -193,7 +268,9 @@ def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPat
 
     broken = {"odd": EntryPoint("odd", "no_such_module:bank", plugins.ESTIMATORS)}
     monkeypatch.setattr(plugins, "entry_points_of", lambda group: broken)
-    with pytest.raises(InputError, match="estimator: 'odd' cannot be loaded from no_such_module:bank"):
+    with pytest.raises(
+        InputError, match="estimator: 'odd' cannot be loaded from no_such_module:bank"
+    ):
         edge_agent.make_bank("odd", [])
 
 

@@ -40,7 +40,9 @@ def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> No
 
 
 def test_every_campaign_owes_a_figure_of_what_it_did() -> None:
-    assert [one.name for one in CAMPAIGNS if not any(BARS[name].better == "more" for name in one.owes)] == []
+    assert [
+        one.name for one in CAMPAIGNS if not any(BARS[name].better == "more" for name in one.owes)
+    ] == []
 
 
 def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
@@ -49,7 +51,10 @@ def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> No
 
     campaign = Campaign("forgetful", forgetful, ("faults.kill.doubled", "faults.frozen.lost"))
     found = conduct([campaign], tmp_path, "test", quick=True, seed=0)
-    assert {one.name: one.holds for one in found} == {"faults.kill.doubled": True, "faults.frozen.lost": False}
+    assert {one.name: one.holds for one in found} == {
+        "faults.kill.doubled": True,
+        "faults.frozen.lost": False,
+    }
     written = json.loads((tmp_path / "figures.json").read_text())[1:]
     assert [row["holds"] for row in written] == [True, False]
     assert "DOES NOT HOLD" in (tmp_path / "figures.md").read_text()
@@ -73,7 +78,9 @@ leave(lambda: len(conduct([Campaign("raises", run, ())], Path("out"), "test", Tr
 def test_a_raising_campaign_ends_the_run_with_its_message(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     command = [sys.executable, "-c", RAISES]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, timeout=120)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, timeout=120
+    )
     assert done.returncode == RAISED
     assert "TimeoutError: not within 60 s" in done.stderr
     child = Path("/proc", (tmp_path / "child").read_text(), "stat")
@@ -92,7 +99,11 @@ def kept(tmp_path: Path) -> list[Batch]:
             (root / "keys").symlink_to(tmp_path / "archive" / "keys")
         with closing(Engine(ServiceConfig(name=f"shard-{turn}"), root)) as engine:
             engine.intake.ingest(
-                [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in shown], time.time_ns()
+                [
+                    Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind])
+                    for b in shown
+                ],
+                time.time_ns(),
             )
             engine.settlement.flush()
     for segment in (tmp_path / "copy" / "inbox").glob("*.parquet"):
@@ -114,12 +125,17 @@ def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_pa
 
 
 def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
-    found_bugs = (1064, 1938)  # files that an interrupted compaction had renamed and not synced, then taken for safe
+    found_bugs = (
+        1064,
+        1938,
+    )  # files that an interrupted compaction had renamed and not synced, then taken for safe
     assert [problem for number in (*range(12), *found_bugs) for problem in history(number)] == []
     assert [problem for number in range(3) for problem in spool_history(number)] == []
 
 
-def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(Writer, "sync", lambda self: None)
     assert any("is lost" in problem for number in range(12) for problem in history(number))
 
@@ -131,15 +147,22 @@ def served(number: int, folder: Path) -> list[str]:
 
 @pytest.mark.campaign
 def test_no_history_on_a_forgetful_disk_loses_or_doubles_anything(tmp_path: Path) -> None:
-    found_bugs = (45, 84)  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
-    assert [problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)] == []
+    found_bugs = (
+        45,
+        84,
+    )  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
+    assert [
+        problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)
+    ] == []
 
 
 def test_forgetful_disk_catches_a_service_that_does_not_sync_its_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pseudonyms, "sync_directory", lambda folder: None)
-    assert any("key is lost" in problem for number in range(6) for problem in served(number, tmp_path))
+    assert any(
+        "key is lost" in problem for number in range(6) for problem in served(number, tmp_path)
+    )
 
 
 def test_link_relay_follows_loss_delay_rate_and_blocking() -> None:
@@ -152,7 +175,9 @@ def test_link_relay_follows_loss_delay_rate_and_blocking() -> None:
     assert not way.flying
     for _ in range(5):
         way.take(packet, 0.0, slow, draw)
-    assert [at for at, _, _ in way.flying] == [2.0, 3.0, 4.0], "two wait, a third is on its way, others find no room"
+    assert [at for at, _, _ in way.flying] == [2.0, 3.0, 4.0], (
+        "two wait, a third is on its way, others find no room"
+    )
     way.deliver(3.0)
     assert os.read(read, 1000) == 2 * packet
     lossy = Direction(write)

@@ -17,7 +17,9 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
 
 
 @pytest.mark.timeout(900)  # the kernels of both halves may have to be compiled
-def test_the_real_minute_comes_onto_the_map_under_three_names(minute: tuple[Cells, list[str]]) -> None:
+def test_the_real_minute_comes_onto_the_map_under_three_names(
+    minute: tuple[Cells, list[str]],
+) -> None:
     cells, _ = minute
     assert len(cells) > 30
     assert max(int(str(cell["vehicles"])) for cell in cells) == len(VEHICLES)
@@ -30,5 +32,10 @@ def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:
 
 def test_first_drive_of_the_tutorial_has_few_commands_all_tested() -> None:
     assert 0 < len(commands()) <= MOST_COMMANDS
-    assert [command.split()[1] for command in commands()] == ["install", "import", "check", "replay"]
+    assert [command.split()[1] for command in commands()] == [
+        "install",
+        "import",
+        "check",
+        "replay",
+    ]
     assert "--publish --start now" in commands()[-1]

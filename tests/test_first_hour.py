@@ -38,7 +38,8 @@ def test_every_estimator_is_made_by_its_name_alone() -> None:
     vehicle = PRESETS["sedan"].vehicle
     assert len(edge_agent.ESTIMATORS) >= 8
     assert all(
-        isinstance(edge_agent.make_bank(name, [vehicle]), edge_agent.EstimatorBank) for name in edge_agent.ESTIMATORS
+        isinstance(edge_agent.make_bank(name, [vehicle]), edge_agent.EstimatorBank)
+        for name in edge_agent.ESTIMATORS
     )
 
 
@@ -70,7 +71,9 @@ def test_a_person_s_report_by_hand_as_the_page_has_it_is_acknowledged(tmp_path: 
         assert reader is not None
         with reader:
             heard: list[bytes] = []
-            reader.declare_subscriber(keys.ack_key("anna"), lambda sample: heard.append(sample.payload.to_bytes()))
+            reader.declare_subscriber(
+                keys.ack_key("anna"), lambda sample: heard.append(sample.payload.to_bytes())
+            )
             exec(found[1].replace("tcp/127.0.0.1:7447", endpoints[0]), {})
             until(lambda: heard)
     vehicle, (stream,) = wire.decode_ack(heard[0])

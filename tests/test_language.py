@@ -18,7 +18,9 @@ MOST_WORDS = 25_000
 def test_language_of_a_package_is_not_worse_than_its_ceilings(package: str) -> None:
     ceilings = language.ceilings()["packages"][package]
     measured = language.measure(package)
-    worse = {name: (value, ceilings[name]) for name, value in measured.items() if value > ceilings[name]}
+    worse = {
+        name: (value, ceilings[name]) for name, value in measured.items() if value > ceilings[name]
+    }
     assert not worse, f"{worse}: see `python -m tests.language {next(iter(worse))}`"
 
 
@@ -39,7 +41,11 @@ def test_ceilings_have_every_package_and_only_existing_pages() -> None:
 
 @pytest.mark.parametrize(
     ("text", "count"),
-    [("Of those who is there.", 1), ("Return what the map knows.", 1), ("Return the rows so that none is lost.", 0)],
+    [
+        ("Of those who is there.", 1),
+        ("Return what the map knows.", 1),
+        ("Return the rows so that none is lost.", 0),
+    ],
 )
 def test_free_relatives_are_found(text: str, count: int) -> None:
     assert len(language.free_relatives(text)) == count
@@ -47,17 +53,30 @@ def test_free_relatives_are_found(text: str, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "is_one"),
-    [("joined", True), ("_kept", True), ("told", True), ("seed", False), ("decode_cells", False), ("spread", False)],
+    [
+        ("joined", True),
+        ("_kept", True),
+        ("told", True),
+        ("seed", False),
+        ("decode_cells", False),
+        ("spread", False),
+    ],
 )
 def test_a_lone_participle_is_recognised(name: str, is_one: bool) -> None:
     assert language.is_participle(name) == is_one
 
 
-@pytest.mark.parametrize("text", ["Write it anew.", "At the most two.", "What lies beside it.", "It is mended."])
+@pytest.mark.parametrize(
+    "text", ["Write it anew.", "At the most two.", "What lies beside it.", "It is mended."]
+)
 def test_stop_words_are_found(text: str) -> None:
     assert language.stop_words(text)
 
 
 def test_prose_leaves_out_code_tables_and_links() -> None:
     text = "# Title\n\nOne [word](a/b.md) and `code`.\n\n| a |\n|---|\n\n```\nanew\n```\n- item one.\n- item two.\n"
-    assert [one.strip() for one in language.sentences(text)] == ["One word and Code.", "item one.", "item two."]
+    assert [one.strip() for one in language.sentences(text)] == [
+        "One word and Code.",
+        "item one.",
+        "item two.",
+    ]

@@ -38,7 +38,10 @@ def test_ice_snow_wet_and_dry_are_told_apart(sight: str) -> None:
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_none_of_them_is_the_white_of_what_was_not_measured(sight: str) -> None:
     white = lab("#ffffff", sight)
-    assert min(difference(lab(shade(mu, *GRIP_RANGE), sight), white) for mu in SURFACES.values()) >= LEAST
+    assert (
+        min(difference(lab(shade(mu, *GRIP_RANGE), sight), white) for mu in SURFACES.values())
+        >= LEAST
+    )
 
 
 def test_colour_scale_lightness_increases_monotonically() -> None:

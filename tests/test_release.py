@@ -13,10 +13,15 @@ from tests.structure import ROOT
 
 
 def test_changelog_section_ends_at_the_next_heading() -> None:
-    assert release.changelog_section("# C\n\n## 0.2.0\n### Added\n- a\n\n## 0.1.0\nb\n", "0.2.0") == "### Added\n- a"
+    assert (
+        release.changelog_section("# C\n\n## 0.2.0\n### Added\n- a\n\n## 0.1.0\nb\n", "0.2.0")
+        == "### Added\n- a"
+    )
 
 
-@pytest.mark.parametrize("text", ["# C\n\n## Unreleased\n- a\n", "# C\n\n## 0.2.0\n\n## 0.1.0\nb\n"])
+@pytest.mark.parametrize(
+    "text", ["# C\n\n## Unreleased\n- a\n", "# C\n\n## 0.2.0\n\n## 0.1.0\nb\n"]
+)
 def test_a_missing_or_empty_section_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="no section '## 0.2.0'"):
         release.changelog_section(text, "0.2.0")
@@ -32,7 +37,9 @@ def test_version_and_date_are_set_in_both_files(tmp_path: Path) -> None:
     assert 'date-released: "2031-01-02"' in citation
 
 
-def test_a_version_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_version_that_is_none_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("sys.argv", ["release", "soon"])
     assert release.main() == 2
     assert capsys.readouterr().err.startswith("error: version: must be like 0.2.0")

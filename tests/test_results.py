@@ -42,7 +42,12 @@ def test_every_judged_figure_is_on_the_page_with_its_commit() -> None:
 
 def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
     left = folder / "left.json"
-    figures.write(left, "demo", [1, 2, 3], [Figure("demo.a", 0.9, "", 0.8, "more"), Figure("demo.b", 0.2, "", 0.1)])
+    figures.write(
+        left,
+        "demo",
+        [1, 2, 3],
+        [Figure("demo.a", 0.9, "", 0.8, "more"), Figure("demo.b", 0.2, "", 0.1)],
+    )
     assert results.keep("demo", left).startswith("demo: 2 figures")
     page = results.results_page()
     assert "2 figures have a bar; 1 hold and 1 do not." in page
@@ -54,7 +59,9 @@ def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
 
 def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
     left = folder / "left.json"
-    figures.write(left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("unshown", 1.0, "")])
+    figures.write(
+        left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("unshown", 1.0, "")]
+    )
     assert results.keep("demo", left).startswith("demo: 1 figures")
     figures.write(left, "demo", [1], [Figure("demo.b", 0.1, "", 0.12)])
     assert results.keep("demo", left).startswith("demo: 1 figures")

@@ -15,18 +15,30 @@ from schemas.runtime.installing import install_command
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
-    parser.add_argument("--duration", type=float, default=150.0, help="seconds of driving (default 150)")
-    parser.add_argument("--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)")
+    parser.add_argument(
+        "--duration", type=float, default=150.0, help="seconds of driving (default 150)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)"
+    )
     parser.add_argument(
         "--warned",
         type=float,
         default=0.5,
         help="share of the drivers who hear the map (default 0.5)",
     )
-    parser.add_argument("--stay", action="store_true", help="keep map and page running after it, until Ctrl-C")
-    parser.add_argument("--open", action="store_true", help="open the page in the browser of this machine")
-    parser.add_argument("--page-port", type=int, default=8080, help="of the live page; 0: a free one (default 8080)")
-    parser.add_argument("--screenshot", type=Path, metavar="FILE", help="keep a picture of the page, by Chromium")
+    parser.add_argument(
+        "--stay", action="store_true", help="keep map and page running after it, until Ctrl-C"
+    )
+    parser.add_argument(
+        "--open", action="store_true", help="open the page in the browser of this machine"
+    )
+    parser.add_argument(
+        "--page-port", type=int, default=8080, help="of the live page; 0: a free one (default 8080)"
+    )
+    parser.add_argument(
+        "--screenshot", type=Path, metavar="FILE", help="keep a picture of the page, by Chromium"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,8 +51,12 @@ def run(args: argparse.Namespace) -> int:
         from deploy.demo import processes, story
         from fleet_service.page import server  # noqa: F401 the page's process needs it
     except ImportError as error:
-        raise InputError("demo", f"the package {error.name} is missing", install_command("demo,page")) from error
+        raise InputError(
+            "demo", f"the package {error.name} is missing", install_command("demo,page")
+        ) from error
     try:
         return story.run(args)
     except processes.DemoError as error:
-        raise InputError("demo", str(error), "read that log; its last line names the reason") from error
+        raise InputError(
+            "demo", str(error), "read that log; its last line names the reason"
+        ) from error

@@ -90,7 +90,10 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
     groups: dict[tuple[int, int], list[int]] = {}
     for row, key in enumerate(keys):
         groups.setdefault(key, []).append(row)
-    return {key: float(np.mean(mu[[r for r in rows if after[r]] or rows])) for key, rows in groups.items()}
+    return {
+        key: float(np.mean(mu[[r for r in rows if after[r]] or rows]))
+        for key, rows in groups.items()
+    }
 
 
 def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
@@ -98,7 +101,11 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
     truth = final_truth(visits, changed_ns)
     cell, sector = zip(*truth, strict=True)
     table = pa.table(
-        {"cell": pa.array(cell, pa.int64()), "sector": pa.array(sector, pa.int8()), "mu": list(truth.values())}
+        {
+            "cell": pa.array(cell, pa.int64()),
+            "sector": pa.array(sector, pa.int8()),
+            "mu": list(truth.values()),
+        }
     )
     part = path.with_suffix(".part")
     pq.write_table(table, part)
@@ -113,7 +120,9 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
     return MapComparison(cells.filter(pa.array(known)), found[known])
 
 
-def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int) -> float:
+def delay_passes(
+    visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
+) -> float:
     """Return the excited passes over a new patch until its first alert, the median of all patches.
 
     A patch without an alert counts as infinite; cells within LINK_CELLS of each other are one patch.
@@ -164,7 +173,10 @@ def figures(
     counts: dict[str, float], archive: Path, wall_s: float,
 ) -> list[Figure]:  # fmt: skip
     """Return the demo's figures with their bars."""
-    several, value = comparison.has_several_vehicles, comparison.has_several_vehicles & comparison.is_measured
+    several, value = (
+        comparison.has_several_vehicles,
+        comparison.has_several_vehicles & comparison.is_measured,
+    )
     error = comparison.cells["mu"].to_numpy() - comparison.truth
     patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     rows, distinct, vehicles = archive_counts(archive)
@@ -173,9 +185,19 @@ def figures(
         Figure("demo.vehicles", vehicles, "", 30, "more"),
         Figure(COVERAGE, _mean(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
-        Figure(DELAY, delay_passes(visits, patch, alerts, changed_ns), "passes, median of the new patches", 3),
+        Figure(
+            DELAY,
+            delay_passes(visits, patch, alerts, changed_ns),
+            "passes, median of the new patches",
+            3,
+        ),
         Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
-        Figure("demo.alerts.per_stretch", per_stretch(alerts, visits), "per icy stretch and direction", 2),
+        Figure(
+            "demo.alerts.per_stretch",
+            per_stretch(alerts, visits),
+            "per icy stretch and direction",
+            2,
+        ),
         Figure("demo.observations.unacknowledged", counts["observations_unsettled"], "", 0),
         Figure("demo.observations.duplicates", rows - distinct, "", 0),
         Figure(WALL, wall_s, "s", 240),
@@ -201,7 +223,9 @@ class LostGrip:
         """Return the shares of passes that lost grip, and their number."""
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         shares = [
-            Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes") for name, rows in kinds if rows.any()
+            Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes")
+            for name, rows in kinds
+            if rows.any()
         ]  # of no pass there is no share
         counts = [int(rows.sum()) for _, rows in kinds]
         return shares + [
@@ -211,12 +235,17 @@ class LostGrip:
 
     def line(self) -> str:
         """Return the result as one line."""
-        counts = [f"{int(self.lost[rows].sum())} of {int(rows.sum())}" for rows in (self.warned, ~self.warned)]
+        counts = [
+            f"{int(self.lost[rows].sum())} of {int(rows.sum())}"
+            for rows in (self.warned, ~self.warned)
+        ]
         known = "Over the new ice, once it was known"
         return f"{known}: {counts[0]} warned drivers lost grip, {counts[1]} who were not warned."
 
 
-def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float) -> LostGrip:
+def lost_grip(
+    visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
+) -> LostGrip:
     """Return the passes over the new ice since the first alert of its patch; `share` of the drivers is warned."""
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)
@@ -226,7 +255,9 @@ def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int
     count = max((_number(name) for name in vehicles), default=0)
     warned = warned_ones(count, share)
     rows: dict[tuple[str, int], tuple[bool, int]] = {}
-    enter, left = (visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
+    enter, left = (
+        visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time")
+    )
     last: dict[str, tuple[int, int]] = {}
     order = np.argsort(enter, kind="stable")
     for k in order[on[order] & (enter[order] >= since[order])].tolist():
@@ -269,7 +300,9 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
         ids |= {one.id for one in road.changes()}
     icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
     cell, sector = icy["cell"].to_numpy(), icy["sector"].to_numpy()
-    stretches = sum(int(link_cells(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
+    stretches = sum(
+        int(link_cells(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector)
+    )
     return len(ids) / stretches if stretches else float("nan")
 
 
@@ -280,7 +313,11 @@ def archive_counts(archive: Path) -> tuple[int, int, int]:
     if not tables:
         return 0, 0, 0
     whole = pa.concat_tables(tables)
-    return whole.num_rows, whole.group_by(identity).aggregate([]).num_rows, len(pc.unique(whole["vehicle"]))
+    return (
+        whole.num_rows,
+        whole.group_by(identity).aggregate([]).num_rows,
+        len(pc.unique(whole["vehicle"])),
+    )
 
 
 def start_time(visits: pa.Table) -> int:
@@ -289,7 +326,9 @@ def start_time(visits: pa.Table) -> int:
 
 
 def _keys(table: pa.Table) -> list[tuple[int, int]]:
-    return list(zip(table["cell"].to_numpy().tolist(), table["sector"].to_numpy().tolist(), strict=True))
+    return list(
+        zip(table["cell"].to_numpy().tolist(), table["sector"].to_numpy().tolist(), strict=True)
+    )
 
 
 def _mean(values: FloatArray | BoolArray) -> float:

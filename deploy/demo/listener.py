@@ -39,7 +39,9 @@ class Listener:
     def _on_alert(self, sample: zenoh.Sample) -> None:
         alert = wire.decode_alert(sample.payload.to_bytes())
         with self._lock:
-            if all(alert != known for _, known in self.alerts):  # one that stands is put again and again
+            if all(
+                alert != known for _, known in self.alerts
+            ):  # one that stands is put again and again
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
@@ -63,5 +65,9 @@ class Listener:
 
     def whole_map(self) -> pa.Table:
         """Query the whole map, one reply per tile."""
-        replies = self.session.get("gripmap/v1/map/**", consolidation=zenoh.ConsolidationMode.NONE, timeout=10.0)
-        return pa.concat_tables([read_tile(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None])
+        replies = self.session.get(
+            "gripmap/v1/map/**", consolidation=zenoh.ConsolidationMode.NONE, timeout=10.0
+        )
+        return pa.concat_tables(
+            [read_tile(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+        )

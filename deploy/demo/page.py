@@ -30,7 +30,9 @@ NAMES = (
 def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     """Write two maps and the table of figures; nothing is loaded from elsewhere."""
     cells = comparison.cells
-    boxes = np.stack([cells[side].to_numpy() for side in ("west", "south", "east", "north")], axis=1)
+    boxes = np.stack(
+        [cells[side].to_numpy() for side in ("west", "south", "east", "north")], axis=1
+    )
     sector: Any = cells["sector"].to_pylist()
     truth = comparison.truth.round(4).tolist()
     found = comparison.values.round(4).tolist()
@@ -43,7 +45,9 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
         "and the figures below judge these."
     )
     table = [["figure", "value", "bar", ""], *(row(figure) for figure in figures)]
-    path.write_text(render("GripMap: the map beside the truth", drawn, GRIP_SCALE, about=about, table=table))
+    path.write_text(
+        render("GripMap: the map beside the truth", drawn, GRIP_SCALE, about=about, table=table)
+    )
 
 
 def _words(cell: dict[str, Any], truth: float) -> list[str]:

@@ -32,8 +32,12 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
         _mark(truth, grip, cells["cell"].to_numpy())
     found.set_title(f"map: median\n(hatched: {UNKNOWN})", fontsize="medium")
     width.set_title("map: width of the 90 % interval")
-    bar = figure.colorbar(colours, ax=found, label=f"{MU}, the darker the more slippery", shrink=0.8)
-    bar.set_ticks(list(SURFACES.values()), labels=[f"{mu:g} {name}" for name, mu in SURFACES.items()])
+    bar = figure.colorbar(
+        colours, ax=found, label=f"{MU}, the darker the more slippery", shrink=0.8
+    )
+    bar.set_ticks(
+        list(SURFACES.values()), labels=[f"{mu:g} {name}" for name, mu in SURFACES.items()]
+    )
     figure.colorbar(wide, ax=width, label="width [1]", shrink=0.8)
     figure.suptitle(
         f"{cells.num_rows} cells and directions; truth inside the interval in {comparison.is_covered.mean():.0%}, "
@@ -45,10 +49,15 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
 def _mark(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
     """Mark passes over the new ice: circles of warned drivers, squares of others; black if grip was lost, else
     white."""
-    shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]  # in the axes of what is drawn
+    shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[
+        len(drawn) :
+    ]  # in the axes of what is drawn
     x, y = shapes.mean(axis=1).T
     side = np.ptp(shapes[0, :, 0])
-    for warned, name, mark, beside in ((True, "warned", "o", -0.25), (False, "not warned", "s", 0.25)):
+    for warned, name, mark, beside in (
+        (True, "warned", "o", -0.25),
+        (False, "not warned", "s", 0.25),
+    ):
         for lost, word, fill in ((True, "lost grip", "black"), (False, "kept it", "white")):
             rows = (grip.warned == warned) & (grip.lost == lost)
             label = f"{name}, {word}: {int(rows.sum())}"

@@ -22,7 +22,9 @@ def main() -> int:
                 print(reply.err.payload.to_string() if reply.err else "no answer", file=sys.stderr)
                 return 1
             features = json.loads(reply.ok.payload.to_string())["features"]
-            print(f"{reply.ok.key_expr} ({reply.ok.encoding}): {len(features)} cells, the first of them:")
+            print(
+                f"{reply.ok.key_expr} ({reply.ok.encoding}): {len(features)} cells, the first of them:"
+            )
             print(json.dumps(features[0]["properties"]) if features else "none")
     return 0
 

@@ -17,7 +17,10 @@ from edge_agent.lab.simulation.scenarios import scenario_named
 START_S = 300.0  # the first start after a change compiles the kernels, on a busy machine
 STOP_S = 10.0
 SCENARIO = "frost"
-SHOWN = {"snapshot_s": 10.0, "metrics_port": 0}  # for the page: a past within minutes, and what the service says
+SHOWN = {
+    "snapshot_s": 10.0,
+    "metrics_port": 0,
+}  # for the page: a past within minutes, and what the service says
 
 
 class DemoError(RuntimeError):
@@ -90,13 +93,23 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
     The agents' configuration is left in `folder/agent.json`.
     """
     scripts = Path(sys.executable).parent
-    router = ManagedProcess("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
+    router = ManagedProcess(
+        "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder
+    )
     try:
         endpoint = router.line_with("router: ").removeprefix("router: ").split()[0]
         zenoh = {"connect": [endpoint]}
         (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo", **SHOWN}))
-        (folder / "agent.json").write_text(json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")}))
-        command = ["run", "--config", str(folder / "service.json"), "--archive", str(folder / "archive")]
+        (folder / "agent.json").write_text(
+            json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")})
+        )
+        command = [
+            "run",
+            "--config",
+            str(folder / "service.json"),
+            "--archive",
+            str(folder / "archive"),
+        ]
         service = ManagedProcess("service", [str(scripts / "fleet-service"), *command], folder)
         try:
             service.line_with("ready")
@@ -115,14 +128,18 @@ def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Ite
     options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port, "--metrics": metrics,
                "--overlay": folder / "overlay.parquet", "--base-map": tiles, "--roads": roads}  # fmt: skip
     words = [str(word) for option in options.items() for word in option]
-    shown = ManagedProcess("page", [str(Path(sys.executable).parent / "fleet-service"), "page", *words], folder)
+    shown = ManagedProcess(
+        "page", [str(Path(sys.executable).parent / "fleet-service"), "page", *words], folder
+    )
     try:
         yield shown.line_with("page: ").removeprefix("page: ")
     finally:
         shown.stop()
 
 
-def fleet(folder: Path, vehicles: int, duration_s: float, seed: int, warned: float) -> ManagedProcess:
+def fleet(
+    folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
+) -> ManagedProcess:
     """Return the process of the simulated vehicles, with one session and identity each; a share of the drivers is
     warned."""
     scripts = Path(sys.executable).parent

@@ -20,7 +20,11 @@ def take(address: str, path: Path) -> None:
     Raises:
         InputError: Chromium or Playwright is missing.
     """
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    program = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     try:
         from playwright import sync_api
     except ImportError as error:

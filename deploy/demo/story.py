@@ -26,7 +26,9 @@ FOLDER = Path(".demo")
 REPORT_S = 5.0
 
 
-def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, float]]:
+def drive(
+    folder: Path, endpoint: str, args: argparse.Namespace
+) -> tuple[Listener, dict[str, float]]:
     """Let the fleet drive; return the received data and the fleet's counts."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
@@ -46,7 +48,9 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
 def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
     """Show one query by a client without GripMap code, and how to read the Parquet files."""
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
-    bbox = ",".join(f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max()))
+    bbox = ",".join(
+        f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max())
+    )
     print("\nA client that knows only Zenoh asks for the map:", flush=True)
     subprocess.run([sys.executable, "-m", "deploy.demo.plain_client", endpoint, bbox], check=True)
     compact(folder / "archive")
@@ -70,7 +74,9 @@ def report(
     picture.draw(comparison, folder / "map.png", grip)
     page.write(comparison, found, folder / "map.html")
     table = figures.markdown(found)
-    print(f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end="")
+    print(
+        f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end=""
+    )
     print(f"figures {folder}/figures.json", flush=True)
     return found
 
@@ -85,7 +91,9 @@ def run(args: argparse.Namespace) -> int:
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     appears_s = scenario_named(processes.SCENARIO).events[0].start
-    print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black ice appears.")
+    print(
+        f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black ice appears."
+    )
     with (
         processes.system(FOLDER) as (endpoint, service),
         processes.page(FOLDER, endpoint, service, args.page_port) as address,
@@ -101,7 +109,9 @@ def run(args: argparse.Namespace) -> int:
         show(FOLDER, endpoint, comparison)
         listener.close()
         wall_s = time.monotonic() - began
-        measured = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
+        measured = compare.figures(
+            comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s
+        )
         grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
         found = report(FOLDER, comparison, measured, grip, args.seed)
         if args.screenshot is not None:

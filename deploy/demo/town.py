@@ -102,7 +102,9 @@ def _houses(centres: FloatArray) -> Iterable[FloatArray]:
         y = float(centres[k, 1] + side * away * math.cos(angle))
         reach = math.hypot(wide, deep) / 2
         near = float(np.min(np.hypot(*(centres - (x, y)).T)))
-        parked = any(((x - px) / a) ** 2 + ((y - py) / b) ** 2 < 1.3 for px, py, a, b in (*PARKS, LAKE))
+        parked = any(
+            ((x - px) / a) ** 2 + ((y - py) / b) ** 2 < 1.3 for px, py, a, b in (*PARKS, LAKE)
+        )
         beside = any(math.hypot(x - px, y - py) < 0.92 * (reach + far) for px, py, far in placed)
         if near < CLEAR_M + deep / 2 - 1.0 or parked or beside:
             continue
@@ -164,7 +166,9 @@ def _write_tiles(scenario: Scenario, found: StreetPlan, path: Path) -> None:
     corners = np.array([[-AROUND_M, -AROUND_M], [AROUND_M, AROUND_M]])
     with sqlite3.connect(path) as table:
         table.execute("create table metadata (name text, value text)")
-        table.execute("create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)")
+        table.execute(
+            "create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)"
+        )
         about = {
             "name": NAME,
             "format": "pbf",
@@ -215,7 +219,12 @@ def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> b
 
 def _touches(points: Sequence[tuple[int, int]]) -> bool:
     xs, ys = [p[0] for p in points], [p[1] for p in points]
-    return max(xs) > -BUFFER and min(xs) < EXTENT + BUFFER and max(ys) > -BUFFER and min(ys) < EXTENT + BUFFER
+    return (
+        max(xs) > -BUFFER
+        and min(xs) < EXTENT + BUFFER
+        and max(ys) > -BUFFER
+        and min(ys) < EXTENT + BUFFER
+    )
 
 
 def _inside(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:

@@ -39,7 +39,9 @@ source_suffix = {".md": "markdown"}
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-suppress_warnings = ["myst.xref_missing"]  # links to source files lead out of the site; a test checks that they exist
+suppress_warnings = [
+    "myst.xref_missing"
+]  # links to source files lead out of the site; a test checks that they exist
 
 napoleon_use_ivar = True  # attributes that a docstring explains are fields already
 autodoc_typehints = "description"

@@ -23,7 +23,9 @@ def main(archive: Path, folder: Path) -> None:
     sql = f"select cell, sector, median(mu) as mu from '{files}' where value group by all"
     by_duckdb = duckdb.sql(sql).df().set_index(["cell", "sector"]).sort_index()  # type: ignore[union-attr]
 
-    rows = pd.concat(pd.read_parquet(path) for path in sorted(archive.glob("observations/*/*/*.parquet")))
+    rows = pd.concat(
+        pd.read_parquet(path) for path in sorted(archive.glob("observations/*/*/*.parquet"))
+    )
     by_pandas = rows[rows["value"]].groupby(["cell", "sector"])["mu"].median()
     print(f"largest difference of the two: {(by_duckdb['mu'] - by_pandas).abs().max():.2g}")
 
@@ -32,7 +34,9 @@ def main(archive: Path, folder: Path) -> None:
     for ending in ("html", "png", "geo.parquet"):
         fleet_service.write_answer(worst, "worst", folder / f"worst.{ending}")
     stretches = geopandas.read_parquet(folder / "worst.geo.parquet")
-    print(f"{len(stretches)} stretches, {stretches.geometry.to_crs(3006).area.sum():.0f} square metres of cells")
+    print(
+        f"{len(stretches)} stretches, {stretches.geometry.to_crs(3006).area.sum():.0f} square metres of cells"
+    )
 
 
 if __name__ == "__main__":

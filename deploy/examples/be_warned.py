@@ -16,18 +16,26 @@ import edge_agent
 SPEED = 14.0  # [m/s]
 
 
-def main(endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0) -> str:
+def main(
+    endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
+) -> str:
     """Look ahead from a place (yaw: radians from east) and print warnings; return the first one, or ""."""
     warnings: queue.Queue[str] = queue.Queue()
-    lookout = edge_agent.Lookout(["my-car"], lambda name, warning: warnings.put(f"{name}: {warning.line()}"))
-    config = zenoh.Config.from_json5(f'{{"mode": "client", "connect": {{"endpoints": ["{endpoint}"]}}}}')
+    lookout = edge_agent.Lookout(
+        ["my-car"], lambda name, warning: warnings.put(f"{name}: {warning.line()}")
+    )
+    config = zenoh.Config.from_json5(
+        f'{{"mode": "client", "connect": {{"endpoints": ["{endpoint}"]}}}}'
+    )
     with zenoh.open(config) as session:
         lookout.attach("my-car", session)
         lookout.start()
         warned = ""
         until = time.monotonic() + within_s
         while not warned and time.monotonic() < until:
-            lookout.see([edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())])  # where the car is now
+            lookout.see(
+                [edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())]
+            )  # where the car is now
             try:
                 warned = warnings.get(timeout=0.1)
             except queue.Empty:
@@ -43,5 +51,7 @@ def main(endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, wit
 
 if __name__ == "__main__":
     if len(sys.argv) < 4:
-        sys.exit("usage: python deploy/examples/be_warned.py ENDPOINT LATITUDE LONGITUDE [YAW [SECONDS]]")
+        sys.exit(
+            "usage: python deploy/examples/be_warned.py ENDPOINT LATITUDE LONGITUDE [YAW [SECONDS]]"
+        )
     main(sys.argv[1], *map(float, sys.argv[2:]))

@@ -17,11 +17,18 @@ def main(folder: Path) -> None:
     """Drive, estimate, show."""
     folder.mkdir(parents=True, exist_ok=True)
     truth, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
-    pq.write_table(truth, folder / "drive.parquet")  # your own log has the same columns, in SI units
+    pq.write_table(
+        truth, folder / "drive.parquet"
+    )  # your own log has the same columns, in SI units
     log = edge_agent.read_log(folder / "drive.parquet")
     found = {name: edge_agent.estimate(log, vehicle, name) for name in ("ckf", "sr-ukf")}
     frame = found["ckf"].to_pandas()
-    print(frame[["t", "vx", "mu", "mu_lower", "mu_upper", "mu_utilised"]].iloc[::100].round(2).to_string(index=False))
+    print(
+        frame[["t", "vx", "mu", "mu_lower", "mu_upper", "mu_utilised"]]
+        .iloc[::100]
+        .round(2)
+        .to_string(index=False)
+    )
     title = "double lane change at 22 m/s, μ .5, sedan, seed 1"
     edge_agent.plot(found, truth=truth, title=title).savefig(folder / "first.svg")
 

@@ -37,7 +37,12 @@ class AtLeast:
         self._radius = np.array([vehicle.wheel_radius for vehicle in vehicles])
 
     def advance(
-        self, t: np.ndarray[Any, Any], signals: np.ndarray[Any, Any], closes: object = None, *, threads: int = 1
+        self,
+        t: np.ndarray[Any, Any],
+        signals: np.ndarray[Any, Any],
+        closes: object = None,
+        *,
+        threads: int = 1,
     ) -> edge_agent.Estimates:
         """Estimate samples: t (T, N) [s], signals (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is
         missing."""
@@ -46,7 +51,9 @@ class AtLeast:
         pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY
         used = np.maximum.accumulate(np.concatenate([self._used[None], pull]), axis=0)[1:]
         self._used = used[-1]
-        values[..., Column.VX] = np.nan_to_num(np.nanmean(signals[..., S.OMEGA : S.OMEGA + 4], axis=-1) * self._radius)
+        values[..., Column.VX] = np.nan_to_num(
+            np.nanmean(signals[..., S.OMEGA : S.OMEGA + 4], axis=-1) * self._radius
+        )
         values[..., Column.YAW_RATE] = np.nan_to_num(signals[..., S.YAW_RATE])
         values[..., Column.VX_STD : Column.SIDESLIP_STD + 1] = 1.0
         values[..., Column.MU_UTILISED] = used

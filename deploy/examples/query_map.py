@@ -15,11 +15,26 @@ import fleet_service
 def main(endpoint: str) -> int:
     """Print the known cells, the worst first; return their number."""
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
-    measured = cells[cells["basis"] == "measured"]  # of the others only lower bounds are known: their mu is null
-    columns = ["latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "vehicles"]
-    print(measured.sort_values("p_slippery", ascending=False)[columns].head().to_string(index=False))
+    measured = cells[
+        cells["basis"] == "measured"
+    ]  # of the others only lower bounds are known: their mu is null
+    columns = [
+        "latitude",
+        "longitude",
+        "sector",
+        "mu",
+        "mu_lower",
+        "mu_upper",
+        "p_slippery",
+        "vehicles",
+    ]
+    print(
+        measured.sort_values("p_slippery", ascending=False)[columns].head().to_string(index=False)
+    )
 
-    config = zenoh.Config.from_json5(f'{{"mode": "client", "connect": {{"endpoints": ["{endpoint}"]}}}}')
+    config = zenoh.Config.from_json5(
+        f'{{"mode": "client", "connect": {{"endpoints": ["{endpoint}"]}}}}'
+    )
     with zenoh.open(config) as session:
         for reply in session.get("gripmap/v1/map/**"):
             if reply.ok is not None:

@@ -38,9 +38,13 @@ def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
 
 
 @compiled
-def adapted(factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray) -> float:
+def adapted(
+    factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
+) -> float:
     """The next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
-    return adapted_within(factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR))
+    return adapted_within(
+        factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
+    )
 
 
 @compiled

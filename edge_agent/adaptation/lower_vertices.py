@@ -27,7 +27,9 @@ from schemas.numeric import FloatArray
 
 SETS: Final = 5
 FEET: Final = 2 * (SETS - 1)
-LEAST_OVERLAP: Final = 0.02  # share of the distance of two peaks by which their sets overlap at least
+LEAST_OVERLAP: Final = (
+    0.02  # share of the distance of two peaks by which their sets overlap at least
+)
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,20 @@ class LowerVertices:
         for name in ("feet", "out_feet"):
             shares = np.asarray(getattr(self, name), float)
             if shares.shape != (FEET,) or not ((shares > 0.0) & (shares <= 2.0)).all():
-                raise InputError(f"lower_vertices.{name}", "out of range", f"give {FEET} shares in (0, 2]")
+                raise InputError(
+                    f"lower_vertices.{name}", "out of range", f"give {FEET} shares in (0, 2]"
+                )
         for name in ("peaks", "out_peaks"):
             peaks = np.asarray(getattr(self, name), float)
             if peaks.shape != (SETS,) or not (np.diff(peaks) > 0.0).all():
-                raise InputError(f"lower_vertices.{name}", "do not rise", f"give {SETS} numbers in order")
+                raise InputError(
+                    f"lower_vertices.{name}", "do not rise", f"give {SETS} numbers in order"
+                )
         pairs = np.asarray(self.feet).reshape(-1, 2)
         if (pairs.sum(axis=1) < 1.0 + LEAST_OVERLAP).any():
-            raise InputError("lower_vertices.feet", "two neighbours leave a gap", "let a pair sum to more than 1")
+            raise InputError(
+                "lower_vertices.feet", "two neighbours leave a gap", "let a pair sum to more than 1"
+            )
 
     def triangles(self) -> tuple[FloatArray, FloatArray]:
         """Return the sets of mismatch and of step, (5, 3) each: left foot, peak, right foot."""

@@ -41,7 +41,10 @@ LENGTHS = {
     "shares": 12,
     "strained": 2,
 }
-RETIRED = ("stretched", "lately")  # in files of before: contradiction is a test of likelihoods now, and has no vertices
+RETIRED = (
+    "stretched",
+    "lately",
+)  # in files of before: contradiction is a test of likelihoods now, and has no vertices
 RAMPS = ("far",)
 LEAST_SHARE = -8.0  # [nat]
 SHARE_REACH = 1.5  # [nat] to either side, in which an optimiser looks for a share
@@ -60,16 +63,38 @@ class Memberships:
     outputs: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
-    consequents: tuple[float, ...] = (0.67, 0.25)  # without: in town three times as many contradictions
-    shares: tuple[float, ...] = (-5.0, -3.1, -2.6, -0.7, -0.7, 0.0, -5.0, -1.6, -2.6, 0.0, -1.0, 0.0)
+    consequents: tuple[float, ...] = (
+        0.67,
+        0.25,
+    )  # without: in town three times as many contradictions
+    shares: tuple[float, ...] = (
+        -5.0,
+        -3.1,
+        -2.6,
+        -0.7,
+        -0.7,
+        0.0,
+        -5.0,
+        -1.6,
+        -2.6,
+        0.0,
+        -1.0,
+        0.0,
+    )
     strained: tuple[float, ...] = (-0.9, -0.4)
 
     def __post_init__(self) -> None:
         for name, length in LENGTHS.items():
             value = np.asarray(getattr(self, name), float)
             if value.shape != (length,) or not np.isfinite(value).all():
-                raise InputError(f"memberships.{name}", "not a list of finite numbers", f"give {length} numbers")
-        if np.any(np.diff(self.inputs) < CLOSEST) or self.inputs[0] < -1.0 or self.inputs[-1] > LARGEST_MISMATCH:
+                raise InputError(
+                    f"memberships.{name}", "not a list of finite numbers", f"give {length} numbers"
+                )
+        if (
+            np.any(np.diff(self.inputs) < CLOSEST)
+            or self.inputs[0] < -1.0
+            or self.inputs[-1] > LARGEST_MISMATCH
+        ):
             raise InputError(
                 "memberships.inputs",
                 "not rising inside the range of the mismatch",
@@ -82,18 +107,32 @@ class Memberships:
                 f"order them in [-{LARGEST_STEP:g}, {LARGEST_STEP:g}]",
             )
         if self.outputs[0] > 0.0 or self.outputs[-1] < 0.0:
-            raise InputError("memberships.outputs", "must shrink R at one end and grow it at the other", "bracket zero")
+            raise InputError(
+                "memberships.outputs",
+                "must shrink R at one end and grow it at the other",
+                "bracket zero",
+            )
         if max(map(abs, self.ln_scales)) > LARGEST_SCALE:
-            raise InputError("memberships.ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat")
+            raise InputError(
+                "memberships.ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat"
+            )
         for name in RAMPS:
             foot, peak = getattr(self, name)
             if not 0.0 <= foot <= peak - CLOSEST:
-                raise InputError(f"memberships.{name}", "does not rise", f"give a foot and a peak {CLOSEST:g} above it")
+                raise InputError(
+                    f"memberships.{name}",
+                    "does not rise",
+                    f"give a foot and a peak {CLOSEST:g} above it",
+                )
         if min(self.consequents) < 0.0 or max(self.consequents) > LARGEST_SCALE:
-            raise InputError("memberships.consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}")
+            raise InputError(
+                "memberships.consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}"
+            )
         for name in ("shares", "strained"):
             if not all(LEAST_SHARE <= value <= 0.0 for value in getattr(self, name)):
-                raise InputError(f"memberships.{name}", "out of range", f"stay within {LEAST_SHARE:g} and 0 nat")
+                raise InputError(
+                    f"memberships.{name}", "out of range", f"stay within {LEAST_SHARE:g} and 0 nat"
+                )
 
     def to_vector(self) -> FloatArray:
         """Free numbers for an optimiser, shape (30,): the fields one after the other."""
@@ -109,7 +148,9 @@ class Memberships:
         if v.shape == (NOISE,):
             v = np.append(v, cls().to_vector()[NOISE:])
         if v.shape != (sum(LENGTHS.values()),):
-            raise InputError("memberships", f"a vector of {v.shape} numbers", f"give {sum(LENGTHS.values())}")
+            raise InputError(
+                "memberships", f"a vector of {v.shape} numbers", f"give {sum(LENGTHS.values())}"
+            )
         inputs = np.sort(v[:SETS])
         for k in range(1, SETS):
             inputs[k] = max(inputs[k], inputs[k - 1] + 2.0 * CLOSEST)
@@ -150,7 +191,9 @@ class Memberships:
                 continue
             if not isinstance(value, list) or not all(isinstance(x, int | float) for x in value):
                 raise InputError(
-                    f"memberships.{name}", "missing or not a list of numbers", "write it with edge-agent tune"
+                    f"memberships.{name}",
+                    "missing or not a list of numbers",
+                    "write it with edge-agent tune",
                 )
             fields[name] = tuple(float(x) for x in value)
         return cls(**fields)

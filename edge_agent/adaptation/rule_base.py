@@ -43,7 +43,9 @@ def rule_base(memberships: Memberships) -> RuleBase:
     """The rules with the vertices of `memberships`."""
     m = memberships
     ln_noise, pace = m.consequents
-    return RuleBase(np.array(m.far), np.array(WIDE), ln_noise, pace, np.array(m.shares), np.array(m.strained))
+    return RuleBase(
+        np.array(m.far), np.array(WIDE), ln_noise, pace, np.array(m.shares), np.array(m.strained)
+    )
 
 
 @compiled
@@ -65,7 +67,9 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 
 @compiled
-def evidence_share(rules: RuleBase, slides: float, demand: float, new: float, strain: float) -> float:
+def evidence_share(
+    rules: RuleBase, slides: float, demand: float, new: float, strain: float
+) -> float:
     """Return the ln of the share of a block's evidence on friction that is taken, at most 0.
 
     Zero-order Takagi-Sugeno rules with product inference; the memberships of each input sum to one.
@@ -89,6 +93,10 @@ def evidence_share(rules: RuleBase, slides: float, demand: float, new: float, st
         for fresh in range(2):
             of_force = new if fresh == 1 else 1.0 - new
             first = 6 * sliding + fresh
-            asked = low * rules.shares[first] + middle * rules.shares[first + 2] + top * rules.shares[first + 4]
+            asked = (
+                low * rules.shares[first]
+                + middle * rules.shares[first + 2]
+                + top * rules.shares[first + 4]
+            )
             total += of_slide * of_force * asked
     return min(total, 0.0)

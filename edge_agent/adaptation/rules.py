@@ -55,7 +55,9 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 
 
 @compiled
-def infer_two(alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray) -> float:
+def infer_two(
+    alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
+) -> float:
     """ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)), level beyond the ends."""
     i, u = bracket(alpha, at)
     j, v = bracket(rate, of)

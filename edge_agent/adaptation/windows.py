@@ -20,7 +20,9 @@ def push(window: FloatArray, innovation: float) -> None:
 
 
 @compiled
-def weighted_noise(window: FloatArray, predicted: float, nominal: float, least: float, largest: float) -> float:
+def weighted_noise(
+    window: FloatArray, predicted: float, nominal: float, least: float, largest: float
+) -> float:
     """R of a row from its window (N,), NaN where not yet filled: then nominal; within [least, largest]*nominal."""
     weight = total = 0.0
     for error in window:

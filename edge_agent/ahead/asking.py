@@ -17,11 +17,17 @@ from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS
 
-BESIDE_M: Final = 12.0  # of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
+BESIDE_M: Final = (
+    12.0  # of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
+)
 AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 bytes
 LONGEST_M: Final = 300.0
-FURTHER_M: Final = 300.0  # than one looks is asked for at once, or each second would ask for its own ten metres
-REFRESH_S: Final = 300.0  # a map is asked anew while it lies ahead; what changes at once comes as an alert
+FURTHER_M: Final = (
+    300.0  # than one looks is asked for at once, or each second would ask for its own ten metres
+)
+REFRESH_S: Final = (
+    300.0  # a map is asked anew while it lies ahead; what changes at once comes as an alert
+)
 STEP: Final = 4  # metres between the points that are looked at
 MOST_BOXES: Final = 128
 MOST_TILES: Final = 6  # whose alerts are heard at a time
@@ -81,12 +87,18 @@ class Tiles:
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
         for path in paths:
-            ahead += _in_order(grid.tile_of(grid.cell_of(*to_degrees(path.x[::STEP], path.y[::STEP], pose))))
+            ahead += _in_order(
+                grid.tile_of(grid.cell_of(*to_degrees(path.x[::STEP], path.y[::STEP], pose)))
+            )
         wanted = list(dict.fromkeys(ahead))[:MOST_TILES]
         fresh = [tile for tile in wanted if tile not in self._wanted]
         self._wanted |= dict.fromkeys(wanted, pose.time)
         late = [tile for tile, at in self._wanted.items() if pose.time - at > LEAVE_S * NS]
-        by_age = sorted((at, tile) for tile, at in self._wanted.items() if tile not in late and tile not in wanted)
+        by_age = sorted(
+            (at, tile)
+            for tile, at in self._wanted.items()
+            if tile not in late and tile not in wanted
+        )
         surplus = len(self._wanted) - len(late) - MOST_TILES
         dropped = late + [tile for _, tile in by_age[: max(surplus, 0)]]
         for tile in dropped:
@@ -97,7 +109,8 @@ class Tiles:
 def keys_of(box: Box) -> list[int]:
     """Return the regions (z10) that a box touches, each once."""
     corners = grid.cell_of(
-        np.array([box.south, box.south, box.north, box.north]), np.array([box.west, box.east, box.west, box.east])
+        np.array([box.south, box.south, box.north, box.north]),
+        np.array([box.west, box.east, box.west, box.east]),
     )
     return _in_order(grid.region_of(corners))
 
@@ -121,7 +134,9 @@ def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
 
 
 def _fits(path: Path, first: int, last: int) -> bool:
-    wide, high = (float(np.ptp(side[first : last + 1])) + 2.0 * BESIDE_M for side in (path.x, path.y))
+    wide, high = (
+        float(np.ptp(side[first : last + 1])) + 2.0 * BESIDE_M for side in (path.x, path.y)
+    )
     return last - first <= LONGEST_M and wide * high <= AREA_M2
 
 

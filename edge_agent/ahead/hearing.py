@@ -33,10 +33,15 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
         raise WireError("tile", f"{len(payload)} bytes", f"ask for less than {MOST_TILE_BYTES}")
     table = decode_tile(payload)
     names = ("cell", "sector", "vehicles", "last_time")
-    if any(table[name].null_count for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")):
+    if any(
+        table[name].null_count
+        for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")
+    ):
         raise WireError("tile", "has holes", "send every needed column whole")
     cell, sector, vehicles, last = (_whole(table, name) for name in names)
-    lower, mu, upper, p, age = (_real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s"))
+    lower, mu, upper, p, age = (
+        _real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s")
+    )
     basis = np.array([_BASIS.get(str(name), -1) for name in table["basis"].to_pylist()], np.int64)
     measured = np.isfinite(mu)
     wrong = {
@@ -52,12 +57,20 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
     }
     for name, rows in wrong.items():
         if rows.any():
-            raise WireError(name, f"is not possible in row {int(rows.argmax())}", "send what the map's table says")
+            raise WireError(
+                name,
+                f"is not possible in row {int(rows.argmax())}",
+                "send what the map's table says",
+            )
     place = cell * grid.SECTORS + sector
     if len(np.unique(place)) < len(place):
         raise WireError("cell", "is there twice", "send each place once")
-    heard = np.minimum(last + (age * NS).astype(np.int64), now)  # when the tile was made: somebody may have kept it
-    return tile, ReceivedCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
+    heard = np.minimum(
+        last + (age * NS).astype(np.int64), now
+    )  # when the tile was made: somebody may have kept it
+    return tile, ReceivedCells(
+        place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard
+    )
 
 
 def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
@@ -102,7 +115,9 @@ def _tile(key: str, topic: str) -> int:
     try:
         parsed = keys.parse(key)
     except InputError as error:
-        raise WireError("key", f"{key[:80]!r} is no tile's", "put on the key of the topic") from error
+        raise WireError(
+            "key", f"{key[:80]!r} is no tile's", "put on the key of the topic"
+        ) from error
     if parsed.topic.name != topic or parsed.quadint is None:
         raise WireError("key", f"{key[:80]!r} is no tile's", "put on the key of the topic")
     return parsed.quadint
@@ -110,7 +125,9 @@ def _tile(key: str, topic: str) -> int:
 
 def _ordered(low: FloatArray | float, middle: FloatArray, high: FloatArray | float) -> BoolArray:
     with np.errstate(invalid="ignore"):
-        return np.asarray((middle >= np.asarray(low) - SLACK) & (middle <= np.asarray(high) + SLACK))
+        return np.asarray(
+            (middle >= np.asarray(low) - SLACK) & (middle <= np.asarray(high) + SLACK)
+        )
 
 
 def _whole(table: pa.Table, name: str) -> IntArray:

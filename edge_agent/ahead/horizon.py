@@ -18,10 +18,14 @@ from schemas.stopping import stopping_speed
 from schemas.thresholds import GRAVITY, REACTION_S
 
 MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
-COMFORT: Final = 3.0  # [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
+COMFORT: Final = (
+    3.0  # [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
+)
 COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
 SIGHT_M: Final = 60.0  # within which one wants to be able to stop, in a town
-UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (mugrid.UPPER - mugrid.LOWER)  # lower end of a road nobody has measured
+UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (
+    mugrid.UPPER - mugrid.LOWER
+)  # lower end of a road nobody has measured
 SHORTEST_M: Final = 150.0
 LONGEST_M: Final = 1000.0
 # Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an hour without a link.
@@ -70,7 +74,11 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     inverse = inverse.reshape(path.places.shape)
     there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
     # the first place that is measured, else the first of which anything is known; an alert goes before both
-    rank = np.where(there, np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)), 3)
+    rank = np.where(
+        there,
+        np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)),
+        3,
+    )
     column = rank.argmin(axis=1)
     row = inverse[np.arange(len(column)), column]
     nothing = rank.min(axis=1) == 3
@@ -90,7 +98,11 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
     """Return which places (n,) are slippery and certain enough for a warning."""
-    firm = (found.basis == MEASURED) & (found.p_slippery >= WARN_ABOVE) & (found.vehicles >= LEAST_VEHICLES)
+    firm = (
+        (found.basis == MEASURED)
+        & (found.p_slippery >= WARN_ABOVE)
+        & (found.vehicles >= LEAST_VEHICLES)
+    )
     return np.asarray(found.alerted | firm)
 
 
@@ -106,12 +118,16 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     expected = np.where(measured, mu_lower, UNKNOWN_LOWER)
     grip = GRAVITY * expected
     held = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
-    squares = np.where(measured, np.minimum(held, stopping_speed(expected, SIGHT_M) ** 2), np.inf).tolist()
+    squares = np.where(
+        measured, np.minimum(held, stopping_speed(expected, SIGHT_M) ** 2), np.inf
+    ).tolist()
     brakes, bends = np.minimum(grip, COMFORT).tolist(), bend.tolist()
     for k in range(len(squares) - 2, -1, -1):
         if squares[k + 1] < squares[k]:
             across = min(squares[k + 1] * bends[k] / brakes[k], 1.0)
-            squares[k] = min(squares[k], squares[k + 1] + 2.0 * brakes[k] * math.sqrt(1.0 - across * across))
+            squares[k] = min(
+                squares[k], squares[k + 1] + 2.0 * brakes[k] * math.sqrt(1.0 - across * across)
+            )
     found = np.sqrt(np.array(squares))
     return np.asarray(np.where(np.isinf(found), np.nan, found))
 

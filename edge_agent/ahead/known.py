@@ -18,12 +18,18 @@ from schemas.wire import Alert
 
 UNKNOWN, BOUND, MEASURED, BORROWED = range(4)
 BASES: Final = ("unknown", "bound", "measured", "borrowed")
-CHANGE_S: Final = 10800.0  # mean time between changes that leave nothing of what was known, as in the map
-HELD_S: Final = 3600.0  # what was not heard again for so long is unknown: by then 28 % of it has changed
+CHANGE_S: Final = (
+    10800.0  # mean time between changes that leave nothing of what was known, as in the map
+)
+HELD_S: Final = (
+    3600.0  # what was not heard again for so long is unknown: by then 28 % of it has changed
+)
 ALERT_HELD_S: Final = 600.0  # alerts that stand are put again every few seconds
 MOST_CELLS: Final = 20_000  # 6 MB: fifty kilometres of road with its side streets
 MOST_ALERTS: Final = 4096
-OTHER_WAY: Final = 2  # bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
+OTHER_WAY: Final = (
+    2  # bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
+)
 SLIPPERY_BINS: Final[FloatArray] = np.clip(
     (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
 )  # share of each bin that is slippery
@@ -54,7 +60,9 @@ class PlaceBelief(NamedTuple):
     alerted: BoolArray
 
 
-def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray) -> FloatArray:
+def belief_of(
+    lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
+) -> FloatArray:
     """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be NaN.
 
     The distribution function is linear between the known values.
@@ -90,7 +98,9 @@ class LocalMap:
         self._most = most_cells
         self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        self._all: ReceivedCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
+        self._all: ReceivedCells | None = (
+            NOTHING  # of all tiles, by key; None when it has to be made anew
+        )
 
     @property
     def cells(self) -> int:
@@ -129,14 +139,22 @@ class LocalMap:
     def standing(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
         """Store all standing alerts of a tile; return the places where this is new."""
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
-        news = [key for key in self._alerts if key not in stand and int(grid.tile_of(key // grid.SECTORS)) == tile]
+        news = [
+            key
+            for key in self._alerts
+            if key not in stand and int(grid.tile_of(key // grid.SECTORS)) == tile
+        ]
         for key in news:
             del self._alerts[key]
         return news + [key for key, alert in stand.items() if self.alert(alert, now)]
 
     def forget(self, now: int) -> None:
         """Drop data that is too old."""
-        for tile in [tile for tile, cells in self._tiles.items() if now - cells.heard.max(initial=0) > HELD_S * NS]:
+        for tile in [
+            tile
+            for tile, cells in self._tiles.items()
+            if now - cells.heard.max(initial=0) > HELD_S * NS
+        ]:
             del self._tiles[tile]
             self._all = None
         for key in [key for key, (_, at) in self._alerts.items() if now - at > ALERT_HELD_S * NS]:
@@ -151,23 +169,41 @@ class LocalMap:
         belief, basis, last, at, vehicles = self._rows(key)
         alerted = np.zeros(len(key), np.bool_)
         standing = np.fromiter(self._alerts, np.int64, len(self._alerts))
-        for k in np.flatnonzero(np.isin(key, standing) | np.isin(key ^ OTHER_WAY, standing)).tolist():
+        for k in np.flatnonzero(
+            np.isin(key, standing) | np.isin(key ^ OTHER_WAY, standing)
+        ).tolist():
             place = int(key[k])
             own = place in self._alerts
             alert, heard = self._alerts[place if own else place ^ OTHER_WAY]
             if now - heard > ALERT_HELD_S * NS:
                 continue
-            grip = basis[k] == MEASURED or mugrid.quantiles(belief[k : k + 1], 0.05)[0] >= SLIPPERY_MU
-            alerted[k] = own or alert.time > last[k] or not grip  # who found grip since, on this side, knows better
-            if alerted[k] and (alert.time >= last[k] or basis[k] != MEASURED):  # a bound tells no value
-                shown = (np.array([value]) for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery))
-                belief[k], last[k], at[k], vehicles[k] = belief_of(*shown)[0], alert.time, heard, alert.vehicles
+            grip = (
+                basis[k] == MEASURED or mugrid.quantiles(belief[k : k + 1], 0.05)[0] >= SLIPPERY_MU
+            )
+            alerted[k] = (
+                own or alert.time > last[k] or not grip
+            )  # who found grip since, on this side, knows better
+            if alerted[k] and (
+                alert.time >= last[k] or basis[k] != MEASURED
+            ):  # a bound tells no value
+                shown = (
+                    np.array([value])
+                    for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery)
+                )
+                belief[k], last[k], at[k], vehicles[k] = (
+                    belief_of(*shown)[0],
+                    alert.time,
+                    heard,
+                    alert.vehicles,
+                )
                 basis[k] = MEASURED if own else BORROWED
         since = np.maximum(now - at, 0) / NS
         share = -np.expm1(-since / CHANGE_S)[:, None]
         faded = (1.0 - share) * belief + share * mugrid.PRIOR
         there = (basis != UNKNOWN) & (since <= HELD_S)
-        lower, mu, upper = (np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95))
+        lower, mu, upper = (
+            np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
+        )
         return PlaceBelief(
             key, np.where(basis == BOUND, np.nan, mu), lower, upper, np.where(there, faded @ SLIPPERY_BINS, np.nan),
             np.where(there, np.maximum(now - last, 0) / NS, np.nan), np.where(there, basis, UNKNOWN),
@@ -203,7 +239,8 @@ class LocalMap:
         hit = whole.key[row] == key
         belief = np.where(hit[:, None], whole.belief[row], mugrid.PRIOR)
         basis, last, heard, vehicles = (
-            np.where(hit, column[row], 0) for column in (whole.basis, whole.last_time, whole.heard, whole.vehicles)
+            np.where(hit, column[row], 0)
+            for column in (whole.basis, whole.last_time, whole.heard, whole.vehicles)
         )
         return belief, basis, last, heard, vehicles
 
@@ -213,4 +250,6 @@ def _some(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:
 
 
 def _joined(parts: list[ReceivedCells]) -> ReceivedCells:
-    return ReceivedCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))
+    return ReceivedCells._make(
+        np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True)
+    )

@@ -65,7 +65,10 @@ class LookoutCounts:
     def values(self) -> dict[str, float]:
         """Return the counters for the last line of a drive."""
         refused = sum(
-            n for one in self.subscribers.values() for name, n in one.counts.items() if name.startswith("refused")
+            n
+            for one in self.subscribers.values()
+            for name, n in one.counts.items()
+            if name.startswith("refused")
         )
         return {
             "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
@@ -128,7 +131,9 @@ class Lookout:
             subscriber = self._watchers[k].subscriber if k in self._watchers else None
             if subscriber is None or places[k] < 0:
                 map_beliefs[k] = None
-            elif subscriber.looking().acquire(blocking=False):  # the loop does not wait: it asks again at the next
+            elif subscriber.looking().acquire(
+                blocking=False
+            ):  # the loop does not wait: it asks again at the next
                 try:
                     map_beliefs[k] = subscriber.known.belief(int(places[k]), time.time_ns())
                 finally:
@@ -148,7 +153,9 @@ class Lookout:
             self._thread.join(within_s)
 
     def _urge(self, watcher: _Watcher, places: list[int]) -> None:
-        if not watcher.places.isdisjoint(places) or any(not one.places.isdisjoint(places) for one in watcher.active):
+        if not watcher.places.isdisjoint(places) or any(
+            not one.places.isdisjoint(places) for one in watcher.active
+        ):
             watcher.urgent = True
             self._wake.set()
 
@@ -168,7 +175,9 @@ class Lookout:
             self.counts.busy_s += time.thread_time() - began
             if not ready:
                 urgent = any(watcher.urgent for watcher in self._watchers.values())
-                next_due = min((watcher.due for watcher in self._watchers.values()), default=now + LOOK_S)
+                next_due = min(
+                    (watcher.due for watcher in self._watchers.values()), default=now + LOOK_S
+                )
                 self._wake.wait(AGAIN_S / 2.0 if urgent else max(next_due - time.monotonic(), 0.0))
 
     def _watch(self, k: int, now: float) -> None:
@@ -195,8 +204,12 @@ class Lookout:
         length = horizon_length(pose.speed)
         with subscriber.looking():
             paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
-            horizons = [look_ahead(path.near(length), subscriber.known, pose.time) for path in paths]
-            watcher.active, issued = update_warnings(watcher.active, horizons, pose, subscriber.known)
+            horizons = [
+                look_ahead(path.near(length), subscriber.known, pose.time) for path in paths
+            ]
+            watcher.active, issued = update_warnings(
+                watcher.active, horizons, pose, subscriber.known
+            )
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
         self._on_horizons(watcher.name, horizons, pose)
@@ -214,7 +227,9 @@ class Lookout:
         subscriber.tell(lambda: encode_ahead(outlook))
 
 
-def paths_ahead(pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float) -> list[Path]:
+def paths_ahead(
+    pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float
+) -> list[Path]:
     """Return the ways on: the given route, else the roads visible in the map, else straight on; hold the subscriber's
     lock."""
     given = route.ahead(pose, length) if route is not None else None
@@ -226,7 +241,9 @@ def paths_ahead(pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber,
 def runs(horizon: Horizon) -> Runs:
     """Return a horizon as runs of metres in the same place."""
     key = horizon.key
-    starts = np.append(0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1)
+    starts = np.append(
+        0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1
+    )
     ends = np.append(starts[1:], len(key))
     place = np.maximum(key[starts], 0)
     return Runs(

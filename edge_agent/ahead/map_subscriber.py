@@ -51,7 +51,10 @@ class MapSubscriber:
         self._map, self._asked, self._tiles = LocalMap(), RequestLog(), Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
-        self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
+        self._again, self._answered = (
+            list[int](),
+            False,
+        )  # [ns] when to ask once more; since the router is there
         self._publisher = session.declare_publisher(
             keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, **quality_of(_TOPIC)
         )
@@ -87,7 +90,9 @@ class MapSubscriber:
         for tile in dropped:
             self._subscribers.pop(tile).undeclare()
         for tile in fresh:
-            self._subscribers[tile] = self._session.declare_subscriber(keys.alert_key(tile), self._on_alert)
+            self._subscribers[tile] = self._session.declare_subscriber(
+                keys.alert_key(tile), self._on_alert
+            )
         if not routers:
             return
         if back:
@@ -98,7 +103,9 @@ class MapSubscriber:
             back = not self._answered
         if back:
             self._asked.forget()
-        for tile in self._tiles.heard if back else fresh:  # after the subscription: none is missed in between
+        for tile in (
+            self._tiles.heard if back else fresh
+        ):  # after the subscription: none is missed in between
             self._get(keys.alert_key(tile), self._on_standing)
         for path in paths:
             for box in self._asked.wanting(path, pose, within):

@@ -22,14 +22,20 @@ from schemas.wire.ahead import Way
 
 NONE: Final = -1
 BESIDE_M: Final = 4.0  # a lane's width and a receiver's error; no other carriageway of the same direction is as near
-SMOOTH_M: Final = 15  # in which a corner of a given route is driven: 9.5 m of radius at a right angle
-OFF_ROUTE_M: Final = 20.0  # from the line of a route: a receiver's error, a wide road, a coarse route
+SMOOTH_M: Final = (
+    15  # in which a corner of a given route is driven: 9.5 m of radius at a right angle
+)
+OFF_ROUTE_M: Final = (
+    20.0  # from the line of a route: a receiver's error, a wide road, a coarse route
+)
 BACK_M: Final = 20.0  # a fix may jump back by so much
 ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
 # Unless the route heads like that so near, for corners are cut and turned into late; or begins so near: a navigation
 # system leaves out what has been driven, and how a route came to its beginning nobody knows.
 CORNER_M: Final = 20.0
-CORRIDOR_M: Final = 150.0  # a road without bends in sight; beyond, where it leads is anybody's guess
+CORRIDOR_M: Final = (
+    150.0  # a road without bends in sight; beyond, where it leads is anybody's guess
+)
 CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
 
@@ -64,13 +70,24 @@ class Path(NamedTuple):
     def near(self, length: float) -> Path:
         """Return its first metres."""
         n = max(int(length), 1)
-        return Path(self.kind, self.distance[:n], self.places[:n], self.curvature[:n], self.x[:n], self.y[:n])
+        return Path(
+            self.kind,
+            self.distance[:n],
+            self.places[:n],
+            self.curvature[:n],
+            self.x[:n],
+            self.y[:n],
+        )
 
 
-def to_plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+def to_plane(
+    latitude: FloatArray, longitude: FloatArray, pose: Pose
+) -> tuple[FloatArray, FloatArray]:
     """Return east and north [m] of the car; exact to a centimetre within a kilometre."""
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
-    return (np.asarray(longitude) - pose.longitude) * east, (np.asarray(latitude) - pose.latitude) * METRES_PER_DEGREE
+    return (np.asarray(longitude) - pose.longitude) * east, (
+        np.asarray(latitude) - pose.latitude
+    ) * METRES_PER_DEGREE
 
 
 def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
@@ -79,7 +96,9 @@ def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, Fl
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
 
 
-def path_along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
+def path_along(
+    kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None
+) -> Path:
     """Return the way along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
     `first` (n,) are known keys at the line's points; they precede those that follow from the position.
@@ -88,7 +107,9 @@ def path_along(kind: Way, line: FloatArray, pose: Pose, length: float, first: In
     count = max(int(min(run[-1], length)), 1)
     s = np.arange(1.0, count + 1.0)
     x, y = np.interp(s, run, line[:, 0]), np.interp(s, run, line[:, 1])
-    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x))) if count > 1 else np.full(1, pose.yaw)
+    yaw = (
+        np.unwrap(np.arctan2(np.gradient(y), np.gradient(x))) if count > 1 else np.full(1, pose.yaw)
+    )
     smooth = _smoothed(yaw, SMOOTH_M)
     curvature = np.gradient(smooth) if kind == "route" and count > 1 else np.full(count, np.nan)
     widen = BESIDE_M + (CORRIDOR_WIDENS * s if kind == "corridor" else 0.0)
@@ -138,7 +159,9 @@ class GivenRoute:
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
         share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
         off = np.hypot(*(start + share[:, None] * step).T)
-        turned = np.abs((np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi)
+        turned = np.abs(
+            (np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi
+        )
         at, fits = run[:-1] + share * size, off <= OFF_ROUTE_M
         for k in np.flatnonzero(fits & (turned > ASTRAY)).tolist():
             first, last = np.searchsorted(run, [at[k] - CORNER_M, at[k] + CORNER_M])
@@ -152,11 +175,15 @@ class GivenRoute:
         return float(at[among[int(cost.argmin())]])
 
 
-def _places(x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | float, pose: Pose) -> IntArray:
+def _places(
+    x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | float, pose: Pose
+) -> IntArray:
     sectors = [np.asarray(sector, np.int64) for sector in grid.sectors_touched(yaw)]
     columns = []
     for side in (0.0, 1.0, -1.0):
-        cell = grid.cell_of(*to_degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
+        cell = grid.cell_of(
+            *to_degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose)
+        )
         columns += [np.where(sector >= 0, cell * grid.SECTORS + sector, NONE) for sector in sectors]
     return np.column_stack(columns)
 

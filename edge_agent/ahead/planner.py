@@ -49,7 +49,10 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 def limit_of(horizons: list[Horizon]) -> float:
     """Return the lowest limit over all ways on [m/s]; inf without any."""
-    found = [limit_ahead(np.arange(len(one.safe_speed), dtype=np.float64), one.safe_speed) for one in horizons]
+    found = [
+        limit_ahead(np.arange(len(one.safe_speed), dtype=np.float64), one.safe_speed)
+        for one in horizons
+    ]
     return min(found, default=math.inf)
 
 
@@ -83,7 +86,9 @@ def encode_limit(limit: float, now: int) -> bytes:
     """Return a VelocityLimit as CDR, little endian; inf is written as FREE."""
     sender = SENDER.encode() + b"\0"
     speed = min(limit, FREE)
-    body = struct.pack("<iIfB3x", now // NS, now % NS, speed, 1) + struct.pack("<fff", -COMFORT, MAX_JERK, MIN_JERK)
+    body = struct.pack("<iIfB3x", now // NS, now % NS, speed, 1) + struct.pack(
+        "<fff", -COMFORT, MAX_JERK, MIN_JERK
+    )
     return b"\x00\x01\x00\x00" + body + struct.pack("<I", len(sender)) + sender
 
 

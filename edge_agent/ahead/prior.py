@@ -55,7 +55,11 @@ class MapPrior:
         return np.flatnonzero(keys != self._key).tolist()
 
     def step(
-        self, keys: IntArray, own: FloatArray, visit: FloatArray, map_beliefs: dict[int, FloatArray | None]
+        self,
+        keys: IntArray,
+        own: FloatArray,
+        visit: FloatArray,
+        map_beliefs: dict[int, FloatArray | None],
     ) -> FloatArray:
         """Return the beliefs of the vehicles with the map's help, (N, 32) probabilities.
 
@@ -73,7 +77,9 @@ class MapPrior:
             likelihood = np.exp(visit[k])
             informed = self._entry[k] * likelihood
             right, wrong = informed.sum(), (self._border[k] * likelihood).sum()
-            share = self._wrong[k] * wrong / (self._wrong[k] * wrong + (1.0 - self._wrong[k]) * right)
+            share = (
+                self._wrong[k] * wrong / (self._wrong[k] * wrong + (1.0 - self._wrong[k]) * right)
+            )
             self._found[k] = min(max(share, SHARE), MOST)
             out[k] = (1.0 - self._found[k]) * informed / right + self._found[k] * now[k]
         self._own = now
@@ -84,7 +90,11 @@ class MapPrior:
         self._wrong[k] = self._found[k] = SHARE + KEPT * (self._found[k] - SHARE)
         if belief is None:
             return
-        change = BLIND if before is None else max(1.0 - float(np.minimum(before, belief).sum()), LEAST_CHANGE)
+        change = (
+            BLIND
+            if before is None
+            else max(1.0 - float(np.minimum(before, belief).sum()), LEAST_CHANGE)
+        )
         self._border[k] = (1.0 - LEAST_CHANGE) * self._own[k] + LEAST_CHANGE * mugrid.PRIOR
         carried = (1.0 - change) * self._own[k] + change * mugrid.PRIOR
         self._entry[k] = _normal((carried * belief)[None])[0]

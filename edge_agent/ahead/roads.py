@@ -17,7 +17,9 @@ from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_p
 from schemas import grid
 from schemas.numeric import IntArray
 
-LINK_CELLS: Final = 2.3  # sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
+LINK_CELLS: Final = (
+    2.3  # sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
+)
 BEGIN_CELLS: Final = 1.6  # from the car to the first
 TURN: Final = math.radians(95.0)  # between two links: the right angle of a junction within a cell
 LEAN: Final = math.radians(
@@ -36,8 +38,12 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     latitude, longitude = grid.centre(keys // grid.SECTORS)
     x, y = to_plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
-    places = dict(zip(keys[near].tolist(), zip(x[near].tolist(), y[near].tolist(), strict=True), strict=True))
-    west, _, east, _ = (float(side) for side in grid.bounds(grid.cell_of(pose.latitude, pose.longitude)))
+    places = dict(
+        zip(keys[near].tolist(), zip(x[near].tolist(), y[near].tolist(), strict=True), strict=True)
+    )
+    west, _, east, _ = (
+        float(side) for side in grid.bounds(grid.cell_of(pose.latitude, pose.longitude))
+    )
     side = (east - west) * math.cos(math.radians(pose.latitude)) * 111e3
     by_cell: dict[tuple[int, int], list[int]] = {}
     for key, (px, py) in places.items():
@@ -60,7 +66,10 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
 
 class _Neighbours:
     def __init__(
-        self, places: dict[int, tuple[float, float]], by_cell: dict[tuple[int, int], list[int]], side: float
+        self,
+        places: dict[int, tuple[float, float]],
+        by_cell: dict[tuple[int, int], list[int]],
+        side: float,
     ) -> None:
         self.places, self._by_cell, self.side = places, by_cell, side
 
@@ -77,7 +86,10 @@ class _Neighbours:
                     if not 0.3 * self.side < distance <= reach:
                         continue
                     link = math.atan2(dy, dx)
-                    turn, turned = _apart(link, heading), _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
+                    turn, turned = (
+                        _apart(link, heading),
+                        _apart(link, (key % grid.SECTORS) * math.pi / 2.0),
+                    )
                     if turn <= TURN and turned <= LEAN:
                         found.append((distance * (1.0 + 2.0 * turn + 0.5 * turned), key, link))
         chosen: list[tuple[int, float]] = []
@@ -87,7 +99,9 @@ class _Neighbours:
         return [key for key, _ in chosen]
 
 
-def _follow_way(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
+def _follow_way(
+    graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]
+) -> list[int]:
     """Follow a way to its end; put branches on `forks`."""
     run, passed = 0.0, set(way)
     for _ in range(MOST_STEPS):
@@ -112,7 +126,12 @@ def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose)
 
 
 def _as_path(
-    way: list[int], places: dict[int, tuple[float, float]], pose: Pose, length: float, *, beyond: bool
+    way: list[int],
+    places: dict[int, tuple[float, float]],
+    pose: Pose,
+    length: float,
+    *,
+    beyond: bool,
 ) -> Path:
     line = np.array([(0.0, 0.0), *(places[key] for key in way)])
     smooth = line.copy()

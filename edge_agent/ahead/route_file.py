@@ -30,7 +30,9 @@ def read_route(path: Path) -> GivenRoute:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError("route", f"cannot read {path} ({error.strerror})", "give a GPX or GeoJSON file") from error
+        raise InputError(
+            "route", f"cannot read {path} ({error.strerror})", "give a GPX or GeoJSON file"
+        ) from error
     if len(data) > MOST_BYTES:
         raise InputError("route", f"{path} has {len(data)} bytes", f"give at most {MOST_BYTES}")
     points = _gpx(data) if data.lstrip().startswith((b"<", b"\xef\xbb\xbf<")) else _geojson(data)
@@ -44,7 +46,9 @@ def route_of(points: list[tuple[float, float]]) -> GivenRoute:
         InputError: they are no route.
     """
     if not 2 <= len(points) <= MOST_POINTS:
-        raise InputError("route", f"has {len(points)} points", f"give a line of 2 to {MOST_POINTS} points")
+        raise InputError(
+            "route", f"has {len(points)} points", f"give a line of 2 to {MOST_POINTS} points"
+        )
     place = np.array(points, dtype=np.float64)
     if not (
         np.isfinite(place).all()
@@ -69,7 +73,9 @@ def _gpx(data: bytes) -> list[tuple[float, float]]:
             try:
                 found[kind].append((float(attributes["lat"]), float(attributes["lon"])))
             except (KeyError, ValueError) as error:
-                raise InputError("route", f"has a {kind} without a position", "give lat and lon in degrees") from error
+                raise InputError(
+                    "route", f"has a {kind} without a position", "give lat and lon in degrees"
+                ) from error
 
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse

@@ -101,13 +101,21 @@ def update_warnings(
 def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
     """Return runs of slippery metres of a horizon; runs less than LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
-    begins = math.ceil(speed * (REACTION_S + UPDATE_S) + MARGIN_M)  # where the brakes bite at the latest
+    begins = math.ceil(
+        speed * (REACTION_S + UPDATE_S) + MARGIN_M
+    )  # where the brakes bite at the latest
     found = []
     for first, last in _runs(horizon.slippery):
-        places = frozenset(horizon.key[first : last + 1][horizon.slippery[first : last + 1]].tolist())
-        worst = first + int(np.nanargmin(np.where(horizon.slippery, horizon.mu, np.nan)[first : last + 1]))
+        places = frozenset(
+            horizon.key[first : last + 1][horizon.slippery[first : last + 1]].tolist()
+        )
+        worst = first + int(
+            np.nanargmin(np.where(horizon.slippery, horizon.mu, np.nan)[first : last + 1])
+        )
         braking_energy = float(brakes[first] - brakes[min(begins, first)])
-        found.append(_Stretch(places, float(first), float(last + 1), worst, braking_energy, horizon))
+        found.append(
+            _Stretch(places, float(first), float(last + 1), worst, braking_energy, horizon)
+        )
     return found
 
 
@@ -116,7 +124,13 @@ def _runs(mask: BoolArray) -> list[tuple[int, int]]:
     if not len(at):
         return []
     breaks = np.flatnonzero(np.diff(at) > LINK_M)
-    return list(zip(at[np.append(0, breaks + 1)].tolist(), at[np.append(breaks, len(at) - 1)].tolist(), strict=True))
+    return list(
+        zip(
+            at[np.append(0, breaks + 1)].tolist(),
+            at[np.append(breaks, len(at) - 1)].tolist(),
+            strict=True,
+        )
+    )
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
@@ -130,13 +144,21 @@ def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Str
     return groups
 
 
-def _warning(name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool) -> GripWarning:
+def _warning(
+    name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool
+) -> GripWarning:
     horizon, k = stretch.horizon, stretch.worst
     first, last = int(stretch.start), int(stretch.end)
     age = float(np.nanmin(horizon.age_s[first:last]))
     alerted = horizon.alerted[first:last]
     own = (alerted & (horizon.basis[first:last] == MEASURED)).any()
-    reason = "an alert stands" if own else "an alert stands for the other way" if alerted.any() else "the map says so"
+    reason = (
+        "an alert stands"
+        if own
+        else "an alert stands for the other way"
+        if alerted.any()
+        else "the map says so"
+    )
     return GripWarning(
         id=name, state=state, time=pose.time, distance_m=stretch.start, length_m=stretch.end - stretch.start,
         time_s=stretch.start / pose.speed if pose.speed > SLOWEST else math.inf,

@@ -46,13 +46,19 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
     Raises:
         InputError: two logs have one name, or estimates would replace a log.
     """
-    tasks = [Task(log, vehicle or vehicle_file_of(log), folder / f"{log.stem}.parquet") for log in logs]
+    tasks = [
+        Task(log, vehicle or vehicle_file_of(log), folder / f"{log.stem}.parquet") for log in logs
+    ]
     seen: dict[Path, Path] = {}
     for task in tasks:
         if (other := seen.setdefault(task.out, task.log)) is not task.log:
-            raise InputError("log", f"{other} and {task.log} would both write {task.out}", "rename one of them")
+            raise InputError(
+                "log", f"{other} and {task.log} would both write {task.out}", "rename one of them"
+            )
         if task.out.resolve() == task.log.resolve():
-            raise InputError("out", f"estimates would replace the log {task.log}", "choose another folder")
+            raise InputError(
+                "out", f"estimates would replace the log {task.log}", "choose another folder"
+            )
     return tasks
 
 
@@ -72,7 +78,9 @@ def backfill(
     if jobs < 1:
         raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
     with ThreadPoolExecutor(jobs) as pool:
-        for future in as_completed([pool.submit(estimate, task, estimator, memberships) for task in tasks]):
+        for future in as_completed(
+            [pool.submit(estimate, task, estimator, memberships) for task in tasks]
+        ):
             yield future.result()
 
 
@@ -87,7 +95,9 @@ def backfill_on_spark(
     """
     folders = {writable("out", task.out).parent for task in tasks}
     yield from spark.spread(
-        spark.session(), tasks, partial(estimate_atomically, estimator=estimator, memberships=memberships)
+        spark.session(),
+        tasks,
+        partial(estimate_atomically, estimator=estimator, memberships=memberships),
     )
     for folder in folders:
         sweep_drafts(folder)

@@ -84,10 +84,14 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
     elif path.suffix in IMAGES:
         figure_of(drive).savefig(path, dpi=120)
     else:
-        raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(ENDINGS)}")
+        raise InputError(
+            "out", f"{path.name} has no known ending", f"use one of {', '.join(ENDINGS)}"
+        )
 
 
-def curve_of(table: pa.Table, panel: Panel) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def curve_of(
+    table: pa.Table, panel: Panel
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return time, value, and both ends of the band of a quantity, (n,) each; NaN where there is none."""
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
@@ -120,7 +124,9 @@ def page_of(drive: RecordedDrive) -> str:
         "slippery": SLIPPERY_MU,
         "estimators": [{"name": name, "colour": line_of(name).colour} for name in drive.estimates],
     }
-    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no value can end or open a tag
+    text = json.dumps(data, allow_nan=False).replace(
+        "<", "\\u003c"
+    )  # no value can end or open a tag
     found = _TEMPLATE.read_text(encoding="utf-8")
     return found.replace("<!--TITLE-->", html.escape(drive.title)).replace("/*DATA*/null", text)
 
@@ -169,14 +175,21 @@ def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
         return None
     rows = known[:: max(1, len(known) // MOST_POINTS)]
     latitude, longitude = position[rows].T
-    x = (longitude - longitude.mean()) * math.cos(math.radians(float(latitude.mean()))) * METRES_PER_DEGREE
+    x = (
+        (longitude - longitude.mean())
+        * math.cos(math.radians(float(latitude.mean())))
+        * METRES_PER_DEGREE
+    )
     y = (latitude - latitude.mean()) * METRES_PER_DEGREE
     table = next(iter(drive.estimates.values()))
     t = drive.log.t[rows]
     at = np.clip(np.searchsorted(table["t"].to_numpy(), t), 0, table.num_rows - 1)
     mu, lower, upper = (table[name].to_numpy()[at] for name in ("mu", "mu_lower", "mu_upper"))
     sure = (upper - lower < 0.5) | (upper < SLIPPERY_MU)
-    colours = [shade(float(m), *GRIP_RANGE) if ok and m == m else None for m, ok in zip(mu, sure, strict=True)]
+    colours = [
+        shade(float(m), *GRIP_RANGE) if ok and m == m else None
+        for m, ok in zip(mu, sure, strict=True)
+    ]
     return {"x": _plain_list(x), "y": _plain_list(y), "t": _plain_list(t), "colour": colours}
 
 

@@ -29,7 +29,9 @@ ENDINGS: Final[dict[str, Any]] = {
     ".csv": pacsv.CSVWriter,
     ".mcap": McapTableWriter,
 }
-WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper"))
+WHEEL_COLUMNS = tuple(
+    f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper")
+)
 
 
 def writable(field: str, path: Path) -> Path:
@@ -40,11 +42,19 @@ def writable(field: str, path: Path) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        reason = "is a folder" if path.is_dir() else "" if os.access(path.parent, os.W_OK) else "no permission"
+        reason = (
+            "is a folder"
+            if path.is_dir()
+            else ""
+            if os.access(path.parent, os.W_OK)
+            else "no permission"
+        )
     except OSError as error:
         reason = error.strerror or str(error)
     if reason:
-        raise InputError(field, f"cannot write {path} ({reason})", "name a file in a writable folder")
+        raise InputError(
+            field, f"cannot write {path} ({reason})", "name a file in a writable folder"
+        )
     return path
 
 
@@ -54,13 +64,19 @@ def write_table(field: str, path: Path, table: pa.Table) -> None:
     Raises:
         InputError: the path cannot be written, or its ending is not one of ENDINGS.
     """
-    with open_durably(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
+    with (
+        open_durably(writable(field, path)) as file,
+        _table_writer(path, field)(file, table.schema) as writer,
+    ):
         writer.write_table(table)
 
 
 def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a class of Arrow
     if path.suffix not in ENDINGS:
-        problem, fix = f"{path.name} has no known ending", f"use one of {', '.join(name for name in ENDINGS if name)}"
+        problem, fix = (
+            f"{path.name} has no known ending",
+            f"use one of {', '.join(name for name in ENDINGS if name)}",
+        )
         raise InputError(field, problem, fix)
     return ENDINGS[path.suffix]
 
@@ -83,7 +99,10 @@ class EstimatesFile:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._opened.__exit__(kind, error, trace)
 

@@ -14,11 +14,16 @@ from schemas.vehicle import Vehicle
 
 def known_estimators() -> dict[str, str]:
     """Return all estimators by name with one line about each, those of other packages too."""
-    others = {name: f"from {point.value}" for name, point in plugins.entry_points_of(plugins.ESTIMATORS).items()}
+    others = {
+        name: f"from {point.value}"
+        for name, point in plugins.entry_points_of(plugins.ESTIMATORS).items()
+    }
     return others | ESTIMATORS
 
 
-def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None) -> EstimatorBank:
+def bank_of(
+    estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None
+) -> EstimatorBank:
     """Return a bank of estimators by name, one per vehicle.
 
     Args:
@@ -38,11 +43,17 @@ def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Membership
     curve = plugins.load_entry_point(plugins.TYRE_CURVES, own) if own else None
     if estimator not in ESTIMATORS and estimator in plugins.entry_points_of(plugins.ESTIMATORS):
         if memberships is not None:
-            raise InputError("memberships", f"{estimator} has no fuzzy sets to replace", "leave them out")
+            raise InputError(
+                "memberships", f"{estimator} has no fuzzy sets to replace", "leave them out"
+            )
         bank: EstimatorBank = plugins.load_entry_point(plugins.ESTIMATORS, estimator)(vehicles)
         return bank
     if estimator not in ESTIMATORS:
-        raise InputError("estimator", f"{estimator!r} is unknown", f"choose one of {', '.join(known_estimators())}")
+        raise InputError(
+            "estimator",
+            f"{estimator!r} is unknown",
+            f"choose one of {', '.join(known_estimators())}",
+        )
     if memberships is None and estimator in TUNED:
         memberships = shipped(TUNED[estimator])
     return create(estimator, vehicles, memberships=memberships, curve=curve)

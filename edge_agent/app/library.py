@@ -50,7 +50,9 @@ def load_memberships(path: Path | str) -> Memberships:
     return tuned_memberships.load(path).memberships
 
 
-def make_bank(estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
+def make_bank(
+    estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None
+) -> EstimatorBank:
     """Return N estimators, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals (T, N, 18).
 
     Raises:
@@ -60,7 +62,11 @@ def make_bank(estimator: str, vehicles: Sequence[Vehicle], *, memberships: Membe
 
 
 def estimate(
-    log: SignalLog, vehicle: Vehicle, estimator: str = DEFAULT, *, memberships: Memberships | None = None
+    log: SignalLog,
+    vehicle: Vehicle,
+    estimator: str = DEFAULT,
+    *,
+    memberships: Memberships | None = None,
 ) -> pa.Table:
     """Return the estimates of a log, one row per sample, with the columns of schemas.tables.ESTIMATES.
 
@@ -86,7 +92,9 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
     return table(time, Estimates(estimates.values[:, vehicle : vehicle + 1]))
 
 
-def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = "") -> Figure:
+def plot(
+    estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = ""
+) -> Figure:
     """Plot speed and friction with its 90 % band over time, for several estimators by name; `truth` is a simulated log.
 
     Raises:
@@ -99,15 +107,27 @@ def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title
     figure = Figure(figsize=(8, 6), layout="constrained")
     speed, friction = figure.subplots(2, 1, sharex=True)
     if truth is not None:
-        wheels = [truth[name].to_numpy() for name in truth.schema.names if name.startswith("true_mu_")]
+        wheels = [
+            truth[name].to_numpy() for name in truth.schema.names if name.startswith("true_mu_")
+        ]
         speed.plot(truth["t"], truth["true_vx"], color="k", label="true")
-        friction.plot(truth["t"], np.mean(wheels, axis=0), color="k", label="true, mean of the wheels")
+        friction.plot(
+            truth["t"], np.mean(wheels, axis=0), color="k", label="true, mean of the wheels"
+        )
     for name, found in estimates.items():
         style, t = line_of(name), found["t"].to_numpy()
         speed.plot(t, found["vx"].to_numpy(), color=style.colour, linestyle=style.dash, label=name)
-        friction.plot(t, found["mu"].to_numpy(), color=style.colour, linestyle=style.dash, label=f"{name}, median")
+        friction.plot(
+            t,
+            found["mu"].to_numpy(),
+            color=style.colour,
+            linestyle=style.dash,
+            label=f"{name}, median",
+        )
         ends = (found[end].to_numpy() for end in ("mu_lower", "mu_upper"))
-        friction.fill_between(t, *ends, color=style.colour, alpha=0.2, linewidth=0, label="90 % band")
+        friction.fill_between(
+            t, *ends, color=style.colour, alpha=0.2, linewidth=0, label="90 % band"
+        )
     speed.set(ylabel="v_x [m/s]", title=title)
     friction.set(ylabel="peak adhesion μ [1]", xlabel="t [s]", ylim=(0.0, 1.25))
     for axes in (speed, friction):

@@ -68,7 +68,10 @@ def drive(
         after()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
-            started, first = clock(), float(block.t.min())  # the first block may have had to load kernels
+            started, first = (
+                clock(),
+                float(block.t.min()),
+            )  # the first block may have had to load kernels
         length = float(block.t.max()) - first - progress.signals_s
         progress.signals_s += length
         progress.blocks += 1
@@ -92,7 +95,12 @@ def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
     for vehicle, flag, reason in pipeline.doubted_flags():
         if (vehicle, flag) not in warned:
             warned.add((vehicle, flag))
-            log.warning("vehicle %d: %s %s: it counts as unknown; correct the profile", vehicle, flag, reason)
+            log.warning(
+                "vehicle %d: %s %s: it counts as unknown; correct the profile",
+                vehicle,
+                flag,
+                reason,
+            )
 
 
 def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: RecordBlock) -> None:

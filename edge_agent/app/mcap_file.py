@@ -32,11 +32,15 @@ class McapTableWriter:
         try:
             from mcap.writer import Writer
         except ImportError as error:
-            raise InputError("out", "the package mcap is missing", "pip install 'gripmap[mcap]'") from error
+            raise InputError(
+                "out", "the package mcap is missing", "pip install 'gripmap[mcap]'"
+            ) from error
         self._writer, self._count = Writer(file), 0
         self._writer.start(library="gripmap")
         fields = {field.name: {"type": _JSON[str(field.type)]} for field in schema}
-        described = json.dumps({"type": "object", "title": "gripmap.Estimates", "properties": fields})
+        described = json.dumps(
+            {"type": "object", "title": "gripmap.Estimates", "properties": fields}
+        )
         known = self._writer.register_schema("gripmap.Estimates", "jsonschema", described.encode())
         self._channel = self._writer.register_channel(TOPIC, "json", known)
 
@@ -49,7 +53,11 @@ class McapTableWriter:
     def write_table(self, table: pa.Table) -> None:
         """Add the samples of a table."""
         for row in table.to_pylist():
-            told = {name: value for name, value in row.items() if value is not None and math.isfinite(value)}
+            told = {
+                name: value
+                for name, value in row.items()
+                if value is not None and math.isfinite(value)
+            }
             at = max(round(row["t"] * NS), 0)
             self._writer.add_message(self._channel, at, json.dumps(told).encode(), at, self._count)
             self._count += 1

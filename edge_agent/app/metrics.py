@@ -63,7 +63,9 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
             f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive late or are refused"
         )
     if publisher.stranded:
-        found.append(f"{publisher.stranded} records are stored under a former name; run once with the former --name")
+        found.append(
+            f"{publisher.stranded} records are stored under a former name; run once with the former --name"
+        )
     if publisher.broken:
         found.append("the sending thread has died; restart the agent")
     if progress.now_s > BEHIND_S:

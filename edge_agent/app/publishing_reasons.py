@@ -100,16 +100,26 @@ def reasons(
     elif watch.missing("turning"):
         found.append("the vehicle stands: only a moving vehicle visits cells")
     if watch.missing("position"):
-        found.append("no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and longitude")
+        found.append(
+            "no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and longitude"
+        )
     where = ", ".join(endpoints)
     if not publisher.links:
-        found.append(f"no router answers at {where}: start one with `gripmap router`, or correct zenoh.connect")
+        found.append(
+            f"no router answers at {where}: start one with `gripmap router`, or correct zenoh.connect"
+        )
     elif publisher.cut_off:
-        found.append(f"the router at {where} is away: records wait on disk and are sent when it returns")
+        found.append(
+            f"the router at {where} is away: records wait on disk and are sent when it returns"
+        )
     elif publisher.unanswered_s > UNANSWERED_S:
-        found.append("no service acknowledges the records: start `fleet-service run` on the same router")
+        found.append(
+            "no service acknowledges the records: start `fleet-service run` on the same router"
+        )
     if any(publisher.counts.rejected.values()) and not any(publisher.counts.acknowledged.values()):
-        found.append("a service refuses all records: the reason stands in its log and in its metrics")
+        found.append(
+            "a service refuses all records: the reason stands in its log and in its metrics"
+        )
     return found
 
 

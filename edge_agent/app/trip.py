@@ -44,7 +44,9 @@ class Known(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     version: Literal[1] = 1
-    of: Annotated[str, Field(description="hash of vehicle file and profile; with others all begins anew")]
+    of: Annotated[
+        str, Field(description="hash of vehicle file and profile; with others all begins anew")
+    ]
     passed: bool = False
     drives: list[DriveEstimates] = []
 
@@ -59,13 +61,19 @@ class Trip:
         trusted: True to publish whatever the doctor finds.
     """
 
-    def __init__(self, vehicle: Vehicle, profile: Profile, path: Path, *, trusted: bool = False) -> None:
+    def __init__(
+        self, vehicle: Vehicle, profile: Profile, path: Path, *, trusted: bool = False
+    ) -> None:
         self._plain = vehicle.model_copy(update={"calibration": None})
         self._path, self._trusted = path, trusted
         self._known = _read(path, _identity(self._plain, profile))
         learned = weighed(self._known.drives, self._plain)
-        self.vehicle = vehicle.model_copy(update={"calibration": surer(vehicle.calibration, learned)})
-        self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []  # of this part: t, signals, ground
+        self.vehicle = vehicle.model_copy(
+            update={"calibration": surer(vehicle.calibration, learned)}
+        )
+        self._blocks: list[
+            tuple[FloatArray, FloatArray, FloatArray]
+        ] = []  # of this part: t, signals, ground
         self._since = self._looked = 0.0
         self._faults: list[str] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
@@ -81,13 +89,17 @@ class Trip:
             return []
         return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
 
-    def blocks(self, source: Generator[Block], ground: Callable[[], FloatArray]) -> Generator[Block]:
+    def blocks(
+        self, source: Generator[Block], ground: Callable[[], FloatArray]
+    ) -> Generator[Block]:
         """Yield the blocks of a source with known device errors corrected; the raw ones are kept for the doctor.
 
         `ground` returns the speed over ground (T,) of the last block.
         """
         if not self.admitted():
-            log.info("nothing is published until the signal doctor has passed half a minute of turns and braking")
+            log.info(
+                "nothing is published until the signal doctor has passed half a minute of turns and braking"
+            )
         corrector = Corrector(self.vehicle)
         with closing(source):
             for block in source:
@@ -144,10 +156,14 @@ class Trip:
             log.warning("a part of this trip cannot be examined: %s", error)
             return
         if diagnosis.passed and not self._known.passed:
-            log.info("the signal doctor has passed: units, signs, clocks and offsets agree with each other")
+            log.info(
+                "the signal doctor has passed: units, signs, clocks and offsets agree with each other"
+            )
         passed = diagnosis.passed or (self._known.passed and not self._faults)
         if estimates or passed != self._known.passed:
-            drives = [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
+            drives = (
+                [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
+            )
             self._known = self._known.model_copy(update={"passed": passed, "drives": drives})
             _write(self._path, self._known)
 
@@ -169,7 +185,9 @@ def _read(path: Path, identity: str) -> Known:
     except FileNotFoundError:
         return Known(of=identity)
     except (OSError, ValidationError) as error:
-        log.warning("%s cannot be read (%s): the car is learned anew", path, str(error).splitlines()[0])
+        log.warning(
+            "%s cannot be read (%s): the car is learned anew", path, str(error).splitlines()[0]
+        )
         return Known(of=identity)
     if known.of != identity:
         log.warning("%s is of another vehicle file or profile: the car is learned anew", path)

@@ -29,13 +29,25 @@ class Record(BaseModel):
 class Score(Record):
     """Scores of one set of memberships on one set of drives; null if the true friction is unknown."""
 
-    interval_score: Annotated[Finite | None, Field(description="of the 90 % friction interval, less is better [1]")]
+    interval_score: Annotated[
+        Finite | None, Field(description="of the 90 % friction interval, less is better [1]")
+    ]
     coverage: Annotated[Finite | None, Field(description="share of true frictions inside it [1]")]
-    log_likelihood: Annotated[Finite, Field(description="of the innovations, more is better [nat/s]")]
-    nis_ratio: Annotated[Finite, Field(description="normalised innovation squared over its expectation [1]")]
-    surface_score: Annotated[Finite | None, Field(description="interval score, mean over kinds of surface [1]")] = None
-    false_ice: Annotated[Finite | None, Field(description="share of grippy samples called slippery [1]")] = None
-    missed_ice: Annotated[Finite | None, Field(description="share of felt slippery samples not called so [1]")] = None
+    log_likelihood: Annotated[
+        Finite, Field(description="of the innovations, more is better [nat/s]")
+    ]
+    nis_ratio: Annotated[
+        Finite, Field(description="normalised innovation squared over its expectation [1]")
+    ]
+    surface_score: Annotated[
+        Finite | None, Field(description="interval score, mean over kinds of surface [1]")
+    ] = None
+    false_ice: Annotated[
+        Finite | None, Field(description="share of grippy samples called slippery [1]")
+    ] = None
+    missed_ice: Annotated[
+        Finite | None, Field(description="share of felt slippery samples not called so [1]")
+    ] = None
 
 
 class SplitScores(Record):
@@ -74,7 +86,8 @@ class Document(Record):
     winner: Annotated[str, Field(description="way that found them: the best held out")] = "colony"
     scores: dict[str, SplitScores]
     candidates: Annotated[
-        dict[str, list[dict[str, list[Finite]]]], Field(description="what every search of a way found")
+        dict[str, list[dict[str, list[Finite]]]],
+        Field(description="what every search of a way found"),
     ] = {}
     provenance: Provenance
 
@@ -99,10 +112,14 @@ def parse(text: str | bytes, where: str) -> Tuned:
         raise explain(error, where) from error
     for way in WAYS:
         if way not in document.scores:
-            raise InputError(f"scores.{way}", "is missing", f"write the {where} with edge-agent tune")
+            raise InputError(
+                f"scores.{way}", "is missing", f"write the {where} with edge-agent tune"
+            )
     known = set(Memberships().to_json())
     if unknown := sorted(set(document.memberships) - known - set(RETIRED)):
-        raise InputError(f"memberships.{unknown[0]}", "is unknown", f"use {', '.join(sorted(known))}")
+        raise InputError(
+            f"memberships.{unknown[0]}", "is unknown", f"use {', '.join(sorted(known))}"
+        )
     return Tuned(Memberships.from_json(document.memberships), document)
 
 
@@ -111,7 +128,9 @@ def load(path: Path | str) -> Tuned:
     try:
         text = Path(path).read_bytes()
     except OSError as error:
-        raise InputError("memberships", f"cannot read {path} ({error.strerror})", "name a tuned file") from error
+        raise InputError(
+            "memberships", f"cannot read {path} ({error.strerror})", "name a tuned file"
+        ) from error
     return parse(text, f"tuned file {path}")
 
 
@@ -127,7 +146,10 @@ def shipped(estimator: str) -> Memberships:
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
     """Return the results of every search behind the shipped file, by search; empty if the file does not have them."""
     document = load(FOLDER / f"{estimator}.json").document
-    return {way: [Memberships.from_json(one) for one in found] for way, found in document.candidates.items()}
+    return {
+        way: [Memberships.from_json(one) for one in found]
+        for way, found in document.candidates.items()
+    }
 
 
 def save(path: Path, document: Document) -> None:

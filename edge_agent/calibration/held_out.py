@@ -71,14 +71,21 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
             continue
         judged.append(held)
     if not judged:
-        raise InputError("log", "no part can be held out to judge the calibration", "give two drives or a longer one")
+        raise InputError(
+            "log",
+            "no part can be held out to judge the calibration",
+            "give two drives or a longer one",
+        )
     before = [judge(vehicle, held) for held in judged]
     best, kept, refused = before, list[str](), list[str]()
     for group, names in GROUPS.items():
         if not any(getattr(whole, name) is not None for name in names):
             continue
         tried = [
-            judge(vehicle.model_copy(update={"calibration": restrict(candidate, [*kept, group])}), held)
+            judge(
+                vehicle.model_copy(update={"calibration": restrict(candidate, [*kept, group])}),
+                held,
+            )
             for candidate, held in zip(candidates, judged, strict=True)
         ]
         if is_worse(tried, best):
@@ -98,8 +105,13 @@ def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
         middle = int(np.searchsorted(t, 0.5 * (t[0] + t[-1])))
         parts = [(t[:middle], signals[:middle]), (t[middle:], signals[middle:])]
         return [([parts[0]], parts[1]), ([parts[1]], parts[0])]
-    chosen = np.unique(np.linspace(0, len(drives) - 1, min(MOST_FOLDS, len(drives))).round().astype(int))
-    return [([drive for k, drive in enumerate(drives) if k != held], drives[held]) for held in chosen.tolist()]
+    chosen = np.unique(
+        np.linspace(0, len(drives) - 1, min(MOST_FOLDS, len(drives))).round().astype(int)
+    )
+    return [
+        ([drive for k, drive in enumerate(drives) if k != held], drives[held])
+        for held in chosen.tolist()
+    ]
 
 
 def restrict(calibration: Calibration, groups: Sequence[str]) -> Calibration:
@@ -118,4 +130,6 @@ def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
 
 def _mean(predictions: Sequence[Prediction]) -> Prediction:
     likelihood = float(np.mean([prediction.log_likelihood for prediction in predictions]))
-    return Prediction(likelihood, float(np.mean([prediction.contradicted for prediction in predictions])))
+    return Prediction(
+        likelihood, float(np.mean([prediction.contradicted for prediction in predictions]))
+    )

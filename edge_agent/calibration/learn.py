@@ -51,7 +51,11 @@ BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "st
                "steer_lag": 0.009}  # fmt: skip
 USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
                 "force_gain": 0.08, "understeer": 0.001, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
-SOUND: Final = {"steer_gain": 1.0, "force_gain": 1.0, "understeer": 0.0005}  # what usual cars have; 0 for the others
+SOUND: Final = {
+    "steer_gain": 1.0,
+    "force_gain": 1.0,
+    "understeer": 0.0005,
+}  # what usual cars have; 0 for the others
 STEERED_M_S: Final = 5.0  # from which on the way taken tells of the steering
 LINEAR: Final = 4.0  # [m/s^2] of v·r up to which understeer goes with it
 LEAST_ANGLE: Final = 0.001  # [rad] by which steering and way differ at least
@@ -76,7 +80,9 @@ def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> 
     calibration = weighed(estimates, vehicle)
     if calibration is None:
         raise InputError(
-            "log", "no drive is excited enough to learn from", "give drives with turns, straights, braking"
+            "log",
+            "no drive is excited enough to learn from",
+            "give drives with turns, straights, braking",
         )
     return calibration
 
@@ -119,7 +125,9 @@ def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tu
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
-    around = ROBUST * float(np.median(np.abs(values - centre))) if len(values) > 2 else 2.0 * FLOOR[kind]
+    around = (
+        ROBUST * float(np.median(np.abs(values - centre))) if len(values) > 2 else 2.0 * FLOOR[kind]
+    )
     spread = max(around, FLOOR[kind])
     std = float(np.hypot(spread / np.sqrt(len(values)), bias))
     share = USUAL[kind] ** 2 / (USUAL[kind] ** 2 + std**2)
@@ -138,7 +146,9 @@ def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     quantities: DriveEstimates = {}
     if axle.known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain
-        drive = replace(drive, r=drive.r - quantities["yaw_rate"])  # else taken for offsets of steering and a_y
+        drive = replace(
+            drive, r=drive.r - quantities["yaw_rate"]
+        )  # else taken for offsets of steering and a_y
     quantities |= _radii(drive, vehicle) | _force_gain(drive, vehicle)
     calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
     if calm.sum() > LEAST_S * RATE_HZ:
@@ -157,7 +167,9 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
     rows &= (drive.v > STEERED_M_S) & (np.abs(across) < LINEAR)
     if rows.sum() < LEAST_S * RATE_HZ:
         return {}
-    table = np.stack([np.ones(int(rows.sum())), drive.wheelbase * (drive.r / fast)[rows], across[rows]], axis=1)
+    table = np.stack(
+        [np.ones(int(rows.sum())), drive.wheelbase * (drive.r / fast)[rows], across[rows]], axis=1
+    )
     angle = drive.delta[rows]
     away = angle - table @ robust(table, angle)
     spread = max(ROBUST * float(np.median(np.abs(away))), LEAST_ANGLE)
@@ -170,16 +182,24 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
     found = covariance @ (weight * (table[near].T @ angle[near]) + centre / usual**2)
     std = np.sqrt(np.diag(covariance))
     told = zip(TRACED, found.tolist(), std.tolist(), strict=True)
-    return {key: value for name, mean, error in told for key, value in ((name, mean), (f"{name}_std", error))}
+    return {
+        key: value
+        for name, mean, error in told
+        for key, value in ((name, mean), (f"{name}_std", error))
+    }
 
 
 def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
     """Return how much faster each wheel turns than the mean of the four, but for yaw and slip."""
-    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
+    calm = (
+        (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
+    )
     calm &= np.isfinite(drive.wheels).all(axis=1) & np.isfinite(drive.r) & np.isfinite(drive.ax)
     if calm.sum() < LEAST_S * RATE_HZ:
         return {}
-    half = 0.5 * np.array([-vehicle.track_front, vehicle.track_front, -vehicle.track_rear, vehicle.track_rear])
+    half = 0.5 * np.array(
+        [-vehicle.track_front, vehicle.track_front, -vehicle.track_rear, vehicle.track_rear]
+    )
     rims = drive.wheels[calm] - half * drive.r[calm, None]
     faster = rims / rims.mean(axis=1, keepdims=True) - _slips(drive, vehicle, calm)
     ratio = np.median(faster, axis=0) - 1.0
@@ -207,10 +227,14 @@ def _slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
     if vehicle.drive_split_front is None:
         return np.zeros((int(rows.sum()), 4))
     offset = np.nanmedian((drive.ax - drive.v_dot)[drive.moving > 0])
-    pull = drive.ax[rows] - offset + DRAG * np.square(drive.v[rows]) / vehicle.mass + ROLLING * GRAVITY
+    pull = (
+        drive.ax[rows] - offset + DRAG * np.square(drive.v[rows]) / vehicle.mass + ROLLING * GRAVITY
+    )
     front = np.where(pull > 0.0, vehicle.drive_split_front, BRAKED_FRONT) * pull
     share = vehicle.cg_to_rear_axle / (vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle)
     turned = ROLLING * GRAVITY
     per_slip = 2.0 * vehicle.longitudinal_stiffness / vehicle.mass
-    axles = np.stack([front - share * turned, pull - front - (1.0 - share) * turned], axis=1) / per_slip
+    axles = (
+        np.stack([front - share * turned, pull - front - (1.0 - share) * turned], axis=1) / per_slip
+    )
     return np.repeat(axles - axles.mean(axis=1, keepdims=True), 2, axis=1)

@@ -65,7 +65,9 @@ def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tupl
     """Return the exit code, and whether a remaining thread would keep the process from ending."""
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    logging.basicConfig(
+        level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
     from edge_agent.cli.common import left_behind
     from schemas.runtime.process import limit_memory
 

@@ -20,9 +20,13 @@ UNITS: Final = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, nargs="+", help="signal logs (Parquet) of one car")
-    parser.add_argument("--vehicle", type=Path, required=True, help="vehicle file to start from (JSON)")
+    parser.add_argument(
+        "--vehicle", type=Path, required=True, help="vehicle file to start from (JSON)"
+    )
     parser.add_argument("--out", type=Path, required=True, help="vehicle file to write (JSON)")
-    parser.add_argument("--trust", action="store_true", help="learn from logs that the signal doctor did not pass")
+    parser.add_argument(
+        "--trust", action="store_true", help="learn from logs that the signal doctor did not pass"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,11 +47,15 @@ def run(args: argparse.Namespace) -> int:
         faults = [] if args.trust else diagnose(log.t, signals, vehicle, log.ground).findings
         if faults:
             names = ", ".join(f"{fault.channel} {fault.kind}" for fault in faults)
-            raise InputError("log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it")
+            raise InputError(
+                "log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it"
+            )
         drives.append((log.t, signals))
     alike = vehicle.model_copy(update={"wheel_radius_front": None, "wheel_radius_rear": None})
     found = learn_validated(drives, alike, predict_drive)
-    text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(indent=1, exclude_none=True)
+    text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
+        indent=1, exclude_none=True
+    )
     writable("out", args.out).write_text(text + "\n", encoding="utf-8")
     print("\n".join(report_lines(found)))
     print(f"{args.out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
@@ -63,7 +71,11 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
     from schemas.signals import Health
 
     t, signals = drive
-    values = bank_of(ESTIMATOR, [vehicle]).advance(t[:, None], corrected(t, signals, vehicle)[:, None]).values[:, 0]
+    values = (
+        bank_of(ESTIMATOR, [vehicle])
+        .advance(t[:, None], corrected(t, signals, vehicle)[:, None])
+        .values[:, 0]
+    )
     contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0
     likelihood = float(values[:, Column.INNOVATION_LOG_LIKELIHOOD].sum())
     return Prediction(likelihood / max(float(t[-1] - t[0]), 1e-9), float(contradicted.mean()))
@@ -74,8 +86,12 @@ def report_lines(found: HeldOut) -> list[str]:
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():
         if isinstance(estimate, tuple):
-            lines.append(f"{name:<14} {estimate[0]:+.5f} ± {estimate[1]:.5f} {UNITS.get(name, '1')}")
-    lines += [f"not written: {group}: it makes a held-out drive no better" for group in found.refused]
+            lines.append(
+                f"{name:<14} {estimate[0]:+.5f} ± {estimate[1]:.5f} {UNITS.get(name, '1')}"
+            )
+    lines += [
+        f"not written: {group}: it makes a held-out drive no better" for group in found.refused
+    ]
     before, after = found.before, found.after
     lines.append(
         f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} -> "

@@ -20,7 +20,9 @@ FLAG_ROWS = 1000  # after which a controller's flag is looked at again
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
+    parser.add_argument(
+        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)"
+    )
     add_json(parser, "what was found")
     parser.add_argument("--out", type=Path, help="HTML page with the evidence and plots")
     parser.add_argument(
@@ -47,20 +49,34 @@ def run(args: argparse.Namespace) -> int:
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     doubts = _doubted(log)
     if args.json:
-        print(json.dumps({"log": str(args.log), **document(diagnosis), "doubted_flags": doubts}, allow_nan=False))
+        print(
+            json.dumps(
+                {"log": str(args.log), **document(diagnosis), "doubted_flags": doubts},
+                allow_nan=False,
+            )
+        )
     else:
-        flags = [f"{'no weight':<10}{name} {reason}: it counts as unknown" for name, reason in doubts.items()]
+        flags = [
+            f"{'no weight':<10}{name} {reason}: it counts as unknown"
+            for name, reason in doubts.items()
+        ]
         print("\n".join([*lines(diagnosis), *flags, f"{args.log}: {advice(diagnosis)}"]))
     if args.out is not None:
-        writable("out", args.out).write_text(page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
+        writable("out", args.out).write_text(
+            page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
+        )
     mended = corrections(diagnosis)
     if args.fix is not None and mended:
         profile, corrected, left = fixed(mended, profile_of(args.log), vehicle)
         writable("fix", args.fix).write_text(profile.text(), encoding="utf-8")
         if corrected != vehicle:
-            writable("vehicle", file).write_text(corrected.model_dump_json(indent=1, exclude_none=True) + "\n")
+            writable("vehicle", file).write_text(
+                corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
+            )
         for finding in left:
-            _tell(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
+            _tell(
+                f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise"
+            )
         _tell(f"{args.fix}: the corrected profile; import the recording again with it")
     return 0 if diagnosis.passed else NOT_PASSED
 

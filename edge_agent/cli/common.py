@@ -36,7 +36,9 @@ def checked_name(name: str) -> str:
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(
-            "name", f"{name!r} is no vehicle name", "give --name, 3 to 63 of a-z, 0-9 and -, a letter first"
+            "name",
+            f"{name!r} is no vehicle name",
+            "give --name, 3 to 63 of a-z, 0-9 and -, a letter first",
         )
     return name
 
@@ -57,10 +59,14 @@ def publisher_of(
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
 
-    for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
+    for (
+        name
+    ) in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
         configuration(config.zenoh, name)
     spool = writable("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
-    outbox = Outbox(spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
+    outbox = Outbox(
+        spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s
+    )
     publisher = Publisher(names, outbox, config, estimator, on_open=on_open)
     publisher.start()
     return publisher
@@ -75,8 +81,15 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
     from edge_agent.inputs.doctor.report import advice, lines
 
     if not diagnosis.passed:
-        print("\n".join(line for line in lines(diagnosis) if not line.startswith("sound")), file=sys.stderr)
-        raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
+        print(
+            "\n".join(line for line in lines(diagnosis) if not line.startswith("sound")),
+            file=sys.stderr,
+        )
+        raise InputError(
+            "log",
+            "is not fit to be published",
+            f"{advice(diagnosis)}; --trust publishes it as it is",
+        )
 
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
@@ -85,10 +98,15 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
     for fault in found:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
-        print("warning: the estimates below mean nothing until that is mended; run edge-agent check", file=sys.stderr)
+        print(
+            "warning: the estimates below mean nothing until that is mended; run edge-agent check",
+            file=sys.stderr,
+        )
     notes = []
     if found:
-        notes.append("note: the signal doctor did not pass this log; replay --publish would refuse it")
+        notes.append(
+            "note: the signal doctor did not pass this log; replay --publish would refuse it"
+        )
     elif not diagnosis.passed:
         channels = ", ".join(diagnosis.unknown)
         notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
@@ -119,7 +137,9 @@ def stop_on_signal() -> Iterator[threading.Event]:
 left_behind = threading.Event()
 
 
-def close_publisher(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
+def close_publisher(
+    publisher: Publisher, progress: Progress, drain_s: float, **more: float
+) -> None:
     """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on stdout.
 
     Unsettled records stay in the outbox for the next start.

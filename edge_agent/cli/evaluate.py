@@ -23,18 +23,26 @@ PAPERS: Final = ("000", "001", "002", "003", "004")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
-APPROACHES_S: Final = 300.0  # 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
+APPROACHES_S: Final = (
+    300.0  # 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
+)
 ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--out", type=Path, required=True, help="folder for figures.json, report.md and the plots")
     parser.add_argument(
-        "--quick", action="store_true", help="three scenarios, two estimators, two seeds, to check that it runs"
+        "--out", type=Path, required=True, help="folder for figures.json, report.md and the plots"
     )
-    parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="three scenarios, two estimators, two seeds, to check that it runs",
+    )
+    parser.add_argument(
+        "--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})"
+    )
     parser.add_argument(
         "--only",
         choices=ONLY,
@@ -50,12 +58,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one paper under its own conditions: its figures and tables next to ours, as index.html and report.md; "
         "ends with 1 if a matched number misses the printed one",
     )
-    parser.add_argument("--logs", type=Path, help="folder of LOG.parquet with LOG.json (--only real)")
     parser.add_argument(
-        "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
+        "--logs", type=Path, help="folder of LOG.parquet with LOG.json (--only real)"
+    )
+    parser.add_argument(
+        "--plots",
+        choices=("png", "svg", "pdf"),
+        default="png",
+        help="their format (default %(default)s)",
     )
     parser.add_argument("--recorded", type=Path, help="CAN log to decode as well (--only inputs)")
-    parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
+    parser.add_argument(
+        "--no-plots", action="store_true", help="figures and table only; needs no matplotlib"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,12 +90,20 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
     if args.paper and args.only:
         raise InputError("paper", f"not with --only {args.only}", "leave one of them out")
-    if not args.no_plots and args.only in (None, "detection") and importlib.util.find_spec("matplotlib") is None:
-        raise InputError("plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots")
+    if (
+        not args.no_plots
+        and args.only in (None, "detection")
+        and importlib.util.find_spec("matplotlib") is None
+    ):
+        raise InputError(
+            "plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots"
+        )
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
+        raise InputError(
+            "out", f"cannot make {args.out} ({error.strerror})", "name another folder"
+        ) from error
     if args.paper:
         return _paper(args, count)
     if args.only == "searches":
@@ -116,7 +139,9 @@ def _paper(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.papers.reproductions import write_paper
     from edge_agent.lab.seeds import FIGURES
 
-    done = write_paper(args.paper, range(FIGURES, FIGURES + count), args.out, plots=not args.no_plots)
+    done = write_paper(
+        args.paper, range(FIGURES, FIGURES + count), args.out, plots=not args.no_plots
+    )
     print(f"{markdown_tables(done.tables)}\n\n{summary(done)}")
     return 1 if done.missed else 0
 
@@ -127,7 +152,9 @@ def _searches(args: argparse.Namespace, count: int) -> int:
     from schemas.runtime.figures import write
 
     seeds = range(FIGURES, FIGURES + count)
-    figures = compare_searches(seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True))
+    figures = compare_searches(
+        seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True)
+    )
     write(args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures)
     text = comparison_markdown(figures)
     (args.out / "report.md").write_text(text, encoding="utf-8")
@@ -141,7 +168,12 @@ def _inputs(args: argparse.Namespace) -> int:
 
     with tempfile.TemporaryDirectory(dir=args.out) as scratch:
         figures = _measured(Path(scratch), args)
-    write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
+    write(
+        args.out / "figures.json",
+        "edge-agent evaluate --only inputs",
+        [FIGURES, FIGURES + 1],
+        figures,
+    )
     text = f"# Inputs\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
@@ -153,7 +185,11 @@ def _real(args: argparse.Namespace) -> int:
     from schemas.runtime.figures import markdown, write
 
     if args.logs is None:
-        raise InputError("logs", "is missing", "name the folder of logs, each next to its vehicle file: --logs DIR")
+        raise InputError(
+            "logs",
+            "is missing",
+            "name the folder of logs, each next to its vehicle file: --logs DIR",
+        )
     found = judge_folder(args.logs, lambda line: print(line, file=sys.stderr, flush=True))
     figures = summarise(found)
     write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
@@ -172,8 +208,12 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     rows: list[Callable[[], list[Figure]]] = [
         lambda: cost.figures(FIGURES, 2e3 if quick else 20e3),
         lambda: latency.figures(FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES),
-        lambda: approaches.figures(seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24),
-        lambda: entry.figures(seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16),
+        lambda: approaches.figures(
+            seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24
+        ),
+        lambda: entry.figures(
+            seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16
+        ),
     ]
     figures: list[Figure] = []
     for row in rows:
@@ -181,7 +221,9 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
         figures += found
         print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
     part = " --quick" if quick else f" --seeds {count}" if count < LEAST_SEEDS else ""
-    write(args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures)
+    write(
+        args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures
+    )
     text = f"# What lies ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
@@ -198,12 +240,19 @@ def _detection(args: argparse.Namespace, count: int) -> int:
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
     results = campaign(
         seeds,
-        lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+        lambda line: print(
+            f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True
+        ),
         quick=args.quick,
     )
     figures = detection_figures(results)
     part = " --quick" if args.quick else ""
-    write(args.out / "figures.json", f"edge-agent evaluate --only detection{part}", list(seeds), figures)
+    write(
+        args.out / "figures.json",
+        f"edge-agent evaluate --only detection{part}",
+        list(seeds),
+        figures,
+    )
     text = detection_report(figures)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     if not args.no_plots:
@@ -222,10 +271,14 @@ def _measured(folder: Path, args: argparse.Namespace) -> list[Figure]:
 
     quick = args.quick
     rows: list[Callable[[], list[Figure]]] = [
-        lambda: imports.figures(folder, FIGURES, args.recorded, QUICK_S if quick else imports.DRIVE_S),
+        lambda: imports.figures(
+            folder, FIGURES, args.recorded, QUICK_S if quick else imports.DRIVE_S
+        ),
         lambda: planted.figures(1 if quick else CARS, FIGURES),
         lambda: calibrated.figures(1 if quick else LEARNED_CARS, FIGURES),
-        lambda: calibrated.widths(1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S),
+        lambda: calibrated.widths(
+            1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S
+        ),
         lambda: judge.figures(folder, 1.0 if quick else LIVE_S, 1 if quick else judge.KILLS),
     ]
     figures: list[Figure] = []

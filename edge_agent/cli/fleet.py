@@ -17,21 +17,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
     parser.add_argument(
-        "--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7"
+        "--scenario",
+        default="demo",
+        help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7",
     )
     parser.add_argument(
-        "--rough", type=float, default=0.0, help="share of them with the sensor errors of real cars (default 0)"
+        "--rough",
+        type=float,
+        default=0.0,
+        help="share of them with the sensor errors of real cars (default 0)",
     )
     parser.add_argument(
-        "--winter", type=float, default=0.0, help="share of them with winter tyres and controllers (default 0)"
+        "--winter",
+        type=float,
+        default=0.0,
+        help="share of them with winter tyres and controllers (default 0)",
     )
-    parser.add_argument("--warned", type=float, default=0.0, help="share of them that receive the map and are warned")
+    parser.add_argument(
+        "--warned",
+        type=float,
+        default=0.0,
+        help="share of them that receive the map and are warned",
+    )
     add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)")
-    parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
+    parser.add_argument(
+        "--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=100.0, help="samples per second (default 100)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
-    parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped")
+    parser.add_argument(
+        "--duration", type=float, default=float("inf"), help="[s]; else until stopped"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     config = load(args.config, AgentConfig)
     if args.truth:
         writable("truth", args.truth)
-    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough, winter=args.winter)
+    fleet = SimulatedFleet(
+        args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough, winter=args.winter
+    )
     warm_up_simulation(args.scenario, args.rate, args.rough)
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth else None
     source = blocks(fleet, args.rate, recorder)

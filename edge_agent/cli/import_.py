@@ -19,14 +19,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help="CSV, Parquet, BLF, ASC, candump, TRC, MF4, VBO, ROS bag, MCAP, NMEA, gpsd JSON",
     )
-    parser.add_argument("--profile", help="profile that maps signals to channels: a file, or a shipped one (--list)")
+    parser.add_argument(
+        "--profile", help="profile that maps signals to channels: a file, or a shipped one (--list)"
+    )
     parser.add_argument("--list", action="store_true", help="list the shipped profiles and exit")
     add_json(parser, "the list")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio")
-    parser.add_argument("--draft", type=Path, help="where to write a drafted profile (default: next to the log)")
     parser.add_argument(
-        "--clock", action="append", default=[], metavar="FILE=SECONDS", help="seconds to add to the clock of a source"
+        "--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio"
+    )
+    parser.add_argument(
+        "--draft", type=Path, help="where to write a drafted profile (default: next to the log)"
+    )
+    parser.add_argument(
+        "--clock",
+        action="append",
+        default=[],
+        metavar="FILE=SECONDS",
+        help="seconds to add to the clock of a source",
     )
     parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
 
@@ -46,7 +56,9 @@ def run(args: argparse.Namespace) -> int:
         print_list({name: load_profile(name)[0].about for name in shipped()}, as_json=args.json)
         return 0
     if not args.source or args.out is None:
-        raise InputError("source", "sources and --out are needed", "name recordings, and the log to write")
+        raise InputError(
+            "source", "sources and --out are needed", "name recordings, and the log to write"
+        )
     if any(args.out.resolve() == source.resolve() for source in args.source):
         raise InputError("out", f"would replace the recording {args.out}", "name another file")
     out = writable("out", args.out)
@@ -55,11 +67,19 @@ def run(args: argparse.Namespace) -> int:
     database = database_of(profile, folder, args.dbc)
     recordings = [read_source(path, profile, database) for path in args.source]
     if profile is None:
-        units = {name: series.unit for one in reversed(recordings) for name, series in one.signals.items()}
+        units = {
+            name: series.unit
+            for one in reversed(recordings)
+            for name, series in one.signals.items()
+        }
         profile = draft(units, args.out.stem)
         if not profile.channels:
             seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
-            raise InputError("source", f"no signal has a known name; seen: {seen}", "write a profile that names them")
+            raise InputError(
+                "source",
+                f"no signal has a known name; seen: {seen}",
+                "write a profile that names them",
+            )
         target = writable("draft", args.draft or out.with_suffix(".profile.json"))
         target.write_text(profile.text(), encoding="utf-8")
         print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")
@@ -76,9 +96,15 @@ def run(args: argparse.Namespace) -> int:
     write_log(out, merged, profile, [source.name for source in args.source])
     for note in merged.notes:
         print(f"note: {note}")
-    lacking = [name for name in ("ax", "ay", "yaw_rate", "omega_fl", "delta_fl") if name not in merged.columns]
+    lacking = [
+        name
+        for name in ("ax", "ay", "yaw_rate", "omega_fl", "delta_fl")
+        if name not in merged.columns
+    ]
     if lacking:
-        print(f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the profile")
+        print(
+            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the profile"
+        )
     print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
     return 0
 
@@ -92,5 +118,7 @@ def _shifts(given: list[str]) -> dict[str, float]:
         try:
             shifts[Path(name).name] = float(seconds)
         except ValueError as error:
-            raise InputError("clock", f"{text!r} is no shift", "write it like drive.nmea=-0.4") from error
+            raise InputError(
+                "clock", f"{text!r} is no shift", "write it like drive.nmea=-0.4"
+            ) from error
     return shifts

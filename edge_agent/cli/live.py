@@ -31,12 +31,16 @@ from schemas.vehicle import Vehicle
 from schemas.wire.ahead import GripWarning
 
 
-def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None) -> None:
+def _warm_up(
+    estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None
+) -> None:
     """Load or compile the kernels before the clock runs, on a temporary vehicle."""
     t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
     with progress_messages.show_status("starting the estimator"):
-        Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(Block(t, time, signals))
+        Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(
+            Block(t, time, signals)
+        )
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
@@ -78,7 +82,11 @@ def drive_live(
             config.metrics_host,
             config.metrics_port,
             lambda: [metric for publisher in running for metric in metrics(publisher, progress)],
-            lambda: [*health_problems(running[0], progress), *troubled()] if running else ["the agent is starting"],
+            lambda: (
+                [*health_problems(running[0], progress), *troubled()]
+                if running
+                else ["the agent is starting"]
+            ),
         ) as address,
     ):
         if address:
@@ -103,11 +111,15 @@ def drive_live(
         who = names[0] if len(names) == 1 else f"{len(names)} vehicles"
         log_line(
             LogLine(
-                f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s", event="ready", vehicles=len(names)
+                f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s",
+                event="ready",
+                vehicles=len(names),
             )
         )
         watch = SignalWatch()
-        reporter = ReasonReporter(lambda: reasons(watch, publisher, config.zenoh.connect, troubled()), log_line)
+        reporter = ReasonReporter(
+            lambda: reasons(watch, publisher, config.zenoh.connect, troubled()), log_line
+        )
         report = partial(print_status, publisher=publisher, log_line=log_line)
         if lookout is not None:
             lookout.start()
@@ -127,14 +139,18 @@ def drive_live(
             lookout.close()
             heard = lookout.counts.values()
         at_end()
-        close_publisher(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard)
+        close_publisher(
+            publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard
+        )
     return 0
 
 
 def _show(lookout: Lookout, pipeline: Pipeline) -> None:
     """Pass the vehicles' positions and their filters' beliefs to a lookout."""
     if pipeline.seen is not None:
-        lookout.see([Pose(*row) for row in zip(*(column.tolist() for column in pipeline.seen), strict=True)])
+        lookout.see(
+            [Pose(*row) for row in zip(*(column.tolist() for column in pipeline.seen), strict=True)]
+        )
         lookout.believe(pipeline.places, pipeline.beliefs())
 
 
@@ -144,7 +160,19 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     say = line_logger(config.log, sys.stdout)
 
     def tell(vehicle: str, warning: GripWarning) -> None:
-        values = {name: None if value == math.inf else value for name, value in vars(warning).items() if name != "time"}
-        say(LogLine(f"{vehicle}: {warning.line()}", event="warning", vehicle=vehicle, at=warning.time, **values))
+        values = {
+            name: None if value == math.inf else value
+            for name, value in vars(warning).items()
+            if name != "time"
+        }
+        say(
+            LogLine(
+                f"{vehicle}: {warning.line()}",
+                event="warning",
+                vehicle=vehicle,
+                at=warning.time,
+                **values,
+            )
+        )
 
     return tell

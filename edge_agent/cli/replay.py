@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 NOW = "now"
 REPORTS = (".html", ".png", ".svg", ".pdf")
 LOCAL, SPARK = "local", "spark"
-OLD_NS = 29 * 86_400 * NS  # a service takes nothing of more than thirty days ago, unless it is told otherwise
+OLD_NS = (
+    29 * 86_400 * NS
+)  # a service takes nothing of more than thirty days ago, unless it is told otherwise
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
 PROGRESS_S = 1.0
 
@@ -33,7 +35,9 @@ PROGRESS_S = 1.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
+    parser.add_argument(
+        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)"
+    )
     add_estimator(parser)
     parser.add_argument(
         "--out",
@@ -43,12 +47,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "of several logs, a folder of estimates",
     )
     parser.add_argument(
-        "--compare", metavar="NAME,NAME", help="more estimators on the same drive, side by side in a report"
+        "--compare",
+        metavar="NAME,NAME",
+        help="more estimators on the same drive, side by side in a report",
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
-    parser.add_argument("--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)")
-    parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
-    parser.add_argument("--trust", action="store_true", help="publish although the signal doctor did not pass the log")
+    parser.add_argument(
+        "--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)"
+    )
+    parser.add_argument(
+        "--publish",
+        action="store_true",
+        help="send observations and states, wait for acknowledgement",
+    )
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="publish although the signal doctor did not pass the log",
+    )
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
     parser.add_argument(
@@ -77,19 +93,25 @@ def run(args: argparse.Namespace) -> int:
     if several:
         if args.publish:
             raise InputError(
-                "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
+                "publish",
+                f"{len(args.log)} logs into a folder",
+                "publish one log, to one file, at a time",
             )
         tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
         if args.engine == SPARK:
             return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
         return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
     if args.compare is not None and args.out.suffix not in REPORTS:
-        raise InputError("compare", f"is of no use for {args.out.name}", f"write {', '.join(REPORTS)}")
+        raise InputError(
+            "compare", f"is of no use for {args.out.name}", f"write {', '.join(REPORTS)}"
+        )
     path = args.log[0]
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
     if args.out.suffix in REPORTS and args.publish:
-        raise InputError("publish", "does not go together with a report", "replay twice: once with .parquet")
+        raise InputError(
+            "publish", "does not go together with a report", "replay twice: once with .parquet"
+        )
     bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
     log = read_log(path)
     start_ns = _start(args.start, log)
@@ -112,7 +134,9 @@ def run(args: argparse.Namespace) -> int:
             file.write(block.t, estimates)
 
         if args.publish:
-            code = _published(args.name or vehicle.name, log, start_ns, bank, estimator, config, keep)
+            code = _published(
+                args.name or vehicle.name, log, start_ns, bank, estimator, config, keep
+            )
         else:
             for block in log.blocks(start_ns):
                 keep(block, bank.advance(block.t, block.signals))
@@ -124,7 +148,9 @@ def _more(names: str | None) -> list[str]:
     return [] if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
-def _write_report(args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]) -> list[str]:
+def _write_report(
+    args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]
+) -> list[str]:
     """Estimate with each estimator, write the report, and return notes."""
     import pyarrow as pa
 
@@ -149,9 +175,17 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
     if engine not in (LOCAL, SPARK):
         raise InputError("engine", f"{engine!r} is none", f"use {LOCAL} or {SPARK}")
     if engine == SPARK and not several:
-        raise InputError("engine", "one log into one file needs no cluster", "give several logs, or an existing folder")
+        raise InputError(
+            "engine",
+            "one log into one file needs no cluster",
+            "give several logs, or an existing folder",
+        )
     if engine == SPARK and jobs != 1:
-        raise InputError("jobs", f"{jobs} says nothing to Spark", "its master says how many run at once, e.g. local[4]")
+        raise InputError(
+            "jobs",
+            f"{jobs} says nothing to Spark",
+            "its master says how many run at once, e.g. local[4]",
+        )
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
@@ -165,7 +199,11 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
         spent = time.monotonic() - began
         if spent - last >= PROGRESS_S or done == count:
             last, rate = spent, samples / max(spent, 1e-9)
-            print(f"{done} of {count} logs, {samples} samples, {rate:.0f}/s", file=sys.stderr, flush=True)
+            print(
+                f"{done} of {count} logs, {samples} samples, {rate:.0f}/s",
+                file=sys.stderr,
+                flush=True,
+            )
     return 2 if bad else 0
 
 
@@ -197,7 +235,11 @@ def _published(
         close_publisher(publisher, progress, DRAIN_S)
     if refused := sum(publisher.counts.rejected.values()):
         old = time.time_ns() - start_ns > OLD_NS
-        fix = "it is older than a month: --start now drives it today" if old else "the reasons stand above"
+        fix = (
+            "it is older than a month: --start now drives it today"
+            if old
+            else "the reasons stand above"
+        )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
     return 1 if refused or publisher.unsettled() else 0
 

@@ -30,24 +30,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
         "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
     )  # fmt: skip
-    parser.add_argument("--profile", help="profile that maps live signals to channels: a file, or a shipped one")
+    parser.add_argument(
+        "--profile", help="profile that maps live signals to channels: a file, or a shipped one"
+    )
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
     parser.add_argument(
-        "--trust", action="store_true", help="publish although the signal doctor did not pass the signals"
+        "--trust",
+        action="store_true",
+        help="publish although the signal doctor did not pass the signals",
     )
-    parser.add_argument("--ahead", action="store_true", help="receive the map and warn of slippery road ahead")
-    parser.add_argument("--autoware", metavar="ENDPOINT", help="with --ahead: router of a planner for limits")
-    parser.add_argument("--autoware-hash", metavar="RIHS01_…", help="hash of VelocityLimit in that planner's version")
+    parser.add_argument(
+        "--ahead", action="store_true", help="receive the map and warn of slippery road ahead"
+    )
+    parser.add_argument(
+        "--autoware", metavar="ENDPOINT", help="with --ahead: router of a planner for limits"
+    )
+    parser.add_argument(
+        "--autoware-hash",
+        metavar="RIHS01_…",
+        help="hash of VelocityLimit in that planner's version",
+    )
     parser.add_argument("--route", type=Path, help="route for --ahead (GPX or GeoJSON)")
-    parser.add_argument("--vss", action="store_true", help="report the friction as VSS signals, one line of JSON each")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); required except for simulated")
+    parser.add_argument(
+        "--vss",
+        action="store_true",
+        help="report the friction as VSS signals, one line of JSON each",
+    )
+    parser.add_argument(
+        "--vehicle", type=Path, help="vehicle file (JSON); required except for simulated"
+    )
     add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--scenario", default="demo", help="scenario of the simulated vehicle (default demo)")
-    parser.add_argument("--rate", type=float, default=100.0, help="samples per second of the simulation")
+    parser.add_argument(
+        "--scenario", default="demo", help="scenario of the simulated vehicle (default demo)"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=100.0, help="samples per second of the simulation"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the simulation")
-    parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped or the log ends")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        default=float("inf"),
+        help="[s]; else until stopped or the log ends",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,17 +97,28 @@ def run(args: argparse.Namespace) -> int:
     if all(is_live(source) for source in sources):
         return _live(args, sources, config)
     if len(sources) > 1:
-        raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
+        raise InputError(
+            "source", f"{', '.join(sources)} do not go together", "name live ones, or one log"
+        )
     kind, _, address = sources[0].partition(":")
     others = plugins.entry_points_of(plugins.SOURCES)
     if kind in others:
         vehicle = load_vehicle(_vehicle_file(args))
-        name, blocks = args.name or vehicle.name, plugins.load_entry_point(plugins.SOURCES, kind)(address)
+        name, blocks = (
+            args.name or vehicle.name,
+            plugins.load_entry_point(plugins.SOURCES, kind)(address),
+        )
     elif kind != SIMULATED and not Path(sources[0]).exists():
         known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
-        raise InputError("source", f"{sources[0]!r} is no file, and {kind!r} no kind of source", f"kinds are {known}")
+        raise InputError(
+            "source",
+            f"{sources[0]!r} is no file, and {kind!r} no kind of source",
+            f"kinds are {known}",
+        )
     else:
-        vehicle, name, blocks = _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))
+        vehicle, name, blocks = (
+            _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))
+        )
     return drive_live(
         [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
         lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
@@ -110,7 +148,9 @@ def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFricti
     from edge_agent.publish.vss import RoadFrictionOutput
     from schemas.runtime.process import print_line
 
-    return RoadFrictionOutput([name], lambda line: print_line(line, sys.stdout), config.state_rate_hz)
+    return RoadFrictionOutput(
+        [name], lambda line: print_line(line, sys.stdout), config.state_rate_hz
+    )
 
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:

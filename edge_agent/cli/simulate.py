@@ -16,16 +16,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
     parser.add_argument("--list", action="store_true", help="list the manoeuvres and exit")
     add_json(parser, "the list")
-    parser.add_argument("--mu", type=float, help="peak friction of the road; else the manoeuvre's own")
+    parser.add_argument(
+        "--mu", type=float, help="peak friction of the road; else the manoeuvre's own"
+    )
     parser.add_argument("--speed", type=float, help="[m/s]; else the manoeuvre's own")
     parser.add_argument("--duration", type=float, help="[s]; else the manoeuvre's own")
-    parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
-    parser.add_argument("--sensors", choices=SENSORS, default="mems", help="quality (default mems); rough: real cars'")
-    parser.add_argument("--no-torque", action="store_true", help="record no wheel torque, like most cars")
-    parser.add_argument("--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)")
     parser.add_argument(
-        "--slope", type=float, default=0.0, help="additional slope, metres up per metre ahead (default 0)"
+        "--rate", type=float, default=100.0, help="samples per second (default 100)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
+    parser.add_argument(
+        "--sensors",
+        choices=SENSORS,
+        default="mems",
+        help="quality (default mems); rough: real cars'",
+    )
+    parser.add_argument(
+        "--no-torque", action="store_true", help="record no wheel torque, like most cars"
+    )
+    parser.add_argument(
+        "--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)"
+    )
+    parser.add_argument(
+        "--slope",
+        type=float,
+        default=0.0,
+        help="additional slope, metres up per metre ahead (default 0)",
     )
     parser.add_argument("--out", type=Path, help="signal log to write (.parquet, .csv)")
     parser.add_argument("--vehicle-out", type=Path, help="vehicle file to write (JSON)")
@@ -38,7 +54,9 @@ def run(args: argparse.Namespace) -> int:
     from schemas.errors import InputError
 
     if args.list:
-        print_list({name: manoeuvre.about for name, manoeuvre in MANOEUVRES.items()}, as_json=args.json)
+        print_list(
+            {name: manoeuvre.about for name, manoeuvre in MANOEUVRES.items()}, as_json=args.json
+        )
         return 0
     if args.manoeuvre is None:
         raise InputError("manoeuvre", "is not given", "name one (--list shows them)")

@@ -20,7 +20,15 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.backfill import vehicle_file_of
-from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
+from edge_agent.app.tuned_memberships import (
+    WAYS,
+    Budget,
+    Document,
+    Provenance,
+    Score,
+    SplitScores,
+    save,
+)
 from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.signal_log import read_log
@@ -51,8 +59,14 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `edge-agent tune`."""
-    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own instead of simulated drives")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file of the logs (default: LOG.json beside LOG.parquet)")
+    parser.add_argument(
+        "log", type=Path, nargs="*", help="signal logs of your own instead of simulated drives"
+    )
+    parser.add_argument(
+        "--vehicle",
+        type=Path,
+        help="vehicle file of the logs (default: LOG.json beside LOG.parquet)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of both searches (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
     parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
@@ -62,19 +76,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="interval score of friction (needs the truth: simulated drives' default), log-likelihood of the"
         " innovations, or that with a price on wrong calibration (default with logs: predictive)",
     )
-    parser.add_argument("--repeats", type=int, default=1, help="number of searches of each kind (default %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=1,
+        help="number of searches of each kind (default %(default)s)",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s"
+    )
     parser.add_argument(
         "--study", type=Path, metavar="DIR",
         help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="a few ants on short drives, to check that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few ants on short drives, to check that it runs"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Search, compare, print, write; InputError for options out of range."""
     ants = args.ants if args.ants is not None else QUICK_ANTS if args.quick else ANTS
-    iterations = args.iterations if args.iterations is not None else QUICK_ITERATIONS if args.quick else ITERATIONS
+    iterations = (
+        args.iterations
+        if args.iterations is not None
+        else QUICK_ITERATIONS
+        if args.quick
+        else ITERATIONS
+    )
     for name, value, least in (
         ("--ants", ants, 1),
         ("--iterations", iterations, 1),
@@ -89,14 +118,28 @@ def run(args: argparse.Namespace) -> int:
 
     chosen = args.objective or ("predictive" if args.log else "interval")
     train, held_out = _drives(args, chosen, duration)
-    print_line(f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, {duration:g} s each")
+    print_line(
+        f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, {duration:g} s each"
+    )
     objective = objective_on(train, ESTIMATOR, chosen)
-    objective(Memberships().to_vector())  # loads the compiled filter: the first iteration's time tells the others'
+    objective(
+        Memberships().to_vector()
+    )  # loads the compiled filter: the first iteration's time tells the others'
     results = [_search(objective, ants, iterations, args.seed + k) for k in range(args.repeats)]
-    sets = {way: [Memberships.from_vector(found[way].best) for found in results] for way in WAYS[1:]}
-    best = {way: max((found[way] for found in results), key=lambda result: result.value).best for way in WAYS[1:]}
-    found = {"default": Memberships()} | {way: Memberships.from_vector(vector) for way, vector in best.items()}
-    scores = {way: SplitScores(train=_score(found[way], train), held_out=_score(found[way], held_out)) for way in WAYS}
+    sets = {
+        way: [Memberships.from_vector(found[way].best) for found in results] for way in WAYS[1:]
+    }
+    best = {
+        way: max((found[way] for found in results), key=lambda result: result.value).best
+        for way in WAYS[1:]
+    }
+    found = {"default": Memberships()} | {
+        way: Memberships.from_vector(vector) for way, vector in best.items()
+    }
+    scores = {
+        way: SplitScores(train=_score(found[way], train), held_out=_score(found[way], held_out))
+        for way in WAYS
+    }
     print(table(scores))
     winner = max(WAYS, key=lambda way: _worth(scores[way].held_out, chosen))
     evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
@@ -114,12 +157,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tuple[TuningSet, TuningSet]:
+def _drives(
+    args: argparse.Namespace, objective: str, duration_s: float
+) -> tuple[TuningSet, TuningSet]:
     """Return the drives to search on and to judge by: simulated ones, or parts of the given logs."""
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
     if objective == "interval":
-        raise InputError("objective", "interval wants the true friction, which no log tells", "use predictive")
+        raise InputError(
+            "objective", "interval wants the true friction, which no log tells", "use predictive"
+        )
     logs = []
     for path in args.log:
         vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
@@ -135,7 +182,11 @@ def _worth(score: Score, objective: str) -> float:
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}
     scores = TuningScores(**(unknown | known))
-    return -detection_cost(scores) if score.interval_score is not None else OBJECTIVES[objective](scores)
+    return (
+        -detection_cost(scores)
+        if score.interval_score is not None
+        else OBJECTIVES[objective](scores)
+    )
 
 
 def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
@@ -147,7 +198,9 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     try:
         args.study.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError("study", f"cannot make {args.study} ({error.strerror})", "name another folder") from error
+        raise InputError(
+            "study", f"cannot make {args.study} ({error.strerror})", "name another folder"
+        ) from error
     seeds = range(args.seed, args.seed + (QUICK_REPEATS if args.quick else REPEATS))
     done = study_report.run(
         ants=ants, iterations=iterations, positions=POSITIONS, seeds=seeds,
@@ -162,8 +215,12 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     study_report.draw(listed, ants, args.study / "convergence.png")
     names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
     scores = {way: SplitScores(**study_report.scores(done, name)) for way, name in names.items()}
-    evaluations = {way: sum(result.evaluations for result in results) for way, results in done.found.items()}
-    command = f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
+    evaluations = {
+        way: sum(result.evaluations for result in results) for way, results in done.found.items()
+    }
+    command = (
+        f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
+    )
     document = _document(
         done.best("colony"), "innovation", scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
         command + " --quick" * args.quick, args.seed, "paper-aco-fckf",
@@ -177,7 +234,9 @@ def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict
     """Run random search and ant colony from the same start, with the same positions and budget."""
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
-    for stream, (way, search) in enumerate((("random", random_search.optimise), ("colony", colony.optimise))):
+    for stream, (way, search) in enumerate(
+        (("random", random_search.optimise), ("colony", colony.optimise))
+    ):
         results[way] = search(
             problem,
             ants=ants,
@@ -193,7 +252,9 @@ def print_line(line: str) -> None:
     print(line, flush=True)
 
 
-def reporter(way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]) -> Progress:
+def reporter(
+    way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]
+) -> Progress:
     """Return a function that prints one line per iteration: best, mean, elapsed and expected remaining time by `clock`
     [s]."""
     began = clock()
@@ -211,7 +272,9 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
 
 def _score(memberships: Memberships, drives: TuningSet) -> Score:
     found = asdict(scores_of(memberships, drives, ESTIMATOR))
-    return Score.model_validate({name: None if math.isnan(value) else value for name, value in found.items()})
+    return Score.model_validate(
+        {name: None if math.isnan(value) else value for name, value in found.items()}
+    )
 
 
 def _document(
@@ -238,7 +301,9 @@ def _number(value: float | None, digits: int) -> str:
 
 def table(scores: dict[str, SplitScores]) -> str:
     """Return the comparison as plain text, one row per search and set of drives."""
-    lines = [f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"]
+    lines = [
+        f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"
+    ]
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):
             lines.append(

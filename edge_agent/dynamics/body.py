@@ -30,11 +30,17 @@ def accelerations(
         total_x += ahead
         total_y += left
         moment += x * left - y * ahead
-    return total_x / row[Parameter.MASS], total_y / row[Parameter.MASS], moment / row[Parameter.YAW_INERTIA]
+    return (
+        total_x / row[Parameter.MASS],
+        total_y / row[Parameter.MASS],
+        moment / row[Parameter.YAW_INERTIA],
+    )
 
 
 @compiled
-def axle_lateral_forces(row: FloatArray, ay: float, yaw_acceleration: float, moment_x: float) -> tuple[float, float]:
+def axle_lateral_forces(
+    row: FloatArray, ay: float, yaw_acceleration: float, moment_x: float
+) -> tuple[float, float]:
     """(front, rear) lateral force [N] of the axles in body axes, from what an accelerometer and a gyroscope measure.
 
     moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
@@ -47,7 +53,9 @@ def axle_lateral_forces(row: FloatArray, ay: float, yaw_acceleration: float, mom
 
 
 @compiled
-def advance_velocity(vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float) -> tuple[float, float]:
+def advance_velocity(
+    vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
+) -> tuple[float, float]:
     """(v_x, v_y) [m/s] after `step` [s] of constant a_x, a_y, r: the exact solution, a rotation by -r*step.
 
     Heun's rule is its second-order part; Euler's rule costs a factor of four in v_y (errata).

@@ -23,12 +23,18 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
     """(4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel speed (4,) [rad/s]."""
     out = np.empty((4, 3))
     for wheel in range(4):
-        out[wheel, 0], out[wheel, 1], out[wheel, 2] = math.cos(delta[wheel]), math.sin(delta[wheel]), omega[wheel]
+        out[wheel, 0], out[wheel, 1], out[wheel, 2] = (
+            math.cos(delta[wheel]),
+            math.sin(delta[wheel]),
+            omega[wheel],
+        )
     return out
 
 
 @inlined
-def _slips(radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float) -> tuple[float, float]:
+def _slips(
+    radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
+) -> tuple[float, float]:
     """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta), sin(delta)."""
     along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
     slip_x, slip_y = slips(radius, omega, along, across)
@@ -67,7 +73,14 @@ def tyre_forces(
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
-        slip = _slips(row[Parameter.RADIUS], ahead, aside, wheels[wheel, 0], wheels[wheel, 1], wheels[wheel, 2])
+        slip = _slips(
+            row[Parameter.RADIUS],
+            ahead,
+            aside,
+            wheels[wheel, 0],
+            wheels[wheel, 1],
+            wheels[wheel, 2],
+        )
         slopes = stiffness(parameters, loads[wheel], mu[wheel], wheel >= 2)
         if shape == DUGOFF:
             force = combined_dugoff(slip, slopes, mu[wheel], loads[wheel])
@@ -107,19 +120,35 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
     fl, fr, rl, rr = wheel_loads(body, ax, ay)
     a, b, front, rear = body.to_front, body.to_rear, 0.5 * body.track_front, 0.5 * body.track_rear
     aside = vy + a * rate
-    x_fl, y_fl = _pull(body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]), False)
-    x_fr, y_fr = _pull(body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]), False)
+    x_fl, y_fl = _pull(
+        body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]), False
+    )
+    x_fr, y_fr = _pull(
+        body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]), False
+    )
     aside = vy - b * rate
-    x_rl, y_rl = _pull(body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]), True)
-    x_rr, y_rr = _pull(body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]), True)
+    x_rl, y_rl = _pull(
+        body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]), True
+    )
+    x_rr, y_rr = _pull(
+        body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]), True
+    )
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
     per_mass, per_inertia = 1.0 / body.mass, 1.0 / body.yaw_inertia
-    return (x_fl + x_fr + x_rl + x_rr) * per_mass, (y_fl + y_fr + y_rl + y_rr) * per_mass, moment * per_inertia
+    return (
+        (x_fl + x_fr + x_rl + x_rr) * per_mass,
+        (y_fl + y_fr + y_rl + y_rr) * per_mass,
+        moment * per_inertia,
+    )
 
 
 @inlined
 def _pull(
-    body: Body, ahead: float, aside: float, wheel: tuple[float, float, float, float, float, float], rear: bool
+    body: Body,
+    ahead: float,
+    aside: float,
+    wheel: tuple[float, float, float, float, float, float],
+    rear: bool,
 ) -> tuple[float, float]:
     """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given longitudinal force."""
     load, mu, cos, sin, omega, given_x = wheel

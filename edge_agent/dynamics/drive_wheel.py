@@ -34,7 +34,9 @@ class WheelState(NamedTuple):
 
 
 @compiled
-def drive_wheel(state: WheelState, settled: float, inertia: float, radius: float, step: float) -> WheelState:
+def drive_wheel(
+    state: WheelState, settled: float, inertia: float, radius: float, step: float
+) -> WheelState:
     """The state after `step` [s] by Euler's rule, as printed (32); settled is tau_u."""
     torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope

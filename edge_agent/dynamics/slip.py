@@ -37,7 +37,9 @@ def wheel_velocity(
 
 
 @inlined
-def along_wheel(row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float) -> float:
+def along_wheel(
+    row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float
+) -> float:
     """v_wx [m/s] of the centre of `wheel`, for its steering's cosine and sine."""
     x, y = wheel_position(row, wheel)
     return cos * (vx - y * yaw_rate) + sin * (vy + x * yaw_rate)

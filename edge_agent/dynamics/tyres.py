@@ -54,7 +54,12 @@ def dugoff(theta: float) -> float:
 
 @compiled
 def combined_magic(
-    slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float, c: float, e: float
+    slip: tuple[float, float],
+    stiffness: tuple[float, float],
+    mu: float,
+    load: float,
+    c: float,
+    e: float,
 ) -> tuple[float, float]:
     """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
 

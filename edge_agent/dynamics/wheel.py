@@ -11,7 +11,9 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def force_from_torque(torque: float, wheel_acceleration: float, inertia: float, radius: float) -> float:
+def force_from_torque(
+    torque: float, wheel_acceleration: float, inertia: float, radius: float
+) -> float:
     """F_x = (T - J*omega')/R [N]."""
     return (torque - inertia * wheel_acceleration) / radius
 

@@ -88,7 +88,9 @@ measures, by decimetres per second.
 """
 
 
-def bank(vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None) -> EstimatorBank:
+def bank(
+    vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
+) -> EstimatorBank:
     """Return N of these filters on a road whose friction is set."""
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
@@ -131,7 +133,9 @@ def _adapt(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
             if math.isnan(error):
                 continue
             memory.actual[sub, r] = keep * memory.actual[sub, r] + (1.0 - keep) * error * error
-            memory.expected[sub, r] = keep * memory.expected[sub, r] + (1.0 - keep) * motion.expected[sub, r]
+            memory.expected[sub, r] = (
+                keep * memory.expected[sub, r] + (1.0 - keep) * motion.expected[sub, r]
+            )
             mismatch += memory.actual[sub, r] / memory.expected[sub, r] - 1.0
             count += 1
         alpha = mismatch / max(count, 1)
@@ -247,9 +251,16 @@ ELEMENTS: Final[tuple[Element, ...]] = (
     ),
     Element("table 3", "comparator FKF", "as printed", where="FKF"),
     Element(
-        "figures 7 to 11", "v_x, v_y, beta of five drives, both filters", "as printed", where="lab.evaluation.papers"
+        "figures 7 to 11",
+        "v_x, v_y, beta of five drives, both filters",
+        "as printed",
+        where="lab.evaluation.papers",
     ),
-    Element("figure 2", "tyre forces over load", "left out", "measured by the paper's authors; no data"),
-    Element("section 5", "hardware in the loop", "left out", "the two drives are simulated instead"),
+    Element(
+        "figure 2", "tyre forces over load", "left out", "measured by the paper's authors; no data"
+    ),
+    Element(
+        "section 5", "hardware in the loop", "left out", "the two drives are simulated instead"
+    ),
 )
 """Elements of the paper."""

@@ -44,12 +44,24 @@ class EstimatorBank:
         beliefs: Kernel | None = None,
     ) -> None:
         self._beliefs = beliefs
-        self._filters, self._contexts, self._kernel, self._columns = filters, context, kernel, columns
+        self._filters, self._contexts, self._kernel, self._columns = (
+            filters,
+            context,
+            kernel,
+            columns,
+        )
         self._entered, count = kernel, len(filters)
-        self._nowhere = ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
+        self._nowhere = (
+            ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
+        )
 
     def advance(
-        self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
+        self,
+        t: FloatArray,
+        signals: FloatArray,
+        closes: BoolArray | None = None,
+        *,
+        threads: int = 1,
     ) -> Estimates:
         """Take the next samples of all vehicles.
 
@@ -75,12 +87,16 @@ class EstimatorBank:
         if threads == 1:
             self._entered(self._filters, self._contexts, t, signals, values, *visits, (0, 0, count))
             if self._entered is self._kernel:
-                self._entered = entry_point(self._kernel)  # `checked` sees to it that all arguments are of one kind
+                self._entered = entry_point(
+                    self._kernel
+                )  # `checked` sees to it that all arguments are of one kind
             return _estimates(values, evidence, closes)
         if threads > len(self._contexts):
             self._contexts = np.repeat(self._contexts[:1], threads)
         whole = (self._filters, self._contexts, t, signals, values, *visits)
-        in_shares(lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads)
+        in_shares(
+            lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads
+        )
         return _estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
@@ -99,7 +115,11 @@ class EstimatorBank:
         return own, visit
 
 
-def _estimates(values: FloatArray, evidence: FloatArray | None, closes: BoolArray | None) -> Estimates:
+def _estimates(
+    values: FloatArray, evidence: FloatArray | None, closes: BoolArray | None
+) -> Estimates:
     if evidence is None or closes is None:
         return Estimates(values)
-    return Estimates(values, evidence, np.isfinite(evidence[..., 0]) & ~np.asarray(closes, np.bool_))
+    return Estimates(
+        values, evidence, np.isfinite(evidence[..., 0]) & ~np.asarray(closes, np.bool_)
+    )

@@ -92,7 +92,9 @@ class FrictionSet:
     work: Annotated[FloatArray, A_ROWS + A_STATES, 4 * A_STATES]
 
 
-def bank(vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None) -> EstimatorBank:
+def bank(
+    vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
+) -> EstimatorBank:
     """Return N of these filters on a road whose friction is set; the tyre holds C_f and C_r of table 1."""
     context = records(FrictionSet, 1)
     context["friction"] = friction
@@ -114,7 +116,10 @@ def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: AR
         mean[X.OMEGA + wheel] = mean[X.VX] / row[Parameter.RADIUS] if math.isnan(omega) else omega
         mean[X.FORCE + wheel] = use[S.TORQUE + wheel] / row[Parameter.RADIUS]
         root[X.TORQUE + wheel, X.TORQUE + wheel], root[X.OMEGA + wheel, X.OMEGA + wheel] = 20.0, 0.3
-        root[X.FORCE + wheel, X.FORCE + wheel], root[X.SLOPE + wheel, X.SLOPE + wheel] = 200.0, 1000.0
+        root[X.FORCE + wheel, X.FORCE + wheel], root[X.SLOPE + wheel, X.SLOPE + wheel] = (
+            200.0,
+            1000.0,
+        )
     root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
     root[X.YAW_RATE, X.YAW_RATE] = 0.1
     memory.fused[:], memory.fused_root[:] = mean[:B_STATES], root[:B_STATES, :B_STATES]
@@ -126,7 +131,9 @@ def _step(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
     _preliminary(memory, context, dt)
     _fuse(memory, context, dt)
     rate = DriveWheelState.YAW_RATE
-    return not (diverged(memory.fused, memory.fused_root, rate) or diverged(memory.mean, memory.root, rate))
+    return not (
+        diverged(memory.fused, memory.fused_root, rate) or diverged(memory.mean, memory.root, rate)
+    )
 
 
 @compiled
@@ -142,14 +149,24 @@ def _forces(
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
         # a wheel whose speed is missing has no slip to judge by: its force is the observed one
-        share[wheel] = 0.0 if math.isnan(omega[wheel]) else slip_share(row[Parameter.RADIUS], omega[wheel], along)
+        share[wheel] = (
+            0.0
+            if math.isnan(omega[wheel])
+            else slip_share(row[Parameter.RADIUS], omega[wheel], along)
+        )
     blended(share, force_x, observed, force_x)
 
 
 @compiled
 def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """WCKF-A: lateral forces come from the tyre model in B's last motion."""
-    row, mean, root, points, work = memory.row, memory.mean, memory.root, context.points, context.work
+    row, mean, root, points, work = (
+        memory.row,
+        memory.mean,
+        memory.root,
+        context.points,
+        context.work,
+    )
     use, now, X = memory.track.inputs_before, memory.track.now, DriveWheelState
     force_x, force_y, noise = np.empty(4), np.empty(4), np.zeros((A_STATES, A_STATES))
     _forces(row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
@@ -163,7 +180,9 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
         x[X.YAW_RATE] = rate + dt * turn
         for w in range(4):
             state = WheelState(x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w])
-            state = drive_wheel(state, use[S.TORQUE + w], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS], dt)
+            state = drive_wheel(
+                state, use[S.TORQUE + w], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS], dt
+            )
             x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = state
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(dt)
@@ -171,12 +190,16 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
     innovation, std, rows = np.empty(A_ROWS), np.empty(A_ROWS), np.empty((A_ROWS, A_STATES))
     for r in range(A_ROWS):
         place = X.YAW_RATE + r
-        reading = now[S.YAW_RATE] if r == 0 else now[S.TORQUE + r - 1] if r < 5 else now[S.OMEGA + r - 5]
+        reading = (
+            now[S.YAW_RATE] if r == 0 else now[S.TORQUE + r - 1] if r < 5 else now[S.OMEGA + r - 5]
+        )
         rows[r] = root[place]
         innovation[r] = reading - mean[place]
         if not math.isnan(innovation[r]):
             push(memory.window[r], innovation[r])
-        std[r] = math.sqrt(weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST))
+        std[r] = math.sqrt(
+            weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST)
+        )
     update(mean, root, root.copy(), rows, innovation, std, work)
 
 
@@ -186,7 +209,11 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     row, track, mean, root = memory.row, memory.track, memory.fused, memory.fused_root
     use, now, X = track.inputs, track.now, DriveWheelState
     observed, count = memory.mean[X.FORCE : X.FORCE + 4], 2 * B_STATES
-    points, outcomes, predicted = np.empty((count, B_STATES)), np.empty((count, B_STATES)), np.empty(B_STATES)
+    points, outcomes, predicted = (
+        np.empty((count, B_STATES)),
+        np.empty((count, B_STATES)),
+        np.empty(B_STATES),
+    )
     state, measured = np.empty((B_STATES, count)), np.empty((B_STATES, count))
     innovation, std, noise = np.empty(B_STATES), np.empty(B_STATES), np.zeros((B_STATES, B_STATES))
     force_x, force_y = np.empty(4), np.empty(4)
@@ -195,7 +222,15 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
         sigma_points(mean, root, B_XI, points)
         for p in range(count):
             x = points[p]
-            _forces(row, x, track.inputs_before if act == 0 else use, context.friction, observed, force_x, force_y)
+            _forces(
+                row,
+                x,
+                track.inputs_before if act == 0 else use,
+                context.friction,
+                observed,
+                force_x,
+                force_y,
+            )
             ax, ay, turn = accelerations(row, force_x, force_y, delta)
             if act == 0:
                 vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
@@ -221,9 +256,15 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
         adapted = weighted_noise(memory.fused_window[r], spread, B_NOISE[r], LEAST, LARGEST)
         std[r] = math.sqrt(adapted)
         largest = max(largest, adapted / B_NOISE[r])
-    used, log_likelihood, square = update(mean, root, state, measured, innovation, std, context.work)
+    used, log_likelihood, square = update(
+        mean, root, state, measured, innovation, std, context.work
+    )
     _forces(row, mean, use, context.friction, observed, memory.compensated, force_y)
-    memory.nis, memory.log_likelihood, memory.adaptation = square / max(used, 1), log_likelihood, largest
+    memory.nis, memory.log_likelihood, memory.adaptation = (
+        square / max(used, 1),
+        log_likelihood,
+        largest,
+    )
 
 
 @compiled
@@ -277,7 +318,12 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "1/N lacks in (24), weights are not normalised, one half makes it right for normal errors; bounded, N = 25",
         "adaptation.windows",
     ),
-    Element("(30), (32)", "WCKF-A: 19 states, 9 measurements", "as printed", where="compensated_wckf._preliminary"),
+    Element(
+        "(30), (32)",
+        "WCKF-A: 19 states, 9 measurements",
+        "as printed",
+        where="compensated_wckf._preliminary",
+    ),
     Element(
         "(31)",
         "second-order sliding mode for F_x",
@@ -306,8 +352,15 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "relative error of the peak, as a share: its unit is not given",
         "lab.evaluation.papers.reproduction_002",
     ),
-    Element("table 1", "m, I_z, l_f, l_r, half tracks, radius", "as printed", where="lab.evaluation.scenarios.SMALL"),
-    Element("table 1", "C_f, C_r and J", "as printed", where="lab.evaluation.papers.conditions.IN_WHEEL"),
+    Element(
+        "table 1",
+        "m, I_z, l_f, l_r, half tracks, radius",
+        "as printed",
+        where="lab.evaluation.scenarios.SMALL",
+    ),
+    Element(
+        "table 1", "C_f, C_r and J", "as printed", where="lab.evaluation.papers.conditions.IN_WHEEL"
+    ),
     Element("table 1", "R, L of the motor", "as printed", where="dynamics.drive_wheel.ELECTRIC_S"),
     Element(
         "tables 2 to 5",

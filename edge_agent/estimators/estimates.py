@@ -36,7 +36,10 @@ class Column(IntEnum):
 
 
 COLUMNS = tuple(column.name.lower() for column in Column if column < Column.WHEELS)
-ONE_FRICTION, FOUR_FRICTIONS = int(Column.WHEELS), int(Column.WHEELS) + 12  # how many numbers an estimator reports
+ONE_FRICTION, FOUR_FRICTIONS = (
+    int(Column.WHEELS),
+    int(Column.WHEELS) + 12,
+)  # how many numbers an estimator reports
 
 
 class _View:
@@ -74,7 +77,9 @@ class Estimates:
     adaptation: FloatArray = _column(Column.ADAPTATION)
     innovation_log_likelihood: FloatArray = _column(Column.INNOVATION_LOG_LIKELIHOOD)
 
-    def __init__(self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None) -> None:
+    def __init__(
+        self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None
+    ) -> None:
         self.values = values  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Column
         # (T, N, 32) log-likelihood on the friction grid: at closes of the visit's last part, at jumps of the part that
         # ends there, else NaN

@@ -45,7 +45,12 @@ from edge_agent.estimators.gaussian.federated_motion import (
     step_motion,
 )
 from edge_agent.estimators.gaussian.planar import PlanarState
-from edge_agent.estimators.gaussian.wheel_friction import PRIOR_ROOT, dependence, mean_friction, return_to_prior
+from edge_agent.estimators.gaussian.wheel_friction import (
+    PRIOR_ROOT,
+    dependence,
+    mean_friction,
+    return_to_prior,
+)
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.federated import fuse, share
 from edge_agent.filters.householder import update
@@ -62,7 +67,9 @@ from schemas.vehicle import Vehicle
 WHEELS, ROWS = 4, 3
 RULE = cubature(WHEELS)
 XI, WEIGHT = RULE.xi, RULE.w_cov
-NOISE_STD = np.array([0.15, 0.15, 0.004])  # of a_x, a_y, r against the tyre model, for one independent measurement
+NOISE_STD = np.array(
+    [0.15, 0.15, 0.004]
+)  # of a_x, a_y, r against the tyre model, for one independent measurement
 AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
@@ -140,21 +147,31 @@ def _measure(
 ) -> None:  # fmt: skip
     row, track, x = memory.row, memory.track, memory.motion.mean
     now, use = track.now, track.inputs
-    points, outcomes, predicted = np.empty((2 * WHEELS, WHEELS)), np.empty((2 * WHEELS, ROWS)), np.empty(ROWS)
+    points, outcomes, predicted = (
+        np.empty((2 * WHEELS, WHEELS)),
+        np.empty((2 * WHEELS, ROWS)),
+        np.empty(ROWS),
+    )
     state, measured = np.empty((WHEELS, 2 * WHEELS)), np.empty((ROWS, 2 * WHEELS))
     force_x, mu = np.empty(4), np.empty(4)
     innovation, std = np.empty(ROWS), np.empty(ROWS)
     for wheel in range(4):
         force_x[wheel] = wheel_force(row, track, wheel, dt)
     axis_points(mean, root, XI, points)
-    cos, sin, omega = four(track.steering[0]), four(track.steering[1]), four(use[S.OMEGA : S.TORQUE])
+    cos, sin, omega = (
+        four(track.steering[0]),
+        four(track.steering[1]),
+        four(use[S.OMEGA : S.TORQUE]),
+    )
     motion = PlanarMotion(
         x[PlanarState.VX], x[PlanarState.VY], x[PlanarState.YAW_RATE], x[PlanarState.AX], x[PlanarState.AY]
     )  # fmt: skip
     for p in range(points.shape[0]):
         for wheel in range(4):
             mu[wheel] = min(max(points[p, wheel], LOWER), UPPER)
-        ax, ay, turn = response(body(row), motion, WheelInputs(cos, sin, omega, four(force_x), four(mu)))
+        ax, ay, turn = response(
+            body(row), motion, WheelInputs(cos, sin, omega, four(force_x), four(mu))
+        )
         outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = ax, ay, memory.yaw_rate + dt * turn
     weighted_mean(outcomes, WEIGHT, predicted)
     deviations(points, mean, WEIGHT, state, 0)
@@ -183,7 +200,9 @@ def _report(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> fl
 KERNEL = kernel_of(_begin, _step, _report)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
-    Element("(1) to (3)", "3-DOF model, four steered wheels", "as printed", where="dynamics.chassis"),
+    Element(
+        "(1) to (3)", "3-DOF model, four steered wheels", "as printed", where="dynamics.chassis"
+    ),
     Element(
         "(4) to (6)",
         "accelerations from wheel forces",
@@ -249,7 +268,9 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "printed in the literal filter",
         "gaussian.wheel_friction, literal.federated_friction",
     ),
-    Element("(29) to (48)", "time and measurement updates", "as printed", where="filters.householder"),
+    Element(
+        "(29) to (48)", "time and measurement updates", "as printed", where="filters.householder"
+    ),
     Element(
         "(49) to (52)",
         "fusion in the master",

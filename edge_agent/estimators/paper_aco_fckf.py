@@ -57,15 +57,32 @@ class Setting(NamedTuple):
     """Variances of the filter and its belief at the start."""
 
     process: tuple[float, ...] = (1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-5)  # Q per STEP_S (errata)
-    start: tuple[float, ...] = (FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, PRIOR_MU_STD**2)  # P_0
-    noise: tuple[float, ...] = (0.01, 0.01, 1e-4)  # R of ordinary sensors with some model error; the paper's is .05
+    start: tuple[float, ...] = (
+        FIRST_V_STD**2,
+        FIRST_V_STD**2,
+        0.2,
+        0.2,
+        0.01,
+        PRIOR_MU_STD**2,
+    )  # P_0
+    noise: tuple[float, ...] = (
+        0.01,
+        0.01,
+        1e-4,
+    )  # R of ordinary sensors with some model error; the paper's is .05
     mu: float = PRIOR_MU  # at the start: unknown; the paper begins at the truth
-    straight: bool = False  # begin without acceleration and yaw rate, as the paper does, not with those measured
+    straight: bool = (
+        False  # begin without acceleration and yaw rate, as the paper does, not with those measured
+    )
     tyre: TyreOption = TyreOption()
-    dual_motor: bool = False  # longitudinal forces from one motor per axle, (4) to (6), instead of slip
+    dual_motor: bool = (
+        False  # longitudinal forces from one motor per axle, (4) to (6), instead of slip
+    )
 
 
-AT_THE_TRUTH = Setting(start=(1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6), noise=(0.05, 0.05, 0.05), mu=0.85, straight=True)
+AT_THE_TRUTH = Setting(
+    start=(1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6), noise=(0.05, 0.05, 0.05), mu=0.85, straight=True
+)
 """The paper's experiments: R known, and the start (section IV.A) so well known that the printed mu error can be met."""
 
 
@@ -186,7 +203,9 @@ def _adapt(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float)
 def _report(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> float:  # noqa: ARG001 as of all filters
     mean, root = memory.mean, memory.root
     write_states(output, mean, root, PlanarState.YAW_RATE)
-    write_friction(output, Column.MU, mean[PlanarState.MU], math.sqrt(variance(root, PlanarState.MU)))
+    write_friction(
+        output, Column.MU, mean[PlanarState.MU], math.sqrt(variance(root, PlanarState.MU))
+    )
     return float(mean[PlanarState.MU])
 
 
@@ -223,7 +242,12 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "combined by similarity; (10) has stiffness inside eps*v_x, and tan(alpha) is squared",
         "dynamics.tyres.combined_dugoff",
     ),
-    Element("(10)", "speed factor eps, and 1/(1 - s) on tan(alpha)", "left out", "eps is not given; s is below .02"),
+    Element(
+        "(10)",
+        "speed factor eps, and 1/(1 - s) on tan(alpha)",
+        "left out",
+        "eps is not given; s is below .02",
+    ),
     Element(
         "(11), (12)",
         "longitudinal slip",
@@ -271,7 +295,12 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "R must grow where the actual variance is larger; bounded, or R runs away",
         "adaptation.fuzzy",
     ),
-    Element("figures 2, 3", "five triangular sets of e and n", "as printed", where="adaptation.memberships"),
+    Element(
+        "figures 2, 3",
+        "five triangular sets of e and n",
+        "as printed",
+        where="adaptation.memberships",
+    ),
     Element(
         "III.C",
         "lower vertices of the triangles as tuned variables",
@@ -299,13 +328,39 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "it has a pole at e = -1: |e|; inflating R wins it, so that it makes the filter worse (measured)",
         "lab.tuning.paper_004_tuning",
     ),
-    Element("IV.A", "three tuning runs with R = .1, .05, .01", "as printed", where="lab.tuning.paper_004_tuning"),
-    Element("IV.A", "x_0 at the truth, P_0 = .2*I, R = .05*I, T = .02 s", "as printed", where="AS_PRINTED"),
-    Element("IV.A", "Q_0 = .1*I with seven entries", "corrected", "six states; read as .1*T^2 per step", "AS_PRINTED"),
+    Element(
+        "IV.A",
+        "three tuning runs with R = .1, .05, .01",
+        "as printed",
+        where="lab.tuning.paper_004_tuning",
+    ),
+    Element(
+        "IV.A",
+        "x_0 at the truth, P_0 = .2*I, R = .05*I, T = .02 s",
+        "as printed",
+        where="AS_PRINTED",
+    ),
+    Element(
+        "IV.A",
+        "Q_0 = .1*I with seven entries",
+        "corrected",
+        "six states; read as .1*T^2 per step",
+        "AS_PRINTED",
+    ),
     Element("IV.A", "W_0 = 1", "left out", "the paper does not say what it is"),
     Element("table 1", "vehicle", "as printed", where="lab.simulation.presets"),
-    Element("table 2", "noise variance by schedule, on a_y alone", "as printed", where="lab.simulation.white"),
-    Element("figure 8", "double lane change at 80 km/h, mu .85", "as printed", where="lab.simulation.manoeuvres"),
+    Element(
+        "table 2",
+        "noise variance by schedule, on a_y alone",
+        "as printed",
+        where="lab.simulation.white",
+    ),
+    Element(
+        "figure 8",
+        "double lane change at 80 km/h, mu .85",
+        "as printed",
+        where="lab.simulation.manoeuvres",
+    ),
     Element(
         "tables 3, 4",
         "MAE and RMSE of ACOFCKF and FCKF",
@@ -319,6 +374,11 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "as printed",
         where="lab.evaluation.papers",
     ),
-    Element("figures 4, 5", "flow chart and block diagram", "left out", "they show nothing that is measured"),
+    Element(
+        "figures 4, 5",
+        "flow chart and block diagram",
+        "left out",
+        "they show nothing that is measured",
+    ),
 )
 """Elements of the paper."""

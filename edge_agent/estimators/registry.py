@@ -14,7 +14,13 @@ from typing import Final
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
-from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
+from edge_agent.estimators import (
+    adaptive_federated_ckf,
+    compensated_wckf,
+    federated_ckf,
+    paper_aco_fckf,
+    sr_ukf,
+)
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.calibrated import means_of, spreads_of
@@ -46,7 +52,11 @@ PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
 
 
 def create(
-    name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None, curve: Curve | None = None
+    name: str,
+    vehicles: Sequence[Vehicle],
+    *,
+    memberships: Memberships | None = None,
+    curve: Curve | None = None,
 ) -> EstimatorBank:
     """A bank of estimators `name`, one per vehicle.
 
@@ -61,7 +71,9 @@ def create(
             estimator that has none, or a curve that is none, or to one that has its own.
     """
     if name not in ESTIMATORS:
-        raise InputError("estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}")
+        raise InputError(
+            "estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}"
+        )
     if not vehicles:
         raise InputError("vehicles", "none given", "give at least one vehicle")
     if curve is not None:
@@ -71,18 +83,27 @@ def create(
             proven(curve)
         except (ValueError, TypeError) as error:
             raise InputError(
-                "tyre-curve", str(error), "give force over peak force, of slip times stiffness over peak force"
+                "tyre-curve",
+                str(error),
+                "give force over peak force, of slip times stiffness over peak force",
             ) from error
     if name in PLAIN:
         if memberships is not None:
-            raise InputError("memberships", f"{name} has no fuzzy sets to replace", "leave them out")
+            raise InputError(
+                "memberships", f"{name} has no fuzzy sets to replace", "leave them out"
+            )
         return PLAIN[name](vehicles)
     if memberships is None:
         if name in TUNED:
-            raise InputError("memberships", f"{name} needs tuned ones", "make it with estimator_factory.bank_of")
+            raise InputError(
+                "memberships", f"{name} needs tuned ones", "make it with estimator_factory.bank_of"
+            )
         memberships = Memberships()
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
     design = design_of(memberships, adaptive=name != "ckf", curve=curve)
-    spreads, means = spreads_of(vehicles, design.nominal.std), means_of(vehicles, design.nominal.mean)
+    spreads, means = (
+        spreads_of(vehicles, design.nominal.std),
+        means_of(vehicles, design.nominal.mean),
+    )
     return mixture_bank(parameter_table(vehicles), design, spreads, means)

@@ -18,7 +18,9 @@ CHANNEL_COUNT = len(CHANNELS)
 DOUBLE = np.dtype(np.float64)
 
 
-def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int) -> tuple[FloatArray, FloatArray]:
+def checked(
+    t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int
+) -> tuple[FloatArray, FloatArray]:
     """t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
 
     Raises:

@@ -23,7 +23,14 @@ from typing import Annotated, Final
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
+from edge_agent.dynamics.chassis import (
+    DUGOFF,
+    PlanarMotion,
+    WheelInputs,
+    response,
+    tyre_forces,
+    wheel_inputs,
+)
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body, four
 from edge_agent.estimators.bank import EstimatorBank
@@ -41,7 +48,11 @@ from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
 from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
-from edge_agent.estimators.gaussian.federated_motion import doubted, mean_wheel_velocity, slip_free_speed
+from edge_agent.estimators.gaussian.federated_motion import (
+    doubted,
+    mean_wheel_velocity,
+    slip_free_speed,
+)
 from edge_agent.estimators.gaussian.wheel_friction import (
     FORGET_M,
     INDEPENDENT_S,
@@ -65,13 +76,24 @@ from schemas.vehicle import Vehicle
 STATES, ROWS = 7, 7  # rows: speed of the wheels, r, a_y, four longitudinal forces
 RULE = unscented(STATES, 1.0, 2.0, 0.0)
 XI, W_MEAN, W_COV = RULE.xi, RULE.w_mean, RULE.w_cov
-DRIFT = np.array([0.05, 0.05, 0.1])  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
+DRIFT = np.array(
+    [0.05, 0.05, 0.1]
+)  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
 FIRST_RATE_STD = 0.1  # [rad/s] of the yaw rate at the first sample
 RATE_STD = 0.003  # [rad/s]
 SLOWEST_SLIP_M_S = 1.0  # noise of the wheel speeds is slip at this speed at least
-AY_STD, AY_SHARE = 0.15, 0.05  # [m/s^2], and of a_y, that the tyre model may miss, per independent measurement
-FORCE_STD, FORCE_SHARE = 0.01, 0.15  # of the load: rolling resistance; of the force: torque gain and stiffness
-SLIP_STD, OMEGA_STD = 0.001, 0.03  # [1] radius differences, [rad/s] noise: through the slip stiffness
+AY_STD, AY_SHARE = (
+    0.15,
+    0.05,
+)  # [m/s^2], and of a_y, that the tyre model may miss, per independent measurement
+FORCE_STD, FORCE_SHARE = (
+    0.01,
+    0.15,
+)  # of the load: rolling resistance; of the force: torque gain and stiffness
+SLIP_STD, OMEGA_STD = (
+    0.001,
+    0.03,
+)  # [1] radius differences, [rad/s] noise: through the slip stiffness
 
 
 class WheelFrictionState(IntEnum):
@@ -94,7 +116,10 @@ class UnscentedMemory(PaperMemory):
 def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
     """Return N of these filters."""
     return EstimatorBank(
-        new_filters(UnscentedMemory, vehicles, tyre), records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS
+        new_filters(UnscentedMemory, vehicles, tyre),
+        records(EmptyRecord, 1),
+        KERNEL,
+        columns=FOUR_FRICTIONS,
     )
 
 
@@ -103,7 +128,11 @@ def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG0
     mean, root, X = memory.mean, memory.root, WheelFrictionState
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
-    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = speed if known else 0.0, 0.0, memory.track.inputs[S.YAW_RATE]
+    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = (
+        speed if known else 0.0,
+        0.0,
+        memory.track.inputs[S.YAW_RATE],
+    )
     mean[X.MU :] = PRIOR_MU
     root[:, :] = 0.0
     root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
@@ -125,7 +154,11 @@ def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> 
     """(a_y, yaw acceleration) of the tyres at x (7,)."""
     use, unknown = track.inputs, (math.nan, math.nan, math.nan, math.nan)
     motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
-    cos, sin, omega = four(track.steering[0]), four(track.steering[1]), four(use[S.OMEGA : S.TORQUE])
+    cos, sin, omega = (
+        four(track.steering[0]),
+        four(track.steering[1]),
+        four(use[S.OMEGA : S.TORQUE]),
+    )
     _, ay, turn = response(body(row), motion, WheelInputs(cos, sin, omega, unknown, four(mu)))
     return ay, turn
 
@@ -161,7 +194,9 @@ def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # 
 
 
 @compiled
-def _measure(memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray) -> None:
+def _measure(
+    memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray
+) -> None:
     row, track, mean, root = memory.row, memory.track, memory.mean, memory.root
     now, use = track.now, track.inputs
     count = points.shape[0]
@@ -173,7 +208,10 @@ def _measure(memory: UnscentedMemory, dt: float, share: float, points: FloatArra
     motion = np.array([0.0, 0.0, 0.0, use[S.AX], use[S.AY]])
     rate = WheelFrictionState.YAW_RATE
     for p in range(count):
-        outcomes[p, 0], outcomes[p, 1] = mean_wheel_velocity(row, track, points[p], rate), points[p, rate]
+        outcomes[p, 0], outcomes[p, 1] = (
+            mean_wheel_velocity(row, track, points[p], rate),
+            points[p, rate],
+        )
         _friction(points[p], middle, share, mu)
         outcomes[p, 2], _ = _felt(row, points[p], track, mu)
         motion[:3] = points[p, :3]
@@ -188,15 +226,21 @@ def _measure(memory: UnscentedMemory, dt: float, share: float, points: FloatArra
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     for wheel in range(4):
         force = wheel_force(row, track, wheel, dt)
-        slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(abs(mean[0]), SLOWEST_SLIP_M_S)
+        slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(
+            abs(mean[0]), SLOWEST_SLIP_M_S
+        )
         quiet = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
-        std[3 + wheel] = inflation * math.hypot(quiet, row[Parameter.SLOPE_X] * loads[wheel] * slip_std)
+        std[3 + wheel] = inflation * math.hypot(
+            quiet, row[Parameter.SLOPE_X] * loads[wheel] * slip_std
+        )
         missing = math.isnan(now[S.OMEGA + wheel]) or math.isnan(now[S.TORQUE + wheel])
         innovation[3 + wheel] = math.nan if missing else force
     for r in range(ROWS):
         innovation[r] -= predicted[r]
     std[0] = doubted(std[0], innovation[0])
-    used, log_likelihood, square, refused = update_by_downdate(mean, root, state, measured, innovation, std, work)
+    used, log_likelihood, square, refused = update_by_downdate(
+        mean, root, state, measured, innovation, std, work
+    )
     memory.nis, memory.log_likelihood = square / max(used, 1), log_likelihood
     memory.refused += 1.0 if refused else 0.0
 
@@ -235,7 +279,9 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "as printed",
         where="dynamics.loads, slip",
     ),
-    Element("3.1", "state mu_fl, mu_fr, mu_rl, mu_rr", "as printed", where="literal.wheel_friction_ukf"),
+    Element(
+        "3.1", "state mu_fl, mu_fr, mu_rl, mu_rr", "as printed", where="literal.wheel_friction_ukf"
+    ),
     Element(
         "3.1",
         "v_x, v_y from the simulator",
@@ -344,6 +390,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "as printed",
         where="lab.evaluation.papers.reproduction_003",
     ),
-    Element("figures 1 to 4", "sketches of model, tyre, filter and simulation", "left out", "no results"),
+    Element(
+        "figures 1 to 4", "sketches of model, tyre, filter and simulation", "left out", "no results"
+    ),
 )
 """Elements of the paper."""

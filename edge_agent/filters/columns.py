@@ -30,7 +30,9 @@ def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
 
 
 @inlined
-def gather(points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray) -> None:
+def gather(
+    points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
+) -> None:
     """Mean and sqrt_cov of moved points (n, 2n), which become deviations, with process noise pace*q.
 
     The mean is the first point and deviations from it, so that large offsets lose no digits. The covariance is summed

@@ -19,7 +19,13 @@ def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
 
 
 @compiled
-def fuse(mean: FloatArray, sqrt_cov: FloatArray, other: FloatArray, other_root: FloatArray, work: FloatArray) -> None:
+def fuse(
+    mean: FloatArray,
+    sqrt_cov: FloatArray,
+    other: FloatArray,
+    other_root: FloatArray,
+    work: FloatArray,
+) -> None:
     """Fuse the independent estimate (other, other_root) into (mean, sqrt_cov), in place; work (2n, 2n) or larger."""
     n = mean.shape[0]
     for i in range(n):

@@ -18,7 +18,9 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def sigma_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
+def sigma_points(
+    mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray
+) -> None:
     """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points, n)."""
     count, n = xi.shape
     for p in range(count):
@@ -54,7 +56,9 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 
 
 @compiled
-def deviations(points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int) -> None:
+def deviations(
+    points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
+) -> None:
     """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from centred deviations."""
     count, n = points.shape
     for p in range(count):

@@ -43,7 +43,12 @@ def project(mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain
 
 @inlined
 def carlson(
-    mean: FloatArray, sqrt_cov: FloatArray, i: int, reading: float, variance: float, gain: FloatArray
+    mean: FloatArray,
+    sqrt_cov: FloatArray,
+    i: int,
+    reading: float,
+    variance: float,
+    gain: FloatArray,
 ) -> tuple[float, float]:
     """Take in a `reading` of state i itself with noise `variance` > 0: (innovation squared over a, a).
 

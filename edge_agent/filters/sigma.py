@@ -39,10 +39,14 @@ class SigmaRule:
     def __post_init__(self) -> None:
         points, n = self.xi.shape
         if self.w_mean.shape != (points,) or self.w_cov.shape != (points,):
-            raise InputError(self.name, "one weight per point is wanted", "give weights of shape (points,)")
+            raise InputError(
+                self.name, "one weight per point is wanted", "give weights of shape (points,)"
+            )
         if np.any(self.w_cov < 0.0):
             raise InputError(
-                self.name, "a covariance weight is negative, which has no square root", "raise alpha, beta or kappa"
+                self.name,
+                "a covariance weight is negative, which has no square root",
+                "raise alpha, beta or kappa",
             )
         first = self.w_mean @ self.xi
         second = (self.w_cov[:, None] * self.xi).T @ self.xi
@@ -52,7 +56,11 @@ class SigmaRule:
             ("second", second, np.eye(n)),
         ):
             if not np.allclose(value, expected, rtol=0.0, atol=EXACTNESS):
-                raise InputError(self.name, f"the {moment} moment is not integrated exactly", "correct the constants")
+                raise InputError(
+                    self.name,
+                    f"the {moment} moment is not integrated exactly",
+                    "correct the constants",
+                )
 
     @property
     def dimension(self) -> int:
@@ -68,7 +76,9 @@ def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
     """
     scale = alpha**2 * (n + kappa)
     if n < 1 or scale <= 0.0:
-        raise InputError("unscented", "n and alpha^2*(n + kappa) must be positive", "raise n, alpha or kappa")
+        raise InputError(
+            "unscented", "n and alpha^2*(n + kappa) must be positive", "raise n, alpha or kappa"
+        )
     spread = np.sqrt(scale) * np.eye(n)
     side = np.full(2 * n, 0.5 / scale)
     centre_mean = (scale - n) / scale

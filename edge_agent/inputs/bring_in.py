@@ -37,10 +37,14 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
     if rosbag.is_bag(path):
         with rosbag.open_bag(path) as reader:
             if rosbag.has_frames(reader):
-                return _decoded(lambda ids: rosbag.bag_frames(reader, path, ids), path, profile, database)
+                return _decoded(
+                    lambda ids: rosbag.bag_frames(reader, path, ids), path, profile, database
+                )
             return rosbag.read_bag(reader, path, wanted)
     if suffix in mdf.SUFFIXES:
-        identifiers = None if database is None else {message.identifier for message in database.values()}
+        identifiers = (
+            None if database is None else {message.identifier for message in database.values()}
+        )
         content = mdf.read_isolated(path, identifiers, wanted)
         if content.recording is not None:
             return content.recording
@@ -64,17 +68,34 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
         time, unit = (profile.time, profile.time_unit) if profile else (None, None)
         return tabular.read_table(path, time, unit)
     known = sorted(
-        {*can_log.SUFFIXES, *gnss.SUFFIXES, *mdf.SUFFIXES, *racelogic.SUFFIXES, *rosbag.SUFFIXES, *tabular.SUFFIXES}
+        {
+            *can_log.SUFFIXES,
+            *gnss.SUFFIXES,
+            *mdf.SUFFIXES,
+            *racelogic.SUFFIXES,
+            *rosbag.SUFFIXES,
+            *tabular.SUFFIXES,
+        }
     )
-    raise InputError("source", f"{path} is of no known kind", f"give one of {' '.join(known)}, or a bag's folder")
+    raise InputError(
+        "source", f"{path} is of no known kind", f"give one of {' '.join(known)}, or a bag's folder"
+    )
 
 
-def _decoded(frames: can_log.Taker, path: Path, profile: Profile | None, database: Database | None) -> Recording:
+def _decoded(
+    frames: can_log.Taker, path: Path, profile: Profile | None, database: Database | None
+) -> Recording:
     if database is None:
         raise can_log.no_database(path)
-    every = {f"{message.name}.{signal}" for message in database.values() for signal in message.signals}
+    every = {
+        f"{message.name}.{signal}" for message in database.values() for signal in message.signals
+    }
     wanted = every if profile is None else profile.needs()
-    buses = {c.message: c.bus for c in profile.channels.values() if c.message and c.bus is not None} if profile else {}
+    buses = (
+        {c.message: c.bus for c in profile.channels.values() if c.message and c.bus is not None}
+        if profile
+        else {}
+    )
     with foreign(path, "CAN log"):
         return can_log.decoded(frames, path.name, database, wanted, buses)
 
@@ -86,7 +107,9 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
     if profile is None or profile.dbc is None:
         return None
     beside = folder / profile.dbc
-    return read_dbc(beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc)
+    return read_dbc(
+        beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc
+    )
 
 
 def profile_of(log: Path) -> Profile:
@@ -100,7 +123,8 @@ def profile_of(log: Path) -> Profile:
         if (provenance := (schema.metadata or {}).get(PROVENANCE)) is not None:
             return Profile.model_validate(json.loads(provenance)["profile"])
         return Profile(
-            name=log.stem[:64], channels={n: Channel(signal=n) for n in (*CHANNELS, *CONTEXT) if n in schema.names}
+            name=log.stem[:64],
+            channels={n: Channel(signal=n) for n in (*CHANNELS, *CONTEXT) if n in schema.names},
         )
 
 
@@ -111,7 +135,9 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
         whole = merged.start_ns + np.rint(merged.t * NS).astype(np.int64)
         columns["timestamp"] = pa.array(whole, pa.int64()).cast(pa.timestamp("ns", tz="UTC"))
     else:
-        columns["t"] = pa.array(np.rint(merged.t * NS) / NS)  # as dated ones read: one drive is one log in all formats
+        columns["t"] = pa.array(
+            np.rint(merged.t * NS) / NS
+        )  # as dated ones read: one drive is one log in all formats
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
     provenance: Mapping[str, object] = {
         "profile": json.loads(profile.text()), "sources": list(sources),
@@ -121,4 +147,6 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
     try:
         pq.write_table(table, path, compression="zstd")
     except OSError as error:
-        raise InputError("out", f"cannot write {path} ({error})", "name a file in a writable folder") from error
+        raise InputError(
+            "out", f"cannot write {path} ({error})", "name a file in a writable folder"
+        ) from error

@@ -19,7 +19,10 @@ from schemas.signals import CONTEXT, FLAGS
 # Design parameters. A controller's flag comes at 10 to 100 Hz and lives as long as the intervention does; the air
 # and the wipers change slowly and come once or twice a second.
 HELD_S: Final = {name: 1.0 if name in FLAGS else 30.0 for name in CONTEXT}
-AIR_C: Final = (-60.0, 65.0)  # beyond what was ever measured on a road: codes for "no value" and broken sensors
+AIR_C: Final = (
+    -60.0,
+    65.0,
+)  # beyond what was ever measured on a road: codes for "no value" and broken sensors
 
 
 def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:
@@ -55,12 +58,19 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 def lasting_signals(profile: Profile) -> set[str]:
     """Whole names of the signals that are sent when they change."""
-    return {name for channel in profile.channels.values() if channel.lasting for name in channel.needs()}
+    return {
+        name for channel in profile.channels.values() if channel.lasting for name in channel.needs()
+    }
 
 
 def context_signals(profile: Profile) -> set[str]:
     """Whole names of the signals that context is made of."""
-    return {name for channel in CONTEXT if channel in profile.channels for name in profile.channels[channel].needs()}
+    return {
+        name
+        for channel in CONTEXT
+        if channel in profile.channels
+        for name in profile.channels[channel].needs()
+    }
 
 
 def context_block(
@@ -85,5 +95,7 @@ def context_block(
         raise KeyError(f"{sorted(unknown)[0]} is no context signal; use {', '.join(CONTEXT)}")
     block = np.full((samples, vehicles, len(CONTEXT)), np.nan)
     for name, value in values.items():
-        block[..., CONTEXT.index(name)] = context_values(name, np.asarray(value, dtype=np.float64), None)
+        block[..., CONTEXT.index(name)] = context_values(
+            name, np.asarray(value, dtype=np.float64), None
+        )
     return block

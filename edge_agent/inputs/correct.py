@@ -36,7 +36,9 @@ class Corrector:
         if self._waits:
             signals = self._wait_for_latest(t, signals)
         signals = scale_axles(signals, self._vehicle)
-        return free_rear_wheels(signals, self._vehicle) if self._vehicle.rear_axle_locked else signals
+        return (
+            free_rear_wheels(signals, self._vehicle) if self._vehicle.rear_axle_locked else signals
+        )
 
     def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
         """Return signals of one moment each: devices that speak early wait for the latest."""
@@ -45,9 +47,17 @@ class Corrector:
         for channels, wait in self._waits.items():
             at = t - wait
             after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
-            near = np.where(times[np.minimum(after, len(times) - 1)] - at < at - times[after - 1], after, after - 1)
+            near = np.where(
+                times[np.minimum(after, len(times) - 1)] - at < at - times[after - 1],
+                after,
+                after - 1,
+            )
             together[:, slice(*channels)] = rows[np.minimum(near, len(times) - 1), slice(*channels)]
-        kept = max(0, int(np.searchsorted(times, times[-1] - max(self._waits.values()))) - 2) if len(times) else 0
+        kept = (
+            max(0, int(np.searchsorted(times, times[-1] - max(self._waits.values()))) - 2)
+            if len(times)
+            else 0
+        )
         self._t, self._rows = times[kept:], rows[kept:]
         return together
 
@@ -105,7 +115,11 @@ def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
     """Return how long the readings of a device's channels wait for the latest device [s]; the latest is left out."""
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}
-    late = {INERTIAL: 0.0, STEERING: _value(known.steer_lag, 0.0), TURNING: _value(known.wheel_lag, 0.0)}
+    late = {
+        INERTIAL: 0.0,
+        STEERING: _value(known.steer_lag, 0.0),
+        TURNING: _value(known.wheel_lag, 0.0),
+    }
     latest = max(late.values())
     return {channels: latest - lag for channels, lag in late.items() if lag < latest}
 

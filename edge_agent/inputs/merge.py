@@ -48,7 +48,9 @@ class Merged:
     columns: dict[str, FloatArray]
     start_ns: int | None
     notes: list[str] = field(default_factory=list)
-    origins: dict[str, dict[str, object]] = field(default_factory=dict)  # per channel: source, rate, missing, jitter
+    origins: dict[str, dict[str, object]] = field(
+        default_factory=dict
+    )  # per channel: source, rate, missing, jitter
 
 
 def merge(
@@ -76,9 +78,12 @@ def merge(
     found = found_in(recordings, profile)
     if not found:
         names = ", ".join(sorted(profile.needs())[:6])
-        raise InputError("profile", f"no recording has any of its signals ({names}, …)", "choose another profile")
+        raise InputError(
+            "profile", f"no recording has any of its signals ({names}, …)", "choose another profile"
+        )
     reference = next(
-        (place for name, (place, _) in found.items() if name.startswith("omega")), next(iter(found.values()))[0]
+        (place for name, (place, _) in found.items() if name.startswith("omega")),
+        next(iter(found.values()))[0],
     )
     offsets, start_ns = _clocks(recordings, reference, shifts or {}, notes)
     series: dict[str, Series] = {}
@@ -87,17 +92,26 @@ def merge(
         one, jitter = made(name, channel, recordings[place], radius, ratio)
         series[name] = Series(one.t + offsets[place] - channel.delay_s, one.values)
         source = recordings[place].name
-        origins[name] = {"source": source, "signals": channel.signals, **_rates(one), "jitter_s": jitter}
+        origins[name] = {
+            "source": source,
+            "signals": channel.signals,
+            **_rates(one),
+            "jitter_s": jitter,
+        }
     _still_courses(series)
     context = {name: series.pop(name) for name in CONTEXT if name in series}
     if not series:
-        raise InputError("profile", "no recording has any of the channels", "context alone is no drive")
+        raise InputError(
+            "profile", "no recording has any of the channels", "context alone is no drive"
+        )
     merged = _rows(series, profile, recordings, found)
     for name, one in context.items():
         if len(one.t) == len(merged.t) and np.array_equal(one.t, merged.t):
             merged.columns[name] = one.values  # a table's own rows stay as they are
         else:
-            merged.columns[name] = held_readings(name, one, merged.t, lasting=profile.channels[name].lasting)
+            merged.columns[name] = held_readings(
+                name, one, merged.t, lasting=profile.channels[name].lasting
+            )
     shift = merged.t[0]
     merged.t = merged.t - shift
     merged.start_ns = None if start_ns is None else start_ns + round(shift * NS)
@@ -111,7 +125,11 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
     for name in (*CHANNELS, GROUND, *CONTEXT):
         asked = profile.channels.get(name)
         for place, recording in enumerate(recordings):
-            if asked and asked.source in (None, recording.name) and set(asked.signals) <= recording.signals.keys():
+            if (
+                asked
+                and asked.source in (None, recording.name)
+                and set(asked.signals) <= recording.signals.keys()
+            ):
                 found[name] = place, asked
                 break
         else:
@@ -128,7 +146,9 @@ def _clocks(
     """Seconds to add to each recording's times, and the ns UTC of time 0."""
     spans = [_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
-    dated = next((r.start_ns for r in recordings if {"latitude", "course"} <= r.signals.keys()), None)
+    dated = next(
+        (r.start_ns for r in recordings if {"latitude", "course"} <= r.signals.keys()), None
+    )
     offsets, start_ns = [], base
     for place, recording in enumerate(recordings):
         shift = shifts.get(recording.name, 0.0)
@@ -137,12 +157,18 @@ def _clocks(
                 start_ns = recording.start_ns
             if place != reference:
                 shift += spans[reference][0] - spans[place][0]
-                notes.append(f"{recording.name}: no common date; taken to begin when {recordings[reference].name} does")
+                notes.append(
+                    f"{recording.name}: no common date; taken to begin when {recordings[reference].name} does"
+                )
             offsets.append(shift)
             continue
         lead = (recording.start_ns - base) / NS
         zones = sorted(range(-LARGEST_ZONE, LARGEST_ZONE + 1), key=abs)
-        meets = [zone for zone in zones if _meet(spans[place], lead + shift + zone * ZONE_S, spans[reference])]
+        meets = [
+            zone
+            for zone in zones
+            if _meet(spans[place], lead + shift + zone * ZONE_S, spans[reference])
+        ]
         if not meets:
             raise InputError(
                 recording.name, f"its clock is {lead:.0f} s from that of {recordings[reference].name}",
@@ -150,7 +176,9 @@ def _clocks(
             )  # fmt: skip
         if meets[0]:
             hours = meets[0] * ZONE_S / 3600.0
-            notes.append(f"{recording.name}: its date is {-hours:g} h from the others', as of another time zone")
+            notes.append(
+                f"{recording.name}: its date is {-hours:g} h from the others', as of another time zone"
+            )
             if dated is not None and recording.start_ns == dated:
                 start_ns = base - round(meets[0] * ZONE_S * NS)  # the receiver is right
         offsets.append(lead + shift + meets[0] * ZONE_S)
@@ -189,26 +217,34 @@ def made(
         known = to_si(name, unit, radius)
         if known is None:
             raise InputError(
-                where, f"is a speed in {unit}", "give the wheel's radius: --vehicle, or wheel_radius in the profile"
+                where,
+                f"is a speed in {unit}",
+                "give the wheel's radius: --vehicle, or wheel_radius in the profile",
             )
         factor = known
         values = values - ZEROS.get(unit, 0.0)
     if channel.at == "steering wheel":
         if ratio is None:
             raise InputError(
-                where, "is the steering wheel's angle", "give steering_ratio in the profile or the vehicle file"
+                where,
+                "is the steering wheel's angle",
+                "give steering_ratio in the profile or the vehicle file",
             )
         factor /= ratio
     values = values * (factor * channel.scale)
     if channel.sign is not None:
         flag = recording.signals.get(channel.whole(channel.sign.signal))
         if flag is None:
-            raise InputError(where, f"its sign {channel.sign.signal} is not there", "name the signal of the sign")
+            raise InputError(
+                where, f"its sign {channel.sign.signal} is not there", "name the signal of the sign"
+            )
         values = np.where(_held(flag, first.t) == channel.sign.negative, -values, values)
     values = values + channel.offset
     for gate, good in channel.gates.items():
         if gate in recording.signals:
-            values = np.where(np.isin(_held(recording.signals[gate], first.t), good), values, np.nan)
+            values = np.where(
+                np.isin(_held(recording.signals[gate], first.t), good), values, np.nan
+            )
     if channel.course:
         values = np.mod(np.pi / 2.0 - values + np.pi, 2.0 * np.pi) - np.pi
     if name in CONTEXT:
@@ -219,7 +255,9 @@ def made(
 
 def _held(series: Series, t: FloatArray) -> FloatArray:
     """The last reading at or before each time."""
-    return series.values[np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)]
+    return series.values[
+        np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
+    ]
 
 
 def _rates(series: Series) -> dict[str, object]:
@@ -263,18 +301,29 @@ def _rows(
 ) -> Merged:
     sources = {place for name, (place, _) in found.items() if name in series}
     late = {profile.channels[name].delay_s for name in series if name in profile.channels}
-    if len(sources) == 1 and recordings[min(sources)].rows and len(late) == 1 and profile.rate_hz is None:
+    if (
+        len(sources) == 1
+        and recordings[min(sources)].rows
+        and len(late) == 1
+        and profile.rate_hz is None
+    ):
         t = next(iter(series.values())).t
         return Merged(t, {name: one.values for name, one in series.items()}, None)
     dense = {name: one for name, one in series.items() if name not in SPARSE and len(one.t) > 1}
     if not dense:
-        raise InputError("source", "no channel has two readings", "record longer, or choose another profile")
+        raise InputError(
+            "source", "no channel has two readings", "record longer, or choose another profile"
+        )
     first, last = max(one.t[0] for one in dense.values()), min(one.t[-1] for one in dense.values())
     rate = profile.rate_hz or _rate(dense)
     if not last - first > 1.0 / rate:
-        raise InputError("source", "its channels have no common time", "record them together, or give --clock")
+        raise InputError(
+            "source", "its channels have no common time", "record them together, or give --clock"
+        )
     t = first + np.arange(int((last - first) * rate + 1e-6) + 1) / rate
-    return Merged(t, {name: sampled(one, t, sparse=name in SPARSE) for name, one in series.items()}, None)
+    return Merged(
+        t, {name: sampled(one, t, sparse=name in SPARSE) for name, one in series.items()}, None
+    )
 
 
 def _rate(dense: Mapping[str, Series]) -> float:

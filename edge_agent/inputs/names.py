@@ -23,11 +23,16 @@ PLACES: Final = {
 # a name fits when the first is found in it and the second is not; the first channel that fits is taken
 Rule: TypeAlias = tuple[str, str]
 STATES: Final = "stat|diag|valid|q bit|fault|counter|check|alive|cov|std|v z|sta$"
-ROLLS: Final = r"omega|wheel.*(speed|spd|vel|rot)|whl.*(spd|speed)|rad.*geschw|(speed|spd).*w(hee|h)l|velocity"
+ROLLS: Final = (
+    r"omega|wheel.*(speed|spd|vel|rot)|whl.*(spd|speed)|rad.*geschw|(speed|spd).*w(hee|h)l|velocity"
+)
 SHORT: Final = r"wspd|w spd|^v .*w(hee|h)l|^(v|w(hee|h)l) (fl|fr|rl|rr)$"
 SPEED: Final[Rule] = (rf"{ROLLS}|{SHORT}", rf"{STATES}|dir|torque")
 RULES: Final[dict[str, Rule]] = {
-    "yaw_rate": (r"yaw.*(rate|vel|rt)|gierrate|gyro.*z|angular.*velocity.*z|omega.*z|yawrt", STATES),
+    "yaw_rate": (
+        r"yaw.*(rate|vel|rt)|gierrate|gyro.*z|angular.*velocity.*z|omega.*z|yawrt",
+        STATES,
+    ),
     "ax": (
         r"^a x$|long.*acc|acc.*long|acc.*x$|laengsbeschl|linear.*acceleration.*x|^ax$",
         rf"{STATES}|ang|jerk|target|desired",
@@ -72,7 +77,9 @@ def place_of(plain: str) -> str | None:
     tokens = plain.split()
     for wheel, spellings in PLACES.items():
         for spelling in spellings:
-            if spelling in tokens or (" " in spelling and all(part in plain for part in spelling.split())):
+            if spelling in tokens or (
+                " " in spelling and all(part in plain for part in spelling.split())
+            ):
                 return wheel
     return None
 
@@ -90,7 +97,11 @@ def draft(signals: Mapping[str, str], name: str) -> Profile:
         plain = words(signal if field in ("", "data") else field)
         if (channel := _channel(plain, signal)) and channel not in channels:
             channels[channel] = _entry(channel, signal, unit, plain)
-    if "delta_fl" in channels and "delta_fr" not in channels and channels["delta_fl"].at == "steering wheel":
+    if (
+        "delta_fl" in channels
+        and "delta_fr" not in channels
+        and channels["delta_fl"].at == "steering wheel"
+    ):
         channels["delta_fr"] = channels["delta_fl"]
     about = "Drafted from names: look at every signal, unit and sign, then let `edge-agent check` do it again."
     order = {channel: channels[channel] for channel in QUANTITY if channel in channels}
@@ -120,7 +131,11 @@ def _fits(plain: str, rule: Rule) -> bool:
 def _entry(channel: str, signal: str, unit: str, plain: str) -> Channel:
     message, dot, short = signal.partition(".")
     bus = bool(dot) and not signal.startswith("/")
-    wheel = channel.startswith("delta") and place_of(plain) is None and not re.search(r"^delta|road|front", plain)
+    wheel = (
+        channel.startswith("delta")
+        and place_of(plain) is None
+        and not re.search(r"^delta|road|front", plain)
+    )
     return Channel(
         signal=short if bus else signal,
         message=message if bus else None,

@@ -41,20 +41,38 @@ class Channel(Part):
     """Where a channel comes from, and what makes SI of it."""
 
     signal: Annotated[list[Text] | Text, Field(description="name, or names that are added")]
-    message: Annotated[Text | None, Field(description="CAN message; else the signal's name is whole")] = None
-    source: Annotated[Text | None, Field(description="file name it must come from, where several have it")] = None
-    bus: Annotated[int | None, Field(ge=0, le=255, description="CAN bus; else the one that has the messages")] = None
+    message: Annotated[
+        Text | None, Field(description="CAN message; else the signal's name is whole")
+    ] = None
+    source: Annotated[
+        Text | None, Field(description="file name it must come from, where several have it")
+    ] = None
+    bus: Annotated[
+        int | None, Field(ge=0, le=255, description="CAN bus; else the one that has the messages")
+    ] = None
     unit: Annotated[str | None, Field(description="of the recorded value; SI if not given")] = None
     at: Literal["road wheel", "steering wheel"] = "road wheel"
-    scale: Annotated[Finite, Field(description="beside the unit's; negative for a flipped sign")] = 1.0
+    scale: Annotated[
+        Finite, Field(description="beside the unit's; negative for a flipped sign")
+    ] = 1.0
     offset: Annotated[Finite, Field(description="added at the end, SI")] = 0.0
-    delay_s: Annotated[Finite, Field(ge=-10.0, le=10.0, description="[s] that its time stamps are late")] = 0.0
+    delay_s: Annotated[
+        Finite, Field(ge=-10.0, le=10.0, description="[s] that its time stamps are late")
+    ] = 0.0
     sign: Sign | None = None
-    valid: Annotated[dict[Text, list[Finite]], Field(description="signal -> values at which to believe it")] = {}
-    wrap: Annotated[float | None, Field(gt=0.0, description="recorded values count modulo this (status bits)")] = None
+    valid: Annotated[
+        dict[Text, list[Finite]], Field(description="signal -> values at which to believe it")
+    ] = {}
+    wrap: Annotated[
+        float | None, Field(gt=0.0, description="recorded values count modulo this (status bits)")
+    ] = None
     course: Annotated[bool, Field(description="a heading, clockwise from north")] = False
-    active: Annotated[list[Finite] | None, Field(description="values at which a flag is on; else all but 0")] = None
-    lasting: Annotated[bool, Field(description="sent when it changes: its last value holds")] = False
+    active: Annotated[
+        list[Finite] | None, Field(description="values at which a flag is on; else all but 0")
+    ] = None
+    lasting: Annotated[bool, Field(description="sent when it changes: its last value holds")] = (
+        False
+    )
 
     @property
     def signals(self) -> list[str]:
@@ -85,9 +103,13 @@ class Profile(Part):
     dbc: Annotated[Text | None, Field(description="CAN database, beside the profile")] = None
     time: Annotated[Text | None, Field(description="column that holds the time of a table")] = None
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    rate_hz: Annotated[float | None, Field(gt=0.0, le=1000.0, description="rows a second of the log")] = None
+    rate_hz: Annotated[
+        float | None, Field(gt=0.0, le=1000.0, description="rows a second of the log")
+    ] = None
     wheel_radius: Annotated[float | None, Field(gt=0.05, lt=2.0, description="[m]")] = None
-    steering_ratio: Annotated[float | None, Field(gt=1.0, lt=60.0, description="steering wheel over road wheel")] = None
+    steering_ratio: Annotated[
+        float | None, Field(gt=1.0, lt=60.0, description="steering wheel over road wheel")
+    ] = None
     channels: dict[str, Channel]
 
     @model_validator(mode="after")
@@ -109,7 +131,10 @@ class Profile(Part):
 
     def text(self) -> str:
         """As JSON, without what is not said."""
-        return json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1) + "\n"
+        return (
+            json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1)
+            + "\n"
+        )
 
 
 def shipped() -> list[str]:

@@ -53,7 +53,9 @@ def foreign(path: Path, kind: str) -> Iterator[None]:
     except InputError:
         raise
     except FileNotFoundError as error:
-        raise InputError("source", f"{path} does not exist", "give the path of a recording") from error
+        raise InputError(
+            "source", f"{path} does not exist", "give the path of a recording"
+        ) from error
     except Exception as error:  # a reader of others may raise anything over a hostile file
         reason = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise InputError(
@@ -67,8 +69,12 @@ def library(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of
     Raises:
         InputError: it is not installed.
     """
-    logging.getLogger("numexpr").setLevel(logging.WARNING)  # which tells at INFO how many threads it has
+    logging.getLogger("numexpr").setLevel(
+        logging.WARNING
+    )  # which tells at INFO how many threads it has
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InputError("source", f"needs {name}, which is not installed", f"install gripmap[{extra}]") from error
+        raise InputError(
+            "source", f"needs {name}, which is not installed", f"install gripmap[{extra}]"
+        ) from error

@@ -28,12 +28,16 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT, S, per_wheel
 from schemas.thresholds import NS
 
-logging.getLogger("numexpr").setLevel(logging.WARNING)  # it reports its threads at INFO when pandas loads it
+logging.getLogger("numexpr").setLevel(
+    logging.WARNING
+)  # it reports its threads at INFO when pandas loads it
 GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]
 REAR_STEERING: Final = per_wheel("delta")[2:]
-BLOCK_ROWS: Final = 16_384  # 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
+BLOCK_ROWS: Final = (
+    16_384  # 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,9 @@ class SignalLog:
     t: FloatArray
     signals: FloatArray
     start_ns: int | None
-    ground: FloatArray | None = None  # speed over ground (T,) [m/s], where a receiver's was imported
+    ground: FloatArray | None = (
+        None  # speed over ground (T,) [m/s], where a receiver's was imported
+    )
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
@@ -71,7 +77,9 @@ def read_log(path: Path) -> SignalLog:
             signals[:, index] = _numbers(table, name)
     signals[np.isinf(signals)] = np.nan
     _check(table, signals)
-    fill_steering(signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)])
+    fill_steering(
+        signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
+    )
     ground = _numbers(table, GROUND) if GROUND in table.column_names else None
     return SignalLog(t, signals, start_ns, ground, _context(table))
 
@@ -81,13 +89,21 @@ def _table(path: Path) -> pa.Table:
         with pq.ParquetFile(path) as file:
             present = set(file.schema_arrow.names)
             return file.read(
-                columns=[name for name in ("t", "timestamp", GROUND, *CHANNELS, *CONTEXT) if name in present]
+                columns=[
+                    name
+                    for name in ("t", "timestamp", GROUND, *CHANNELS, *CONTEXT)
+                    if name in present
+                ]
             )
     except FileNotFoundError as error:
-        raise InputError("log", f"{path} does not exist", "give the path of a signal log") from error
+        raise InputError(
+            "log", f"{path} does not exist", "give the path of a signal log"
+        ) from error
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
-        raise InputError("log", f"{path} is not a Parquet file ({reason})", "write the log as Parquet") from error
+        raise InputError(
+            "log", f"{path} is not a Parquet file ({reason})", "write the log as Parquet"
+        ) from error
 
 
 def _context(table: pa.Table) -> FloatArray | None:
@@ -106,7 +122,9 @@ def _numbers(table: pa.Table, name: str) -> FloatArray:
     try:
         values: Any = pc.cast(table[name], pa.float64())
     except pa.ArrowException as error:
-        raise InputError(name, f"is {table[name].type}, not a number", "write the column as float64") from error
+        raise InputError(
+            name, f"is {table[name].type}, not a number", "write the column as float64"
+        ) from error
     return np.array(values.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
@@ -114,7 +132,9 @@ def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
     """t [s] and the ns UTC of t = 0, None for a log that has only `t`."""
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
-        raise InputError("t", "the log has neither t nor timestamp", "add the time of each sample, t in seconds")
+        raise InputError(
+            "t", "the log has neither t nor timestamp", "add the time of each sample, t in seconds"
+        )
     if name == "t":
         t, start_ns = _numbers(table, name), None
     else:
@@ -137,25 +157,37 @@ def _timestamps(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 p
     if pa.types.is_timestamp(kind):
         column = pc.cast(pc.cast(column, pa.timestamp("ns", tz=kind.tz)), pa.int64())
     elif not pa.types.is_integer(kind) and not pa.types.is_floating(kind):
-        raise InputError("timestamp", f"is {kind}, not a time", "write an Arrow timestamp, or ns as int64")
+        raise InputError(
+            "timestamp", f"is {kind}, not a time", "write an Arrow timestamp, or ns as int64"
+        )
     values = np.asarray(column.to_numpy(zero_copy_only=False))
     if pa.types.is_floating(kind):
         first = float(values[0])
-        return np.asarray(values - first, dtype=np.float64), round(first * NS) if np.isfinite(first) else None
+        return np.asarray(values - first, dtype=np.float64), round(first * NS) if np.isfinite(
+            first
+        ) else None
     return (values - values[0]) / NS, int(values[0])
 
 
 def _check(table: pa.Table, signals: FloatArray) -> None:
     for name in NEEDED:
         if name not in table.column_names:
-            raise InputError(name, "the log has no such column", "add it in SI units (README, signal log)")
+            raise InputError(
+                name, "the log has no such column", "add it in SI units (README, signal log)"
+            )
         if np.isnan(signals[:, CHANNELS.index(name)]).all():
-            raise InputError(name, "has no reading in any row", "record the channel, or mend its conversion")
+            raise InputError(
+                name, "has no reading in any row", "record the channel, or mend its conversion"
+            )
     front = [name for name in FRONT_STEERING if name in table.column_names]
     if not front:
-        raise InputError(FRONT_STEERING[0], "the log has no such column", f"add it or {FRONT_STEERING[1]} [rad]")
+        raise InputError(
+            FRONT_STEERING[0], "the log has no such column", f"add it or {FRONT_STEERING[1]} [rad]"
+        )
     if all(np.isnan(signals[:, CHANNELS.index(name)]).all() for name in front):
-        raise InputError(front[0], "has no reading in any row", "record the channel, or mend its conversion")
+        raise InputError(
+            front[0], "has no reading in any row", "record the channel, or mend its conversion"
+        )
 
 
 def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:

@@ -20,7 +20,10 @@ DEGREES: Final = {"deg": 1.0}
 FLAG: Final = {"1": 1.0}
 TEMPERATURE: Final = {"degC": 1.0, "degF": 5.0 / 9.0, "K": 1.0}
 SHARE: Final = {"1": 1.0, "%": 0.01}
-ZEROS: Final = {"degF": 32.0, "K": 273.15}  # what is taken off before the factor: 0 degC in these units
+ZEROS: Final = {
+    "degF": 32.0,
+    "K": 273.15,
+}  # what is taken off before the factor: 0 degC in these units
 # as written by others, in lower case without blanks -> ours
 SPELLINGS: Final = {
     "m/s2": "m/s^2", "m/s²": "m/s^2", "m/s/s": "m/s^2", "ms-2": "m/s^2", "mps2": "m/s^2", "m/s**2": "m/s^2",

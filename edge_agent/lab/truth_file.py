@@ -46,7 +46,12 @@ class TruthRecorder:
     _open: dict[int, _Visit] = field(default_factory=dict)
 
     def add(
-        self, time: IntArray, position: tuple[FloatArray, FloatArray], yaw: FloatArray, mu: FloatArray, used: FloatArray
+        self,
+        time: IntArray,
+        position: tuple[FloatArray, FloatArray],
+        yaw: FloatArray,
+        mu: FloatArray,
+        used: FloatArray,
     ) -> None:
         """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share per wheel (T, N, 4)."""
         cells, sectors = grid.cell_of(*position), grid.sector_of(yaw)
@@ -55,7 +60,9 @@ class TruthRecorder:
         for n in range(len(self.names)):
             edges = [0, *(np.flatnonzero(changes[:, n]) + 1).tolist(), len(time)]
             for first, last in pairwise(edges):
-                visit = self._visit(n, int(cells[first, n]), int(sectors[first, n]), int(time[first, n]))
+                visit = self._visit(
+                    n, int(cells[first, n]), int(sectors[first, n]), int(time[first, n])
+                )
                 visit.leave = int(time[last - 1, n])
                 visit.samples += last - first
                 visit.mu += float(mean[first:last, n].sum())

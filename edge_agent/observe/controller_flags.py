@@ -72,7 +72,11 @@ def trusted_context(
     after, checked = before.copy(), context.copy()
     wheels = np.abs(signals[..., S.OMEGA : S.OMEGA + 4])
     with np.errstate(invalid="ignore"):
-        standing = np.where(np.isfinite(wheels).any(axis=-1), np.nan_to_num(wheels).max(axis=-1) < STANDING_RATE, False)
+        standing = np.where(
+            np.isfinite(wheels).any(axis=-1),
+            np.nan_to_num(wheels).max(axis=-1) < STANDING_RATE,
+            False,
+        )
     _check(after, t, standing.astype(np.float64), checked)
     return after, checked
 
@@ -80,13 +84,21 @@ def trusted_context(
 def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
     """Flags that are doubted now: index of the vehicle, name of the flag, and why."""
     return [
-        (int(n), FLAGS[flag], " and ".join(REASONS[reason] for reason in REASONS if record["doubt"][n, flag] & reason))
+        (
+            int(n),
+            FLAGS[flag],
+            " and ".join(
+                REASONS[reason] for reason in REASONS if record["doubt"][n, flag] & reason
+            ),
+        )
         for n, flag in np.argwhere(record["doubt"] > 0)
     ]
 
 
 @compiled
-def _check(flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray) -> None:
+def _check(
+    flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
+) -> None:
     """Sequential core of `trusted_context`: moves the records on, and takes doubtful flags out of the context."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
@@ -95,7 +107,11 @@ def _check(flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, cont
                 if not np.isfinite(value):
                     continue
                 record = flags[n, i]
-                dt = min(max(t[k, n] - record.time, 0.0), MOST_STEP_S) if np.isfinite(record.time) else 0.0
+                dt = (
+                    min(max(t[k, n] - record.time, 0.0), MOST_STEP_S)
+                    if np.isfinite(record.time)
+                    else 0.0
+                )
                 record.time = t[k, n]
                 _count(record, dt, value > 0.5, standing[k, n] > 0.5)
                 if value > 0.5 and record.doubt > 0:

@@ -38,7 +38,9 @@ FELT_S: Final = 0.06  # smoothing of the accelerometers: their largest reading w
 # What was felt belongs to the cell so near a fix in it, and once as much of it is behind as a fix may be wrong: of ice
 # that was left or entered by dry road a sixth of the visits told a grip that the dry road had given.
 NEAR_FIX_M: Final = 3.0
-EXCLUDED_NATS: Final = -3.0  # what is less likely by so much was not the friction of a part that has ended
+EXCLUDED_NATS: Final = (
+    -3.0
+)  # what is less likely by so much was not the friction of a part that has ended
 
 
 class RecordBlock(NamedTuple):
@@ -70,10 +72,14 @@ class Visit:
     from_fix: float  # since the last fix in the cell [m]; infinite after one outside
     part_time: int  # at which its last part began: the friction was another before [ns]
     parts: int  # that ended before
-    earlier: Annotated[FloatArray, mugrid.BINS]  # log-likelihood of these, the larger of each: it was one or the other
+    earlier: Annotated[
+        FloatArray, mugrid.BINS
+    ]  # log-likelihood of these, the larger of each: it was one or the other
     earlier_used: float  # least that was used in one of them
     known: Annotated[FloatArray, len(CONTEXT)]  # samples at which each context signal was known
-    told: Annotated[FloatArray, len(CONTEXT)]  # its sum over these; of a flag the samples at which it was on
+    told: Annotated[
+        FloatArray, len(CONTEXT)
+    ]  # its sum over these; of a flag the samples at which it was on
     driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
     braking: float
     left: float
@@ -126,9 +132,15 @@ def observe(
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
     notes = _notes(estimates, context)
-    count = _visit(time, located, _samples(estimates, signals), notes, after.visits, ended, config.position_std)
+    count = _visit(
+        time, located, _samples(estimates, signals), notes, after.visits, ended, config.position_std
+    )
     ended = ended[:count]
-    return after, _observations(ended, estimates.evidence, config), _states(after, time, located, estimates, config)
+    return (
+        after,
+        _observations(ended, estimates.evidence, config),
+        _states(after, time, located, estimates, config),
+    )
 
 
 class SampleNotes(NamedTuple):
@@ -189,7 +201,10 @@ def _visit(
                 if k < len(notes.context):
                     _add_context(visit, notes.context[k, n])
                 if located.inside[k, n]:
-                    visit.latitude, visit.longitude = located.latitude[k, n], located.longitude[k, n]
+                    visit.latitude, visit.longitude = (
+                        located.latitude[k, n],
+                        located.longitude[k, n],
+                    )
                     visit.yaw = located.yaw[k, n]
                 if notes.row[k, n] >= 0:
                     _begin_part(visit, time[k, n], notes.told[notes.row[k, n]])
@@ -199,7 +214,13 @@ def _visit(
 @compiled
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     """A record becomes a visit without a sample."""
-    visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = time, cell, sector, 0, 0
+    visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = (
+        time,
+        cell,
+        sector,
+        0,
+        0,
+    )
     visit.driving, visit.braking, visit.left, visit.right, visit.felt = 0.0, 0.0, 0.0, 0.0, np.inf
     visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
     visit.travelled, visit.from_fix = 0.0, 0.0
@@ -268,7 +289,9 @@ def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
 
 
 def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
-    return {name: columns[name].astype(dtype, copy=False) for name, dtype in column_types(kind).items()}
+    return {
+        name: columns[name].astype(dtype, copy=False) for name, dtype in column_types(kind).items()
+    }
 
 
 def _directions(ended: RecordArray) -> dict[str, FloatArray]:
@@ -280,8 +303,12 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
     whole = np.where(along + across > 0.0, along + across, np.nan)
     used = _used(ended)
     return {
-        "used_longitudinal": used * np.sqrt(along / whole) * np.where(ended["driving"] >= ended["braking"], 1.0, -1.0),
-        "used_lateral": used * np.sqrt(across / whole) * np.where(ended["left"] >= ended["right"], 1.0, -1.0),
+        "used_longitudinal": used
+        * np.sqrt(along / whole)
+        * np.where(ended["driving"] >= ended["braking"], 1.0, -1.0),
+        "used_lateral": used
+        * np.sqrt(across / whole)
+        * np.where(ended["left"] >= ended["right"], 1.0, -1.0),
     }
 
 
@@ -291,11 +318,22 @@ def _used(ended: RecordArray) -> FloatArray:
     return np.asarray(np.minimum(last, ended["earlier_used"]))
 
 
-def _observations(ended: RecordArray, evidence: FloatArray | None, config: AgentConfig) -> RecordBlock:
+def _observations(
+    ended: RecordArray, evidence: FloatArray | None, config: AgentConfig
+) -> RecordBlock:
     n = len(ended)
     mu, upper = ended["mu"], ended["mu_upper"]
     used = _used(ended)
-    carried = ("enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "yaw", "health")
+    carried = (
+        "enter_time",
+        "leave_time",
+        "cell",
+        "sector",
+        "latitude",
+        "longitude",
+        "yaw",
+        "health",
+    )
     columns: dict[str, NDArray[np.generic]] = {
         **{name: ended[name] for name in (*carried, "mu", "mu_lower", "mu_upper")},
         "mu_utilised": used,
@@ -309,7 +347,9 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
     }
     limit = config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
-    return RecordBlock(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent)
+    return RecordBlock(
+        Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent
+    )
 
 
 def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
@@ -362,4 +402,9 @@ def _states(
             for name in ("vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health")
         },
     }
-    return RecordBlock(Kind.STATE, _typed(Kind.STATE, columns), n.astype(np.int64), np.zeros(len(k), dtype=np.bool_))
+    return RecordBlock(
+        Kind.STATE,
+        _typed(Kind.STATE, columns),
+        n.astype(np.int64),
+        np.zeros(len(k), dtype=np.bool_),
+    )

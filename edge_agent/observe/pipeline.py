@@ -69,9 +69,19 @@ class Pipeline:
             self._open, block.time, located, estimates, self._config, block.signals, context
         )
         self._last = block
-        self.seen = Seen(located.latitude[-1], located.longitude[-1], located.yaw[-1], estimates.vx[-1], block.time[-1])
+        self.seen = Seen(
+            located.latitude[-1],
+            located.longitude[-1],
+            located.yaw[-1],
+            estimates.vx[-1],
+            block.time[-1],
+        )
         self.grip = Grip(
-            estimates.mu[-1], estimates.mu_lower[-1], estimates.mu_upper[-1], estimates.mu_utilised[-1], block.time[-1]
+            estimates.mu[-1],
+            estimates.mu_lower[-1],
+            estimates.mu_upper[-1],
+            estimates.mu_utilised[-1],
+            block.time[-1],
         )
         cell, sector = located.cell[-1], located.sector[-1]
         self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)

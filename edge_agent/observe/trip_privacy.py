@@ -68,7 +68,9 @@ class TripEnds:
 
     def _forget(self) -> None:
         """Drop the way before the oldest record that waits."""
-        waiting = [r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)]
+        waiting = [
+            r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
+        ]
         oldest = min(waiting, default=self._times[-1].min())
         while len(self._times) > 2 and self._times[1].max() <= oldest:
             del self._times[0], self._odometers[0]
@@ -80,16 +82,24 @@ class TripEnds:
         for n in np.unique(vehicle).tolist():
             rows = vehicle == n
             since = times[0, n]
-            out[rows] = np.interp((time[rows] - since) / NS, (times[:, n] - since) / NS, odometers[:, n])
+            out[rows] = np.interp(
+                (time[rows] - since) / NS, (times[:, n] - since) / NS, odometers[:, n]
+            )
         return out
 
 
-def _selected(records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> RecordBlock:
+def _selected(
+    records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> RecordBlock:
     columns = {name: column[rows] for name, column in records.columns.items()}
     return RecordBlock(records.kind, columns, records.vehicle[rows], records.urgent[rows])
 
 
 def _joined(first: RecordBlock, second: RecordBlock) -> RecordBlock:
-    columns = {name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns}
-    vehicle, urgent = (np.concatenate([getattr(r, n) for r in (first, second)]) for n in ("vehicle", "urgent"))
+    columns = {
+        name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns
+    }
+    vehicle, urgent = (
+        np.concatenate([getattr(r, n) for r in (first, second)]) for n in ("vehicle", "urgent")
+    )
     return RecordBlock(first.kind, columns, vehicle, urgent)

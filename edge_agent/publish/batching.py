@@ -51,7 +51,9 @@ class _Group:
 class Batcher:
     """Collects records of the named vehicles; at most `rows` per batch, waiting at most `flush_s`."""
 
-    def __init__(self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int) -> None:
+    def __init__(
+        self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int
+    ) -> None:
         self._names, self._boot, self._estimator = tuple(names), boot, estimator
         self._flush_s, self._rows = flush_s, rows
         self._groups: dict[_Place, _Group] = {}
@@ -90,7 +92,10 @@ class Batcher:
             if not ready:
                 continue
             del self._groups[place]
-            joined = {name: np.concatenate([part[name] for part in group.parts]) for name in group.parts[0]}
+            joined = {
+                name: np.concatenate([part[name] for part in group.parts])
+                for name in group.parts[0]
+            }
             for first, last in _runs(joined[_TIME[place.kind]], ready, self._rows):
                 drafts.append(self._draft(place, _slice(joined, first, last)))
             if ready < group.rows:
@@ -100,7 +105,16 @@ class Batcher:
 
     def _draft(self, place: _Place, columns: Columns) -> Draft:
         name = self._names[place.vehicle]
-        batch = Batch(place.kind, name, self._boot, place.region, UNNUMBERED, UNNUMBERED, columns, self._estimator)
+        batch = Batch(
+            place.kind,
+            name,
+            self._boot,
+            place.region,
+            UNNUMBERED,
+            UNNUMBERED,
+            columns,
+            self._estimator,
+        )
         return Draft(name, place.kind, place.region, batch.rows, partial(_encode_batch, batch))
 
 

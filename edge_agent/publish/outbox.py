@@ -29,8 +29,12 @@ from edge_agent.publish.pacing import Pacer
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
-FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
-LONGEST_RESEND_S = 6.0  # for an answer of a service that does answer; see `pacing` for one that does not
+FIRST_RESEND_S = (
+    2.0  # a service writes a segment each second: an answer younger than this is on its way
+)
+LONGEST_RESEND_S = (
+    6.0  # for an answer of a service that does answer; see `pacing` for one that does not
+)
 # A batch that no service can read is answered by none. Once so many later ones of its stream were settled, a service is
 # about to take no more (it remembers 65 536 above one that is missing), so that this one must go.
 PASSED_OVER = 50_000
@@ -69,7 +73,9 @@ class OutboxCounts:
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
     damaged: int = 0  # records that damage took, as far as it is known
-    unanswered: int = 0  # records of batches that were given up since nobody answers them, only later ones
+    unanswered: int = (
+        0  # records of batches that were given up since nobody answers them, only later ones
+    )
     damages: int = 0  # times that the file was found damaged
 
 
@@ -119,7 +125,9 @@ class Outbox:
         self.counts = OutboxCounts()
         self._random = random.Random(self.boot)
         self._entries: dict[int, _Entry] = {}
-        self._oldest: dict[Kind, deque[int]] = {kind: deque() for kind in Kind}  # keys in their order, gone ones too
+        self._oldest: dict[Kind, deque[int]] = {
+            kind: deque() for kind in Kind
+        }  # keys in their order, gone ones too
         self._streams: dict[Stream, _Sequence] = {}
         self._pacers: dict[tuple[str, int], Pacer] = {}
         self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
@@ -149,13 +157,19 @@ class Outbox:
         before = sum(entry.records for entry in self._entries.values())
         self._database, _ = spool_file.recover_file(self._path)
         self.counts.damages += 1
-        own = {stream: sequence for stream, sequence in self._streams.items() if stream.boot == self.boot}
+        own = {
+            stream: sequence
+            for stream, sequence in self._streams.items()
+            if stream.boot == self.boot
+        }
         for sequence in own.values():
             sequence.held.clear()
         self._entries, self._oldest, self._streams = {}, {kind: deque() for kind in Kind}, own
         self._pacers, self._later, self._deletable, self._bytes = {}, [], [], 0
         self._restore()
-        self.counts.damaged += max(before - sum(entry.records for entry in self._entries.values()), 0)
+        self.counts.damaged += max(
+            before - sum(entry.records for entry in self._entries.values()), 0
+        )
 
     def _pacer(self, entry: _Entry) -> Pacer:
         return self._pacers.setdefault((entry.stream.vehicle, entry.stream.region), Pacer())
@@ -194,11 +208,17 @@ class Outbox:
     def records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
         """Return the number of records in held batches of some vehicles, of one kind or of all."""
         held = list(self._entries.values())
-        return sum(e.records for e in held if e.stream.vehicle in vehicles and kind in (None, e.stream.kind))
+        return sum(
+            e.records
+            for e in held
+            if e.stream.vehicle in vehicles and kind in (None, e.stream.kind)
+        )
 
     def stranded(self, vehicles: Collection[str]) -> int:
         """Return the number of records of other vehicles than these: of a former name, which is not sent."""
-        return sum(e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles)
+        return sum(
+            e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles
+        )
 
     @property
     def bytes(self) -> int:
@@ -252,7 +272,10 @@ class Outbox:
     def _mark_in_flight(self, key: int, now: float) -> None:
         """Mark a batch as in flight, and set the time of its next resend."""
         entry = self._entries[key]
-        delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
+        delay = min(
+            max(LONGEST_RESEND_S, self.first_resend_s),
+            self.first_resend_s * 2.0 ** min(entry.attempts, 16),
+        )
         entry.attempts += 1
         entry.due = now + delay * self._jitter()
         heapq.heappush(self._later, (entry.due, key))
@@ -281,7 +304,9 @@ class Outbox:
                     self.counts.evicted[kind] += self._forget(key).records
 
     def _delete(self) -> None:
-        self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable])
+        self._database.executemany(
+            "DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable]
+        )
 
     def delete_settled(self) -> None:
         """Delete settled batches from the disk now, without waiting for the next `store`. Raises sqlite3.Error."""
@@ -307,7 +332,9 @@ class Outbox:
         self.counts.settled += records
         return records
 
-    def due(self, now: float, limit: int, vehicles: Collection[str] | None = None) -> list[StoredBatch]:
+    def due(
+        self, now: float, limit: int, vehicles: Collection[str] | None = None
+    ) -> list[StoredBatch]:
         """Return at most `limit` batches to send now, oldest first, of these vehicles or of all; `pacing` decides how
         many.
 
@@ -330,7 +357,9 @@ class Outbox:
                 for key in taken:
                     self._mark_in_flight(key, now)
                 keys += taken
-        self._pacers = {name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent}
+        self._pacers = {
+            name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent
+        }
         return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
 
     def _is_passed_over(self, entry: _Entry) -> bool:
@@ -349,7 +378,9 @@ class Outbox:
         query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
         if row is None or (row[-1] is not None and spool_file.checksum(row[:6], row[6]) != row[-1]):
-            self.counts.damaged += max(self._forget(key).records, 1)  # the number may be what is damaged
+            self.counts.damaged += max(
+                self._forget(key).records, 1
+            )  # the number may be what is damaged
             return None
         return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
 

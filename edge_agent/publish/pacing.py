@@ -55,7 +55,9 @@ class Pacer:
         self._unanswered_since: float | None = None  # since when an answer is
         self._halved = -float("inf")
         self._answered = False
-        self._stale = 0  # of those that fly, put before the silence: that they are lost says nothing
+        self._stale = (
+            0  # of those that fly, put before the silence: that they are lost says nothing
+        )
         self._probe_at, self._probe_s, self._turn = 0.0, FIRST_PROBE_S, 0
 
     @property
@@ -96,7 +98,11 @@ class Pacer:
         self.flying -= 1
         if self.silent:
             return
-        if not self._answered and self._unanswered_since is not None and now - self._unanswered_since >= SILENT_S:
+        if (
+            not self._answered
+            and self._unanswered_since is not None
+            and now - self._unanswered_since >= SILENT_S
+        ):
             self.silent, self._probe_s = True, FIRST_PROBE_S
             self._probe_at = now + jitter * self._probe_s
         elif self._stale > 0:

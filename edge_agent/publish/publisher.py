@@ -35,7 +35,9 @@ WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
 RESEND_PER_VEHICLE: Final = 4  # of these on average; a link waits between two messages of one kind
 CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
-CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
+CLOSE_GRACE_S: Final = (
+    0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
+)
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +51,9 @@ class Counts:
     acknowledged: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     rejected: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
-    late: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))  # batches, not records
+    late: dict[Kind, int] = field(
+        default_factory=lambda: dict.fromkeys(Kind, 0)
+    )  # batches, not records
     resent_batches: int = 0
     bad_acks: int = 0
     failures: int = 0  # of the sending thread, which goes on
@@ -75,7 +79,9 @@ class Publisher:
         self._names = dict.fromkeys(names)
         self._outbox, self._config, self._clock = outbox, config, clock
         self._wall, self.clock_behind_s = wall, 0.0
-        self._batcher = Batcher(names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
+        self._batcher = Batcher(
+            names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows
+        )
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         self._links: dict[str, Link] = {}
@@ -136,7 +142,11 @@ class Publisher:
     @property
     def broken(self) -> bool:
         """True if the sending thread has died: records are accepted, and dropped when there is no room."""
-        return self._sender.ident is not None and not self._sender.is_alive() and not self._closing.is_set()
+        return (
+            self._sender.ident is not None
+            and not self._sender.is_alive()
+            and not self._closing.is_set()
+        )
 
     def unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of unsettled records: in the outbox, also of an earlier start, or on their way to it."""
@@ -174,7 +184,9 @@ class Publisher:
         try:
             self._outbox.close()
         except sqlite3.Error as error:
-            log.warning("the outbox cannot be tidied (%s); settled batches will be sent again", error)
+            log.warning(
+                "the outbox cannot be tidied (%s); settled batches will be sent again", error
+            )
         return True
 
     def _connect(self) -> None:
@@ -252,7 +264,9 @@ class Publisher:
         try:
             batches = self._outbox.store(self._waiting, self._clock())
         except sqlite3.Error as error:
-            log.warning("the outbox refuses %d batches (%s); trying again", len(self._waiting), error)
+            log.warning(
+                "the outbox refuses %d batches (%s); trying again", len(self._waiting), error
+            )
             for draft in self._waiting[:-WAITING_LIMIT]:
                 self.counts.dropped[draft.kind] += draft.records
             self._waiting = self._waiting[-WAITING_LIMIT:]
@@ -294,7 +308,10 @@ class Publisher:
             return
         behind = (reported - self._wall()) / NS
         if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
-            log.warning("the clock is %.0f s behind the service's: reports come late, or are refused", behind)
+            log.warning(
+                "the clock is %.0f s behind the service's: reports come late, or are refused",
+                behind,
+            )
         self.clock_behind_s = behind
 
     def _check_connections(self) -> None:
@@ -328,4 +345,11 @@ class Publisher:
                     records = self._outbox.settle(stream, [(seq, seq)])
                     self.counts.rejected[ack.kind] += records
                     if records:
-                        log.warning("%s batch %d of %s was rejected at row %d: %s", ack.kind, seq, vehicle, row, reason)
+                        log.warning(
+                            "%s batch %d of %s was rejected at row %d: %s",
+                            ack.kind,
+                            seq,
+                            vehicle,
+                            row,
+                            reason,
+                        )

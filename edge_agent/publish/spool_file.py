@@ -30,7 +30,17 @@ NAME: Final = "vehicle, boot, kind, region, seq, records"
 DAMAGED: Final = "damaged"  # ending of a file set aside; with a number
 _MAGIC: Final = b"SQLite format 3\0"
 _SIMILAR: Final = 12  # of its bytes: another file that begins so is none of ours, and is left alone
-TYPES: Final = (object, str, int, str, int, int, int, bytes, int | None)  # of the columns; the id is the row's own
+TYPES: Final = (
+    object,
+    str,
+    int,
+    str,
+    int,
+    int,
+    int,
+    bytes,
+    int | None,
+)  # of the columns; the id is the row's own
 _CORRUPT: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 Row = tuple[object, ...]
@@ -59,13 +69,21 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
         except sqlite3.DatabaseError as error:
             if not is_damage(error) or not _ours(path):
                 raise
-            log.warning("the outbox %s is damaged (%s): set aside, and what can be read is saved", path, error)
+            log.warning(
+                "the outbox %s is damaged (%s): set aside, and what can be read is saved",
+                path,
+                error,
+            )
             return recover_file(path)
     except (sqlite3.Error, OSError) as error:
         if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
-            raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
+            raise InputError(
+                "spool", f"{path} is used by another agent", "give each agent its own"
+            ) from error
         problem = f"{path} cannot be opened ({error})"
-        raise InputError("spool", problem, "name a writable place, or move the file aside") from error
+        raise InputError(
+            "spool", problem, "name a writable place, or move the file aside"
+        ) from error
 
 
 def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
@@ -73,8 +91,16 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
 
     Raises sqlite3.Error or OSError if the disk refuses.
     """
-    aside = next(p for n in range(1, 10_000) if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists())
-    for ending in ("-wal", "-shm", ""):  # its name last: a crash in between leaves it to be found damaged again
+    aside = next(
+        p
+        for n in range(1, 10_000)
+        if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists()
+    )
+    for ending in (
+        "-wal",
+        "-shm",
+        "",
+    ):  # its name last: a crash in between leaves it to be found damaged again
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
     sync_directory(path.parent)
@@ -83,7 +109,8 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
     with database:
         for row in _readable(aside):
             database.execute(
-                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                row,
             )
             saved += 1
     log.warning("%d batches were saved from %s", saved, aside)
@@ -122,9 +149,13 @@ def _readable(path: Path) -> list[Row]:
     """Return the batches of a damaged file by age, each once, with a correct checksum or from before checksums."""
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}
-    for key, values in salvage.recover_rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
+    for key, values in salvage.recover_rows(
+        path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""
+    ):
         values += [None] * (len(TYPES) - len(values))
-        if len(values) != len(TYPES) or not all(isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)):
+        if len(values) != len(TYPES) or not all(
+            isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)
+        ):
             continue
         name, payload, given = tuple(values[1:7]), values[7], values[8]
         assert isinstance(payload, bytes)

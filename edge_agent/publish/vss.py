@@ -27,7 +27,9 @@ DIGITS: Final = 1
 _TOPIC: Final = keys.TOPICS["vss"]
 
 
-def road_friction(mu: float, mu_lower: float, mu_upper: float, mu_utilised: float) -> dict[str, float]:
+def road_friction(
+    mu: float, mu_lower: float, mu_upper: float, mu_utilised: float
+) -> dict[str, float]:
     """Return the known signals [%]; {} if none is known.
 
     Args:
@@ -59,7 +61,9 @@ class RoadFrictionOutput:
 
     def attach(self, name: str, session: zenoh.Session) -> None:
         """Use a vehicle's session, which is open now."""
-        self.publishers[name] = session.declare_publisher(keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC))
+        self.publishers[name] = session.declare_publisher(
+            keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
+        )
 
     def tell(self, grip: Grip | None) -> None:
         """Report the current belief. Never waits: a message that finds no room is dropped."""
@@ -69,8 +73,12 @@ class RoadFrictionOutput:
         self._due = now + self._step_ns
         for k, name in enumerate(self._names):
             known = road_friction(*(float(column[k]) for column in grip[:4]))
-            at = datetime.fromtimestamp(int(grip.time[k]) / NS, UTC).isoformat(timespec="milliseconds")
-            line = json.dumps({"event": "vss", "vehicle": name, "time": at.replace("+00:00", "Z"), **known})
+            at = datetime.fromtimestamp(int(grip.time[k]) / NS, UTC).isoformat(
+                timespec="milliseconds"
+            )
+            line = json.dumps(
+                {"event": "vss", "vehicle": name, "time": at.replace("+00:00", "Z"), **known}
+            )
             self._say(line)
             publisher = self.publishers.get(name)
             if publisher is not None and publisher.matching_status.matching:

@@ -17,13 +17,16 @@ from schemas.runtime.link_watch import LinkWatch
 from schemas.runtime.zenoh_session import open_session, quality_of
 from schemas.wire import ENCODING, MESSAGES_PER_S, Kind
 
-GAP_S: Final = 2.0 / MESSAGES_PER_S  # twice what a router asks for, because networks move messages together
+GAP_S: Final = (
+    2.0 / MESSAGES_PER_S
+)  # twice what a router asks for, because networks move messages together
 
 log = logging.getLogger(__name__)
 _TOPIC: Final = {Kind.OBSERVATION: keys.TOPICS["obs"], Kind.STATE: keys.TOPICS["state"]}
 _KEY: Final = {Kind.OBSERVATION: keys.observation_key, Kind.STATE: keys.state_key}
 _QUALITY: Final = {
-    kind: {"encoding": zenoh.Encoding(ENCODING[kind]), **quality_of(topic)} for kind, topic in _TOPIC.items()
+    kind: {"encoding": zenoh.Encoding(ENCODING[kind]), **quality_of(topic)}
+    for kind, topic in _TOPIC.items()
 }
 
 
@@ -51,7 +54,10 @@ class Link:
 
     @staticmethod
     def open(
-        settings: ZenohSettings, vehicle: str, on_ack: Callable[[str, bytes], None], stop: threading.Event
+        settings: ZenohSettings,
+        vehicle: str,
+        on_ack: Callable[[str, bytes], None],
+        stop: threading.Event,
     ) -> Link | None:
         """Wait for a router and open the session; None if `stop` was set before."""
         session = open_session(settings, stop, vehicle)

@@ -59,7 +59,9 @@ class QueryEngine:
         else:
             self.connection = ibis.duckdb.connect()
             self.connection.raw_sql("SET TimeZone = 'UTC'")
-            self.connection.raw_sql("SET parquet_metadata_cache = true")  # footers once, for questions about few rows
+            self.connection.raw_sql(
+                "SET parquet_metadata_cache = true"
+            )  # footers once, for questions about few rows
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
@@ -88,7 +90,9 @@ class QueryEngine:
         t = t.filter(t.time >= self.part.since // NS, t.time < -(-self.part.until // NS))
         if self.part.bbox is not None:
             west, south, east, north = self.part.bbox
-            t = t.filter(t.longitude >= west, t.longitude < east, t.latitude >= south, t.latitude < north)
+            t = t.filter(
+                t.longitude >= west, t.longitude < east, t.latitude >= south, t.latitude < north
+            )
         return t
 
     def maps(self) -> Table:
@@ -99,7 +103,9 @@ class QueryEngine:
         """
         paths = self.files("map")
         if not paths:
-            raise InputError("archive", f"no snapshots of the map in {self.root}", "let the service take some")
+            raise InputError(
+                "archive", f"no snapshots of the map in {self.root}", "let the service take some"
+            )
         return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
 
     def rows(self) -> int:
@@ -111,21 +117,27 @@ class QueryEngine:
         found: pa.Table = expression.to_pyarrow()
         return found
 
-    def _read(self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*") -> Table:
+    def _read(
+        self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
+    ) -> Table:
         """Return a table of files, with whole seconds since 1970 for one column; the engines count them differently."""
         texts = [str(path) for path in paths]
         if self._spark is None:
             quoted = ", ".join("'" + text.replace("'", "''") + "'" for text in texts)
             files = f"read_parquet([{quoted}], hive_partitioning = true, union_by_name = true)"
             whole = f"epoch_us({moment}) // 1000000 AS {seconds}"
-            self.connection.raw_sql(f"CREATE OR REPLACE VIEW {name} AS SELECT {columns}, {whole} FROM {files}")
+            self.connection.raw_sql(
+                f"CREATE OR REPLACE VIEW {name} AS SELECT {columns}, {whole} FROM {files}"
+            )
         else:
             found = (
                 self._spark.read.option("basePath", str(self.root / NAMES[name]))
                 .option("mergeSchema", "true")
                 .parquet(*texts)
             )
-            found.selectExpr(*columns.split(", "), f"unix_seconds({moment}) AS {seconds}").createOrReplaceTempView(name)
+            found.selectExpr(
+                *columns.split(", "), f"unix_seconds({moment}) AS {seconds}"
+            ).createOrReplaceTempView(name)
         return self.connection.table(name)
 
 

@@ -50,7 +50,9 @@ def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the example."""
     parser = argparse.ArgumentParser(prog="python -m fleet_service.analytics.example")
-    parser.add_argument("--archive", type=Path, help="a compacted one; without it, one that nobody drove is made")
+    parser.add_argument(
+        "--archive", type=Path, help="a compacted one; without it, one that nobody drove is made"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the figures")
     arguments = parser.parse_args(argv)
     root = arguments.archive

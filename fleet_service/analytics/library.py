@@ -34,10 +34,15 @@ def ask_archive(
     root = Path(archive)
     require_archive(root)
     asked = question_of(question)
-    return asked.ask(QueryEngine(engine, root, _part(since, until, bbox)), options or Options(report=lambda _: None))
+    return asked.ask(
+        QueryEngine(engine, root, _part(since, until, bbox)),
+        options or Options(report=lambda _: None),
+    )
 
 
-def map_of_archive(archive: Path | str, *, at: str | None = None, bbox: Box | None = None) -> pa.Table:
+def map_of_archive(
+    archive: Path | str, *, at: str | None = None, bbox: Box | None = None
+) -> pa.Table:
     """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
     root = Path(archive)
     require_archive(root)

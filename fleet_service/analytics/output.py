@@ -25,19 +25,38 @@ SHOWN_ROWS: Final = 20
 PLOTS: Final = (".png", ".svg", ".pdf")
 MAP_CELLS: Final = 200_000  # of a page; more make browsers slow
 PARTS: Final = "members"  # of a row that stands for several cells
-HIDDEN: Final = ("west", "south", "east", "north", "cell")  # of the page: who points at a place sees where it is
+HIDDEN: Final = (
+    "west",
+    "south",
+    "east",
+    "north",
+    "cell",
+)  # of the page: who points at a place sees where it is
 TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
 def text(table: pa.Table, question: Question) -> str:
     """Return the first rows in the question's order, for the terminal."""
     shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
-    names = [name for name in shown.schema.names if not pa.types.is_nested(shown.schema.field(name).type)]
-    cells = [names, *([_text(name, row[name]) for name in names] for row in shown.select(names).to_pylist())]
+    names = [
+        name for name in shown.schema.names if not pa.types.is_nested(shown.schema.field(name).type)
+    ]
+    cells = [
+        names,
+        *([_text(name, row[name]) for name in names] for row in shown.select(names).to_pylist()),
+    ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(names))]
-    lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in cells]
+    lines = [
+        "  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True))
+        for row in cells
+    ]
     rest = table.num_rows - shown.num_rows
-    return "\n".join([*lines, f"{table.num_rows} rows" + (f", {rest} not shown (--out writes all)" if rest else "")])
+    return "\n".join(
+        [
+            *lines,
+            f"{table.num_rows} rows" + (f", {rest} not shown (--out writes all)" if rest else ""),
+        ]
+    )
 
 
 def lines(table: pa.Table, question: Question) -> str:
@@ -70,7 +89,11 @@ def _text(name: str, value: object) -> str:
     if name in TIMES and isinstance(value, int):
         return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
     if isinstance(value, float):
-        return f"{value:.6f}" if name in ("latitude", "longitude", "west", "south", "east", "north") else f"{value:.4g}"
+        return (
+            f"{value:.6f}"
+            if name in ("latitude", "longitude", "west", "south", "east", "north")
+            else f"{value:.4g}"
+        )
     if isinstance(value, datetime):
         return f"{value:%Y-%m-%dT%H:%M:%SZ}"
     return str(value)
@@ -104,7 +127,9 @@ def times_as_timestamps(table: pa.Table) -> pa.Table:
     """Return an answer whose seconds since 1970 are timestamps, which text files write as ISO 8601."""
     for place, field in enumerate(table.schema):
         if field.name in TIMES and pa.types.is_integer(field.type):
-            table = table.set_column(place, field.name, table[field.name].cast(pa.timestamp("s", "UTC")))
+            table = table.set_column(
+                place, field.name, table[field.name].cast(pa.timestamp("s", "UTC"))
+            )
     return table
 
 
@@ -123,8 +148,14 @@ def add_places(table: pa.Table) -> pa.Table:
 def add_geometry(table: pa.Table, question: Question) -> pa.Table:
     """Return an answer with the polygons of its cells, or of its boxes."""
     if "cell" not in table.schema.names:
-        raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
-    return geo.with_stretches(table, _members(table)) if PARTS in table.schema.names else geo.with_cells(table)
+        raise InputError(
+            "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+        )
+    return (
+        geo.with_stretches(table, _members(table))
+        if PARTS in table.schema.names
+        else geo.with_cells(table)
+    )
 
 
 def _members(table: pa.Table) -> list[list[int]]:
@@ -142,14 +173,18 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
     try:
         from fleet_service.analytics.plots import draw
     except ImportError as error:
-        raise InputError("out", "matplotlib is not installed", install_command("analytics")) from error
+        raise InputError(
+            "out", "matplotlib is not installed", install_command("analytics")
+        ) from error
     draw(table, question.name, question.about, path)
 
 
 def page(table: pa.Table, question: Question) -> str:
     """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs no network."""
     if question.colour is None or "cell" not in table.schema.names:
-        raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
+        raise InputError(
+            "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+        )
     rest, table = max(table.num_rows - MAP_CELLS, 0), table.slice(0, MAP_CELLS)
     part = None
     cells = table["cell"].to_numpy()
@@ -161,14 +196,23 @@ def page(table: pa.Table, question: Question) -> str:
     frames = _frames(table)
     known = sorted(set(frames))
     number = {name: k for k, name in enumerate(known)}
-    names = [f.name for f in table.schema if f.name not in HIDDEN and not pa.types.is_nested(f.type)]
+    names = [
+        f.name for f in table.schema if f.name not in HIDDEN and not pa.types.is_nested(f.type)
+    ]
     rows = [[_text(name, row[name]) for name in names] for row in table.select(names).to_pylist()]
-    values = [None if v is None or np.isnan(v) else round(float(v), 4) for v in table[question.colour].to_pylist()]
+    values = [
+        None if v is None or np.isnan(v) else round(float(v), 4)
+        for v in table[question.colour].to_pylist()
+    ]
     lasting: Any = table["lasts"].to_pylist() if "lasts" in table.schema.names else None
     sector: Any = table["sector"].to_pylist()
     frame = [number[name] for name in frames]
-    drawn = DrawnCells(boxes, sector, {"": values}, names, rows, part, known or [""], frame, lasting)
-    about = f"{rest:,} rows more are not drawn: ask for a smaller box or fewer days." if rest else ""
+    drawn = DrawnCells(
+        boxes, sector, {"": values}, names, rows, part, known or [""], frame, lasting
+    )
+    about = (
+        f"{rest:,} rows more are not drawn: ask for a smaller box or fewer days." if rest else ""
+    )
     return render(question.about, drawn, _scale(question, values), about=about)
 
 
@@ -176,7 +220,11 @@ def _scale(question: Question, values: list[Value]) -> Scale:
     if question.colour is not None and question.colour.startswith("mu"):
         return GRIP_SCALE
     top = max((v for v in values if v is not None), default=1.0) or 1.0
-    label = f"{question.colour}, the darker the longer" if question.colour == "duration_s" else str(question.colour)
+    label = (
+        f"{question.colour}, the darker the longer"
+        if question.colour == "duration_s"
+        else str(question.colour)
+    )
     ticks = [(share * top, f"{share * top:,.0f} s") for share in (0.0, 0.5, 1.0)]
     return Scale(label, 0.0, top, ticks, dark_is_high=True, unknown="not measured")
 
@@ -184,7 +232,10 @@ def _scale(question: Question, values: list[Value]) -> Scale:
 def _frames(table: pa.Table) -> list[str]:
     for name in ("frame", "day"):
         if name in table.schema.names:
-            return [f"{v:%Y-%m-%d %H:%M:%S}" if isinstance(v, datetime) else _day(v) for v in table[name].to_pylist()]
+            return [
+                f"{v:%Y-%m-%d %H:%M:%S}" if isinstance(v, datetime) else _day(v)
+                for v in table[name].to_pylist()
+            ]
     return [""] * table.num_rows
 
 

@@ -69,7 +69,12 @@ class DrawnCells:
 
 
 def render(
-    title: str, cells: DrawnCells, scale: Scale, *, about: str = "", table: Sequence[Sequence[str]] | None = None
+    title: str,
+    cells: DrawnCells,
+    scale: Scale,
+    *,
+    about: str = "",
+    table: Sequence[Sequence[str]] | None = None,
 ) -> str:
     """Return the page. `table` holds the lines of a table below the map, the first its heads."""
     data: dict[str, Any] = {
@@ -83,5 +88,7 @@ def render(
         "names": cells.names, "rows": cells.rows, "frames": cells.frames,
         "frame": cells.frame if cells.frame is not None else [0] * len(cells.sector), "lasting": cells.lasting,
     }  # fmt: skip
-    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no value can end or open a tag
+    text = json.dumps(data, allow_nan=False).replace(
+        "<", "\\u003c"
+    )  # no value can end or open a tag
     return _TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", text)

@@ -19,7 +19,9 @@ LATENESS_S = 120.0  # ServiceConfig.lateness_s
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
     """Return the beliefs at a moment [ns] about visited cells that touch a box [deg]."""
-    slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)  # a poor fix makes neighbours that nobody visited
+    slots = np.flatnonzero(
+        fusion.live.vehicles[: fusion.size] > 0
+    )  # a poor fix makes neighbours that nobody visited
     if box is not None:
         slots = slots[grid.touches(box, grid.bounds(fusion.cell[slots]))]
     return cell_table(fusion, slots, at)
@@ -28,12 +30,15 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
     """Return the map at the end of a part, replayed from everything received by then, as a GeoParquet table."""
     return snapshot_table(
-        visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox), part.until
+        visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox),
+        part.until,
     )
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
     """Return cells as believed at a moment [ns], as the GeoParquet table of a snapshot."""
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
-    table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
+    table = table.append_column("snapshot_time", time).sort_by(
+        [("cell", "ascending"), ("sector", "ascending")]
+    )
     return geo.with_cells(table.cast(tables.MAP_ARCHIVE, safe=False))

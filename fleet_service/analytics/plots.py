@@ -23,7 +23,9 @@ GRIP_MAP: Final = LinearSegmentedColormap.from_list("grip", GRIP)
 MU: Final = "peak adhesion μ [1]"
 MOST_ROWS: Final = 40  # spells or vehicles of a picture that can still be read
 MOST_PANELS: Final = 6
-EDGE: Final = 1.2  # points around each cell: a road of ten metres is seen on a map of ten kilometres
+EDGE: Final = (
+    1.2  # points around each cell: a road of ten metres is seen on a map of ten kilometres
+)
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
 PUBLISHED: Final = 0.9  # how often a published interval is to hold
 ARROWS: Final = "→↑←↓"  # of the headings
@@ -47,7 +49,10 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
     west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
     x, y = grid.outline(cell, sector)
-    return np.stack([(x - west.min(initial=180.0)) * scale, (y - south.min(initial=90.0)) * METRES_PER_DEGREE], axis=-1)
+    return np.stack(
+        [(x - west.min(initial=180.0)) * scale, (y - south.min(initial=90.0)) * METRES_PER_DEGREE],
+        axis=-1,
+    )
 
 
 def paint(
@@ -60,7 +65,9 @@ def paint(
             PolyCollection(list(shapes[~known]), facecolors="white", edgecolors="0.55", hatch=HATCH, linewidths=0.2,
                            label=UNKNOWN)
         )  # fmt: skip
-    patches = PolyCollection(list(shapes[known]), array=values[known], cmap=GRIP_MAP, norm=Normalize(*limits))
+    patches = PolyCollection(
+        list(shapes[known]), array=values[known], cmap=GRIP_MAP, norm=Normalize(*limits)
+    )
     patches.set(edgecolor="face", linewidth=EDGE)
     axes.add_collection(patches)
     axes.autoscale()
@@ -93,7 +100,15 @@ def _grip(figure: Figure, table: pa.Table) -> None:
 
 def _band(axes: Axes, at: float, three: FloatArray, label: str | None = None) -> None:
     low, middle, high = three
-    axes.errorbar([at], [middle], [[middle - low], [high - middle]], fmt="o", capsize=5, color=_DARK, label=label)
+    axes.errorbar(
+        [at],
+        [middle],
+        [[middle - low], [high - middle]],
+        fmt="o",
+        capsize=5,
+        color=_DARK,
+        label=label,
+    )
 
 
 def _worst(figure: Figure, table: pa.Table) -> None:
@@ -101,7 +116,9 @@ def _worst(figure: Figure, table: pa.Table) -> None:
     panels = _panels(figure, len(rows))
     for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
         cells = np.array(one["members"], np.int64)
-        patches = paint(axes, cell_shapes(cells), np.full(len(cells), one["mu"]))  # whole: all head the same way
+        patches = paint(
+            axes, cell_shapes(cells), np.full(len(cells), one["mu"])
+        )  # whole: all head the same way
         axes.set_title(
             f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} {ARROWS[one['sector']]}\n"
             f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} values", fontsize=9,
@@ -115,7 +132,9 @@ def _panels(figure: Figure, count: int) -> list[Axes]:
     columns, rows = min(count, 3) or 1, -(-count // 3) or 1
     if count > 1:
         figure.set_size_inches(4.2 * columns, 3.8 * rows)
-    panels: list[Axes] = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
+    panels: list[Axes] = (
+        np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
+    )
     for axes in panels[count:]:
         axes.set_visible(False)
     return panels
@@ -127,13 +146,23 @@ def _spells(figure: Figure, table: pa.Table) -> None:
     axes = figure.subplots()
     for k, one in enumerate(rows):
         begin, end = ((one["onset"] + extra) / DAY_S for extra in (0.0, one["duration_s"]))
-        axes.plot([begin, end], [k, k], color=_MARK if one["lasts"] else _DARK, linewidth=3, solid_capstyle="butt")
+        axes.plot(
+            [begin, end],
+            [k, k],
+            color=_MARK if one["lasts"] else _DARK,
+            linewidth=3,
+            solid_capstyle="butt",
+        )
         if one["lasts"]:
             axes.plot([end], [k], marker=">", color=_MARK)
     axes.xaxis_date(UTC)
     axes.plot([], [], color=_DARK, linewidth=3, label="ended")
     axes.plot([], [], color=_MARK, marker=">", linewidth=3, label="lasts at the end of the data")
-    axes.set(xlabel="time, UTC", ylabel="spell, by its onset", title=f"the {len(rows)} longest of {table.num_rows}")
+    axes.set(
+        xlabel="time, UTC",
+        ylabel="spell, by its onset",
+        title=f"the {len(rows)} longest of {table.num_rows}",
+    )
     axes.tick_params(axis="x", labelrotation=25)
     axes.legend(fontsize=8)
 
@@ -142,15 +171,27 @@ def _before_after(figure: Figure, table: pa.Table) -> None:
     rows = {row["period"]: row for row in table.to_pylist()}
     before, after = rows["before"], rows["after"]
     left, right = figure.subplots(1, 2, width_ratios=[2, 1])
-    left.plot([0, 1], [before["mu"], after["mu"]], "o-", color=_DARK, label="mean of the same cells")
+    left.plot(
+        [0, 1], [before["mu"], after["mu"]], "o-", color=_DARK, label="mean of the same cells"
+    )
     left.set_xticks([0, 1], ["before", "after"])
     left.set(ylabel=MU, ylim=(0.0, 1.2), xlim=(-0.5, 1.5))
-    _band(right, 0, np.array([after[name] for name in ("lower", "difference", "upper")]), "difference, 95 % interval")
+    _band(
+        right,
+        0,
+        np.array([after[name] for name in ("lower", "difference", "upper")]),
+        "difference, 95 % interval",
+    )
     right.axhline(0.0, color=_MARK, linewidth=1, label="no change")
     right.set_xticks([0], ["after - before"])
     right.set(ylabel="change of μ [1]")
-    left.set_title(f"{after['cells']} cells, {after['vehicles']} vehicles, {after['values']} values", fontsize=10)
-    right.set_title(f"{after['difference']:+.3f} [{after['lower']:+.3f}, {after['upper']:+.3f}]", fontsize=10)
+    left.set_title(
+        f"{after['cells']} cells, {after['vehicles']} vehicles, {after['values']} values",
+        fontsize=10,
+    )
+    right.set_title(
+        f"{after['difference']:+.3f} [{after['lower']:+.3f}, {after['upper']:+.3f}]", fontsize=10
+    )
     for axes in (left, right):
         axes.legend(fontsize=8)
 
@@ -167,21 +208,33 @@ def _vehicles(figure: Figure, table: pa.Table) -> None:
     axes.axvline(0.0, color=_MARK, linewidth=1)
     axes.set_yticks(at, [str(row["vehicle"])[:8] for row in rows], fontsize=6)
     axes.invert_yaxis()
-    axes.set(xlabel="bias of μ [1]", ylabel="vehicle", title=f"the {len(rows)} surest of {table.num_rows}")
+    axes.set(
+        xlabel="bias of μ [1]",
+        ylabel="vehicle",
+        title=f"the {len(rows)} surest of {table.num_rows}",
+    )
     axes.legend(fontsize=8)
 
 
 def _calibration(figure: Figure, table: pa.Table) -> None:
     axes = figure.subplots()
     basis = np.array(table["basis"].to_pylist(), str)
-    for name, marker, colour in (("measured", "o", _DARK), ("bound", "s", _LIGHT), ("borrowed", "^", _MARK)):
+    for name, marker, colour in (
+        ("measured", "o", _DARK),
+        ("bound", "s", _LIGHT),
+        ("borrowed", "^", _MARK),
+    ):
         own = table.filter(pa.array(basis == name)).sort_by("age_h")
         if own.num_rows:
             for column, line in (("held", "-"), ("compatible", ":")):
                 axes.plot(_floats(own, "age_h"), _floats(own, column), line, marker=marker, color=colour,
                           label=f"{name}: {column}")  # fmt: skip
     axes.axhline(PUBLISHED, color="0.4", linewidth=1, label=f"published: {PUBLISHED:.0%}")
-    axes.set(xlabel="hours between map and value", ylabel="share of later values inside", ylim=(0.0, 1.05))
+    axes.set(
+        xlabel="hours between map and value",
+        ylabel="share of later values inside",
+        ylim=(0.0, 1.05),
+    )
     axes.legend(fontsize=8)
 
 
@@ -195,13 +248,17 @@ def _weather(figure: Figure, table: pa.Table) -> None:
     left.set(xlabel="temperature of the nearest station [°C]", ylabel=MU, ylim=(0.0, 1.2))
     left.legend(fontsize=8)
     right.bar(t, _floats(table, "share_slippery"), width=1.6, color=_DARK)
-    right.set(xlabel="temperature [°C]", ylabel=f"share of values below {SLIPPERY_MU}", ylim=(0.0, 1.0))
+    right.set(
+        xlabel="temperature [°C]", ylabel=f"share of values below {SLIPPERY_MU}", ylim=(0.0, 1.0)
+    )
 
 
 def _replay(figure: Figure, table: pa.Table) -> None:
     frame = table["frame"].cast(pa.int64()).to_numpy()
     times = np.unique(frame)
-    times = times[np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_PANELS)).astype(int))]
+    times = times[
+        np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_PANELS)).astype(int))
+    ]
     panels = _panels(figure, len(times))
     shapes = cell_shapes(table["cell"].to_numpy(), table["sector"].to_numpy().astype(np.int64))
     for axes, time in zip(panels, times.tolist(), strict=False):
@@ -212,7 +269,9 @@ def _replay(figure: Figure, table: pa.Table) -> None:
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
     """Plot the first two numeric columns of a plug-in's question against each other."""
-    numbers = [f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)][:2]
+    numbers = [
+        f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)
+    ][:2]
     axes = figure.subplots()
     axes.plot(*(_floats(table, name) for name in numbers), "o", color=_DARK)
     axes.set(xlabel=numbers[0], ylabel=numbers[-1])

@@ -59,9 +59,13 @@ def require_empty(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
         something = next(out.iterdir(), None)
     except OSError as error:
-        raise InputError("out", f"cannot use {out} ({error.strerror})", "name a folder you may write to") from error
+        raise InputError(
+            "out", f"cannot use {out} ({error.strerror})", "name a folder you may write to"
+        ) from error
     if something is not None:
-        raise InputError("out", f"{out} holds {something.name}", "give a new folder, or empty this one")
+        raise InputError(
+            "out", f"{out} holds {something.name}", "give a new folder, or empty this one"
+        )
 
 
 def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
@@ -76,7 +80,9 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
         raise InputError("engine", f"{engine!r} is none", f"use one of {', '.join(ENGINES)}")
     zones = zones_of(wanted.root)
     if not zones:
-        raise InputError("archive", f"no compacted observations in {wanted.root}", "run fleet-service compact")
+        raise InputError(
+            "archive", f"no compacted observations in {wanted.root}", "run fleet-service compact"
+        )
     work = partial(rebuild_zone, wanted)
     yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
     sweep_drafts(wanted.out)
@@ -84,7 +90,9 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
 def zones_of(root: Path) -> list[int]:
     """Return the zones that an archive has compacted observations of."""
-    return sorted({layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)})
+    return sorted(
+        {layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)}
+    )
 
 
 def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
@@ -96,7 +104,9 @@ def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
     """
     west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
     box = (west, south, east, north)
-    cells = visited_cells(past_fusion(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
+    cells = visited_cells(
+        past_fusion(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box
+    )
     cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
     named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
     with own_drafts(wanted.out) as drafts:
@@ -119,7 +129,9 @@ def _part(path: Path) -> pa.Table | None:
         return None  # its day was retired meanwhile
 
 
-def _write_atomically(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
+def _write_atomically(
+    out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding
+) -> None:
     """Write a file atomically, also if another process writes the same one."""
     write_table(table, drafts / path.name, encoding, named=False)
     path.parent.mkdir(parents=True, exist_ok=True)

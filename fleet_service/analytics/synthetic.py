@@ -66,7 +66,12 @@ def chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
 
 
 def _chunk(
-    world: SyntheticFleet, rng: np.random.Generator, bias: FloatArray, since_s: int, span_s: int, rows: int
+    world: SyntheticFleet,
+    rng: np.random.Generator,
+    bias: FloatArray,
+    since_s: int,
+    span_s: int,
+    rows: int,
 ) -> Rows:
     trips = -(-rows // world.length)
     road, who = rng.integers(0, world.roads, trips), rng.integers(0, world.vehicles, trips)
@@ -77,13 +82,26 @@ def _chunk(
     latitude, longitude, yaw = _places(road[trip], along, rng)
     truth = truth_of(world, road[trip], along, seconds)
     excited = rng.random(rows) < _EXCITED
-    used = np.clip(truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)), 0.02, 1.2)
+    used = np.clip(
+        truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)),
+        0.02,
+        1.2,
+    )
     reported = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
-    mu = np.clip(np.where(excited, reported, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)), 0.06, 1.19)
+    mu = np.clip(
+        np.where(excited, reported, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)),
+        0.06,
+        1.19,
+    )
     half = np.where(excited, Z_95 * _STD, 0.35)
     cell = grid.cell_of(latitude, longitude)
     zeros = np.zeros(rows, np.int64)
-    names = np.array([blake2b(f"{world.seed}/{v}".encode(), digest_size=8).hexdigest() for v in range(world.vehicles)])
+    names = np.array(
+        [
+            blake2b(f"{world.seed}/{v}".encode(), digest_size=8).hexdigest()
+            for v in range(world.vehicles)
+        ]
+    )
     leave = START_NS + (seconds * NS).astype(np.int64)
     found: Rows = {
         "enter_time": leave - int(CELL_S * NS) - rng.integers(0, 10**7, rows), "leave_time": leave, "cell": cell,
@@ -111,7 +129,9 @@ def _chunk(
     return {name: column[order] for name, column in round_to_steps(found).items()}
 
 
-def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _places(
+    road: IntArray, along: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
@@ -119,7 +139,11 @@ def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[
     x = np.where(north, row * 260 + 130, along + column * 260) * step
     y = np.where(north, along + column * 260, row * 260 + 130) * step * np.cos(np.radians(LATITUDE))
     noise = 0.3 * step * rng.normal(size=(2, len(road)))
-    return LATITUDE + y + noise[0] * 0.5, LONGITUDE + x + noise[1], np.where(north, np.pi / 2, 0.0) + 0.02 * noise[0]
+    return (
+        LATITUDE + y + noise[0] * 0.5,
+        LONGITUDE + x + noise[1],
+        np.where(north, np.pi / 2, 0.0) + 0.02 * noise[0],
+    )
 
 
 def night(seconds: FloatArray) -> FloatArray:
@@ -127,19 +151,27 @@ def night(seconds: FloatArray) -> FloatArray:
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
 
-def truth_of(world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray) -> FloatArray:
+def truth_of(
+    world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray
+) -> FloatArray:
     """Return the friction: dry, and ice on the middle fifth of icy roads in the small hours."""
     middle = np.abs(along - world.length // 2) < world.length // 10
     return np.where((road % world.icy == 0) & middle & (night(seconds) > 0.5), ICE, DRY)
 
 
-def _likelihoods(rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray) -> ByteArray:
+def _likelihoods(
+    rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
+) -> ByteArray:
     """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a bound."""
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)
     below = 0.5 * np.square(distance / flank[0]) * (distance < 0)
     above = 0.5 * np.square(distance / flank[1]) * (distance > 0) * excited[:, None]
-    floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(np.float32)  # contamination: nothing falls below
+    floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(
+        np.float32
+    )  # contamination: nothing falls below
     slope = rng.uniform(0.0, 1.5, (len(mu), 1)).astype(np.float32) * np.abs(distance)
     nats = np.minimum(below + above, floor) + slope * excited[:, None]
-    return np.asarray(np.clip(np.rint((nats - nats.min(axis=1, keepdims=True)) * 16), 0, 255).astype(np.uint8))
+    return np.asarray(
+        np.clip(np.rint((nats - nats.min(axis=1, keepdims=True)) * 16), 0, 255).astype(np.uint8)
+    )

@@ -35,5 +35,7 @@ def run_module(
                     child.terminate()
                     return None
     if child.returncode:
-        raise InputError(what, errors.strip() or f"ended with {child.returncode}", "it is tried again")
+        raise InputError(
+            what, errors.strip() or f"ended with {child.returncode}", "it is tried again"
+        )
     return output.strip()

@@ -15,9 +15,13 @@ from typing import Final, NamedTuple
 from schemas.thresholds import NS
 
 JUMP_NS: Final = 60 * NS  # a step that a time server takes at once, and no report minds
-NEAR_NS: Final = 600 * NS  # of a report that tells the time: younger than that, and not from a backlog
+NEAR_NS: Final = (
+    600 * NS
+)  # of a report that tells the time: younger than that, and not from a backlog
 VOTE_NS: Final = 5 * NS  # in which every vehicle that drives has been heard
-OFF_NS: Final = 86_400 * NS  # longer than that a service is seldom off: its clock may as well be wrong
+OFF_NS: Final = (
+    86_400 * NS
+)  # longer than that a service is seldom off: its clock may as well be wrong
 ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
 
 
@@ -58,7 +62,9 @@ class SteadyClock:
         self._seen, self._began = seen, steady()
         self._confirmed = False
         self._sure = 0 <= wall() - seen <= OFF_NS
-        self._doubted: int | None = None  # since when the wall clock is elsewhere, by the steady one
+        self._doubted: int | None = (
+            None  # since when the wall clock is elsewhere, by the steady one
+        )
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
@@ -85,14 +91,18 @@ class SteadyClock:
         """Record the times [ns] that vehicles just reported."""
         now, wall = self.now(), self._wall()
         if self._doubted is None:
-            self._confirmed = self._confirmed or any(abs(reported - now) <= NEAR_NS for reported in times.values())
+            self._confirmed = self._confirmed or any(
+                abs(reported - now) <= NEAR_NS for reported in times.values()
+            )
             return
         for vehicle, reported in times.items():
             if abs(reported - wall) <= NEAR_NS:
                 self._votes[vehicle] = True
             elif abs(reported - now) <= NEAR_NS:
                 self._votes[vehicle] = False
-        if self._steady() - self._doubted >= VOTE_NS and 2 * sum(self._votes.values()) > len(self._votes):
+        if self._steady() - self._doubted >= VOTE_NS and 2 * sum(self._votes.values()) > len(
+            self._votes
+        ):
             self._zero, self._confirmed = wall - self._steady(), True
 
     def lag(self) -> int:

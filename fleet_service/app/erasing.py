@@ -25,7 +25,12 @@ from fleet_service.app.state import load_state
 from fleet_service.archive.format.layout import Cut
 from fleet_service.archive.identity import erasure_requests
 from fleet_service.archive.identity.erasure_requests import Erasure
-from fleet_service.archive.maintenance.retention import destroy_key, erase_files, forget_witness, key_of
+from fleet_service.archive.maintenance.retention import (
+    destroy_key,
+    erase_files,
+    forget_witness,
+    key_of,
+)
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from fleet_service.replication.replica import BucketReplica
@@ -33,7 +38,9 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
 
-def handle_requests(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
+def handle_requests(
+    engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event
+) -> str | None:
     """Handle waiting requests; return a line for the operator."""
     rows = answered = 0
     for question in erasure_requests.open_requests(root):
@@ -72,20 +79,36 @@ def _erase(
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
     if vehicle is None:
-        destroyed = _reload_service(engine, lambda: destroy_key(root, wanted.month, engine.state.streams.newest), stop)
+        destroyed = _reload_service(
+            engine, lambda: destroy_key(root, wanted.month, engine.state.streams.newest), stop
+        )
         return {"rows": 0, "files": []} if destroyed else None
     cut = engine.settlement.run_between_segments(lambda: engine.settlement.newest_segment, stop)
     if cut is None:
         return None
-    request = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
-    output = beside.run_module("erasure", "fleet_service.app.erasing_process", [str(root)], stop, request)
+    request = json.dumps(
+        {
+            **asdict(wanted),
+            "config": config.model_dump(mode="json", exclude={"archive"}),
+            "cut": cut,
+        }
+    )
+    output = beside.run_module(
+        "erasure", "fleet_service.app.erasing_process", [str(root)], stop, request
+    )
     if output is None:
         return None
     answer: dict[str, Any] = json.loads(output)
-    return answer if _reload_service(engine, lambda: forget_witness(root, vehicle, wanted.month), stop) else None
+    return (
+        answer
+        if _reload_service(engine, lambda: forget_witness(root, vehicle, wanted.month), stop)
+        else None
+    )
 
 
-def _reload_service(engine: Engine, before: Callable[[], None], stop: threading.Event) -> bool | None:
+def _reload_service(
+    engine: Engine, before: Callable[[], None], stop: threading.Event
+) -> bool | None:
     """Replace the service's state after calling `before`; None if it stops first."""
 
     def work() -> bool:
@@ -104,5 +127,7 @@ def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
     with erase_files(root, request["vehicle"], request["month"]) as done:
         cut = Cut(*request["cut"])
-        checkpoints.save(root, load_state(root, ServiceConfig(**request["config"]), until=cut).image(cut, known))
+        checkpoints.save(
+            root, load_state(root, ServiceConfig(**request["config"]), until=cut).image(cut, known)
+        )
     return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

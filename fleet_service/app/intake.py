@@ -50,7 +50,12 @@ class Intake:
     """
 
     def __init__(
-        self, config: ServiceConfig, root: Path, shared: SharedState, log: SegmentLog[BatchId], counts: Counter[str]
+        self,
+        config: ServiceConfig,
+        root: Path,
+        shared: SharedState,
+        log: SegmentLog[BatchId],
+        counts: Counter[str],
     ) -> None:
         self._config = config
         self._root = root
@@ -63,7 +68,9 @@ class Intake:
         self.weather = WeatherInbox(root, config.name, shared.state.fusion, counts)
         self.reset()
         if config.weather is not None:
-            self._apply_weather(self.weather.begin(config.weather, shared.state.weather, time.time_ns()))
+            self._apply_weather(
+                self.weather.begin(config.weather, shared.state.weather, time.time_ns())
+            )
 
     def reset(self) -> None:
         """Follow a replaced state: forget budgets and paths, which belong to the former one."""
@@ -127,11 +134,15 @@ class Intake:
         """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
         places."""
         witness = rows["witness"]
-        beyond = self._paths.find_implausible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
+        beyond = self._paths.find_implausible(
+            witness, rows["leave_time"], rows["latitude"], rows["longitude"]
+        )
         self._counts["implausible_moves"] += int(beyond.sum())
         slots = self._shared.state.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64))
         new = np.flatnonzero((slots < 0) & ~beyond)
-        over = self._places.beyond(witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS)
+        over = self._places.beyond(
+            witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS
+        )
         beyond[new[over]] = True
         self._counts["too_many_places"] += int(over.sum())
         return beyond

@@ -31,10 +31,14 @@ from schemas.wire import Kind
 log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
-FOLLOW_S: Final = 30.0  # after which the archive's copy has what compaction, checkpoints and snapshots made
+FOLLOW_S: Final = (
+    30.0  # after which the archive's copy has what compaction, checkpoints and snapshots made
+)
 DAY_S: Final = 86_400.0
 ASKED_S: Final = 2.0  # between two looks whether an erasure, or a hand-over, is asked for
-SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
+SOON_S: Final = (
+    60.0  # after the start; the first turn of a job does not wait for its whole interval
+)
 HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
 _NICE: Final = 10  # the worker goes first
 
@@ -47,11 +51,15 @@ class Job(NamedTuple):
     work: Callable[[threading.Event], str | None]
 
 
-def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]) -> list[Job]:
+def archive_jobs(
+    engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]
+) -> list[Job]:
     """Return the jobs that maintain an archive, according to the settings; `moment` returns the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
-        if engine.copy is not None and engine.settlement.failing:  # compacted, its segments would never be put as such
+        if (
+            engine.copy is not None and engine.settlement.failing
+        ):  # compacted, its segments would never be put as such
             return "compaction waits for the copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)
@@ -91,7 +99,9 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         engine.counts["files_set_aside"] = count_set_aside(root)
         return None
 
-    def with_disk_space(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
+    def with_disk_space(
+        work: Callable[[threading.Event], str | None],
+    ) -> Callable[[threading.Event], str | None]:
         """Release the reserve to a job that makes room, if the disk is full."""
 
         def done(stop: threading.Event) -> str | None:
@@ -142,7 +152,9 @@ class BackgroundJobs:
         failed: number of consecutive failures per job whose last run failed.
     """
 
-    def __init__(self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> None:
+    def __init__(
+        self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]
+    ) -> None:
         self._jobs = [job for job in jobs if job.every_s]
         self._counts, self._log_line = counts, log_line
         self.failed: dict[str, int] = {}
@@ -152,7 +164,9 @@ class BackgroundJobs:
 
     def health_problems(self) -> list[str]:
         """Return one message per failed or hanging job."""
-        found = [f"{name} failed {times} times in a row" for name, times in list(self.failed.items())]
+        found = [
+            f"{name} failed {times} times in a row" for name, times in list(self.failed.items())
+        ]
         busy = self._busy
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
@@ -163,7 +177,11 @@ class BackgroundJobs:
     @property
     def has_ended(self) -> bool:
         """Return True if the thread has ended although nobody stopped it."""
-        return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
+        return (
+            self._thread.ident is not None
+            and not self._thread.is_alive()
+            and not self._stop.is_set()
+        )
 
     def __enter__(self) -> BackgroundJobs:
         self._thread.start()
@@ -175,7 +193,9 @@ class BackgroundJobs:
 
     def _keep(self) -> None:
         with suppress(OSError):  # where it may not: the jobs matter more than their place
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
+            os.setpriority(
+                os.PRIO_PROCESS, threading.get_native_id(), _NICE
+            )  # of this thread alone, on Linux
         began = time.monotonic()
         due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
         while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):

@@ -54,8 +54,13 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
     counts = dict(engine.counts)
     report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
-    found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
-    found += [Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()]
+    found = [
+        Metric(name, "counter", text, _below(counts, prefix), label)
+        for prefix, name, label, text in _FAMILIES
+    ]
+    found += [
+        Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()
+    ]
     kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
     failures, runs = _ending(counts, "_failures"), _ending(counts, "_runs")
     return [
@@ -102,7 +107,9 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
     if engine.settlement.hangs_s > STALLED_S:
         found.append(f"a segment write has been in progress for {engine.settlement.hangs_s:.0f} s")
     if abs(pulse.clock_lag_s) > CLOCK_S:
-        found.append(f"the system clock differs by {abs(pulse.clock_lag_s):.0f} s from the service's time")
+        found.append(
+            f"the system clock differs by {abs(pulse.clock_lag_s):.0f} s from the service's time"
+        )
     if engine.copy is not None and engine.copy.trouble is not None:
         found.append(engine.copy.trouble)
     elif engine.settlement.failing:

@@ -62,7 +62,9 @@ class HistoricalMaps:
         self._root = root
         self._idle: _Process | None = None
 
-    def ask(self, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
+    def ask(
+        self, question: PastQuery, wanted: Callable[[int], bool]
+    ) -> Iterator[tuple[int, bytes]]:
         """Yield tile and payload of every reply.
 
         Raises:
@@ -152,7 +154,9 @@ def box_of(question: PastQuery) -> Box | None:
         longitudes, latitudes = zip(*query.route, strict=True)
         return min(longitudes), min(latitudes), max(longitudes), max(latitudes)
     if question.only is not None and query.bbox is None:
-        west, south, east, north = (float(edge) for edge in grid.bounds(question.only, grid.TILE_ZOOM))
+        west, south, east, north = (
+            float(edge) for edge in grid.bounds(question.only, grid.TILE_ZOOM)
+        )
         return west, south, east, north
     return query.bbox
 
@@ -171,16 +175,23 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
     listening = listener if question.public > 1 else None
     try:
-        then = past_fusion(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
+        then = past_fusion(
+            root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening
+        )
     except OSError as error:
-        raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
+        raise InputError(
+            "at", f"the archive cannot be read ({error.strerror})", "ask again later"
+        ) from error
     cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 
 def encode_question(question: PastQuery) -> bytes:
     """Return a question as a line for `answer_line`."""
-    return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode() + b"\n"
+    return (
+        json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
+        + b"\n"
+    )
 
 
 def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:

@@ -32,7 +32,9 @@ def warm_up() -> None:
     megabytes of fragmented memory, into which a service would grow for hours."""
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
-        beside = subprocess.run([sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False)
+        beside = subprocess.run(
+            [sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False
+        )
         if beside.returncode == 0:
             with suppress(OSError):  # then it is looked for again at the next start
                 done.parent.mkdir(parents=True, exist_ok=True)

@@ -71,7 +71,9 @@ class Queries:
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
         return self._past.ask(past, wanted)
 
-    def measure_answer(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
+    def measure_answer(
+        self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
+    ) -> AnswerSize:
         """Return the upper bound of an answer's size; errors as for `answer`."""
         return size_asked(self._shared.tiles, query, wanted, only)
 

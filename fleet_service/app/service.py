@@ -40,9 +40,13 @@ from schemas.runtime.process import LogLine
 from schemas.wire import Alert, Kind
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
-REPEAT_S: Final = 2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
+REPEAT_S: Final = (
+    2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
+)
 REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
-HANGS_S: Final = 60.0  # of a segment or a tile of an answer that is being made: systemd is to start anew
+HANGS_S: Final = (
+    60.0  # of a segment or a tile of an answer that is being made: systemd is to start anew
+)
 STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
@@ -65,23 +69,39 @@ class Service:
     """
 
     def __init__(
-        self, config: ServiceConfig, root: Path, log_line: Callable[[str], None], holding: Ownership | None = None
+        self,
+        config: ServiceConfig,
+        root: Path,
+        log_line: Callable[[str], None],
+        holding: Ownership | None = None,
     ) -> None:
         self._config, self._root, self._log_line = config, root, log_line
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
-        limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
-        self._replies = MapQueryable(Answering(self.engine.queries.measure_answer, self._answer), self.engine.counts)
+        limits = RateLimiter(
+            config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts
+        )
+        self._replies = MapQueryable(
+            Answering(self.engine.queries.measure_answer, self._answer), self.engine.counts
+        )
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
-        self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
+        self.failure: BaseException | None = (
+            None  # of the worker; leaving the session after it may hang
+        )
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
-            config.put_s, lambda: self.engine.state.map.take_dirty(), self._put_tile, self.engine.counts, time.monotonic
+            config.put_s,
+            lambda: self.engine.state.map.take_dirty(),
+            self._put_tile,
+            self.engine.counts,
+            time.monotonic,
         )
-        self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
+        self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = (
+            time.monotonic()
+        )
         self._reported, self._began, self._survived = 0, self._stepped_at, False
         self._followed = False  # by a service that has the lease now
 
@@ -100,13 +120,19 @@ class Service:
     @property
     def exit_code(self) -> int:
         """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another service took over."""
-        return 1 if self.failure is not None or self._followed or self.engine.settlement.unsettled else 0
+        return (
+            1
+            if self.failure is not None or self._followed or self.engine.settlement.unsettled
+            else 0
+        )
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         config = self._config
         with (
             session,
-            claim_regions(session, config.name, config.regions, stop, self.engine.holding.former) as mine,
+            claim_regions(
+                session, config.name, config.regions, stop, self.engine.holding.former
+            ) as mine,
             watch_successors(session, mine) as came,
             self._upkeep,
             self._declared(session),
@@ -137,7 +163,9 @@ class Service:
     def _hanging(self) -> str | None:
         """Return what has died or hangs next to the worker, so that only a restart helps."""
         if self.engine.settlement.hangs_s >= HANGS_S:
-            return f"a segment write has been in progress for {self.engine.settlement.hangs_s:.0f} s"
+            return (
+                f"a segment write has been in progress for {self.engine.settlement.hangs_s:.0f} s"
+            )
         if self._replies.hangs_s >= HANGS_S:
             return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
         return "upkeep has ended" if self._upkeep.has_ended else None
@@ -145,7 +173,9 @@ class Service:
     def _works(self) -> bool:
         """Return True if this service can do for its regions what a successor could do."""
         session, turn_age_s = self._session, time.monotonic() - self._stepped_at
-        return session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
+        return (
+            session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
+        )
 
     def _monitored(self) -> AbstractContextManager[str | None]:
         """Serve metrics and health if the settings ask for it."""
@@ -171,16 +201,24 @@ class Service:
             for kind in Kind
             for region in regions
         ]
-        inputs += [session.declare_subscriber(f"{keys.ROOT}/weather/{region}", self._weather) for region in regions]
+        inputs += [
+            session.declare_subscriber(f"{keys.ROOT}/weather/{region}", self._weather)
+            for region in regions
+        ]
         queryables = [
-            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._replies, complete=True) for region in regions
+            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._replies, complete=True)
+            for region in regions
         ]
         queryables += [
-            session.declare_queryable(f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True)
+            session.declare_queryable(
+                f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True
+            )
             for region in regions
         ]
         if self.engine.holding.lease is not None:
-            queryables.append(session.declare_queryable(own, lambda query: self._hand_over(query, session)))
+            queryables.append(
+                session.declare_queryable(own, lambda query: self._hand_over(query, session))
+            )
         token = session.liveliness().declare_token(own)  # last: who sees it may ask
         try:
             yield
@@ -193,7 +231,9 @@ class Service:
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
         """Stop in good order, for the named standby."""
-        self.engine.holding.to = moving.answer_request(query, session, self._config.regions) or self.engine.holding.to
+        self.engine.holding.to = (
+            moving.answer_request(query, session, self._config.regions) or self.engine.holding.to
+        )
 
     def _standing(self, asked: zenoh.Query) -> None:
         """Reply with the standing alerts, for late clients."""
@@ -207,7 +247,9 @@ class Service:
     def _weather(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        fits = len(sample.payload) <= wire.MAX_BYTES  # else it is refused as an empty one, where refusals are counted
+        fits = (
+            len(sample.payload) <= wire.MAX_BYTES
+        )  # else it is refused as an empty one, where refusals are counted
         payload = sample.payload.to_bytes() if fits else b""
         message = WeatherMessage(str(sample.key_expr), payload, str(sample.encoding))
         self.engine.intake.weather.enqueue(message)
@@ -244,7 +286,9 @@ class Service:
         if self.engine.holding.lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
-            self._log_line("lease lost to another service; senders keep everything that was not acknowledged")
+            self._log_line(
+                "lease lost to another service; senders keep everything that was not acknowledged"
+            )
             return
         leaves = self.engine.holding.leaves
         if leaves:
@@ -276,7 +320,10 @@ class Service:
     def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
         for alert in alerts:
             publish(
-                session, keys.alert_key(int(grid.tile_of(alert.cell))), wire.encode_alert(alert), wire.ALERT_ENCODING
+                session,
+                keys.alert_key(int(grid.tile_of(alert.cell))),
+                wire.encode_alert(alert),
+                wire.ALERT_ENCODING,
             )
 
     def _status(self, now: float) -> None:
@@ -284,17 +331,32 @@ class Service:
         rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
         self._reported_at, self._reported = now, counts[Kind.OBSERVATION]
         behind = self._clock.lag() * 1e-9
-        rest = ", ".join(f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind))
+        rest = ", ".join(
+            f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)
+        )
         text = (
             f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
             f"{self.engine.state.fusion.size} cells, {self.engine.alerts.count} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
             + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
-            + (f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it" if behind <= -LAG_S else "")
+            + (
+                f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it"
+                if behind <= -LAG_S
+                else ""
+            )
         )
-        self._log_line(LogLine(text, cells=self.engine.state.fusion.size, queue=len(self.inbox), counts=dict(counts)))
+        self._log_line(
+            LogLine(
+                text,
+                cells=self.engine.state.fusion.size,
+                queue=len(self.inbox),
+                counts=dict(counts),
+            )
+        )
 
-    def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+    def _answer(
+        self, wanted: MapQuery, near: Callable[[int], bool], only: int | None
+    ) -> Iterator[tuple[int, bytes]]:
         return self.engine.queries.answer(wanted, near, self._clock.now(), only)
 
 

@@ -26,7 +26,9 @@ class StandingAlerts:
     def __init__(self, shared: SharedState) -> None:
         self._shared = shared
         self._turn = 0  # of the alerts that are repeated
-        self._erased: list[Alert] = []  # alerts that ended by erasure; their end is not published yet
+        self._erased: list[
+            Alert
+        ] = []  # alerts that ended by erasure; their end is not published yet
 
     @property
     def count(self) -> int:
@@ -49,7 +51,11 @@ class StandingAlerts:
         with self._shared.guard:
             for alert in self.all:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
-        return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if is_wanted(tile)]
+        return [
+            (tile, wire.encode_standing(alerts))
+            for tile, alerts in tiles.items()
+            if is_wanted(tile)
+        ]
 
     def next_to_repeat(self, most: int) -> list[Alert]:
         """Return at most `most` standing alerts, in turn, so that clients that were away receive them too."""

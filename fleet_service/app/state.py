@@ -73,7 +73,9 @@ class ServiceState(NamedTuple):
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
         """Return the content of a checkpoint, which includes everything up to the segment `cut` and these weather
         files."""
-        tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(self.visitors)
+        tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(
+            self.visitors
+        )
         return Taken(tables, cut, tuple(path.name for path in weather))
 
 
@@ -111,7 +113,10 @@ def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:
 
 
 def load_state(
-    root: Path, config: ServiceConfig, damaged: Callable[[Path, str], None] = skip_damaged, until: Cut | None = None
+    root: Path,
+    config: ServiceConfig,
+    damaged: Callable[[Path, str], None] = skip_damaged,
+    until: Cut | None = None,
 ) -> ServiceState:
     """Load the state from the archive; of uncompacted segments, those written up to `until`.
 
@@ -121,20 +126,26 @@ def load_state(
     begin = load_restart(root, config.lateness_s, (VISITORS,))
     fusion, streams = begin.fusion, begin.streams
     visitors = None
-    if config.public_vehicles > 1:  # after a checkpoint that does not have them nothing is shown until so many came
+    if (
+        config.public_vehicles > 1
+    ):  # after a checkpoint that does not have them nothing is shown until so many came
         kept = begin.beside.get(VISITORS)
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
     shown, alerts = MapState(fusion), Alerts(fusion, IdleRoads())
     alerts.resume(begin.standing)
     used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
-    fusion.update_weather(archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used)
+    fusion.update_weather(
+        archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
+    )
     restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
     matters = Begin(first_day(root), begin.cut, until)
     heard = nobody if visitors is None else visitors.add
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
-        noting = None if begin.cut else beside.submit(noted)  # what a checkpoint knows, the replay asks
+        noting = (
+            None if begin.cut else beside.submit(noted)
+        )  # what a checkpoint knows, the replay asks
         for slots in chain(restored, (updated.slots for updated in rest)):
             alerts.update(slots)
             shown.mark_changed(slots)

@@ -18,7 +18,9 @@ class Tasks:
     """Queue of such work; true if it is not empty."""
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = (
+            queue.SimpleQueue()
+        )
 
     def __bool__(self) -> bool:
         return not self._queue.empty()

@@ -45,7 +45,9 @@ class _Load(Generic[Batch]):
         """Write each kind that is not written yet, then make all of it durable, by `upload` too."""
         for kind, waiting in self.waiting.items():
             if waiting:
-                rows = {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
+                rows = {
+                    name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]
+                }
                 self.segments.append(writer.write(kind, rows))
                 self.waiting[kind] = []
         writer.sync()
@@ -63,7 +65,9 @@ class SegmentLog(Generic[Batch]):
         epoch: smallest epoch, from the lease.
     """
 
-    def __init__(self, root: Path, shard: str, upload: Upload | None = None, epoch: int = 0) -> None:
+    def __init__(
+        self, root: Path, shard: str, upload: Upload | None = None, epoch: int = 0
+    ) -> None:
         self._writer, self._upload = Writer(root, shard, epoch), upload
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
@@ -79,7 +83,9 @@ class SegmentLog(Generic[Batch]):
     @property
     def hangs_s(self) -> float:
         """Return how long the current write has taken so far [s]."""
-        return 0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
+        return (
+            0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
+        )
 
     @property
     def rows(self) -> int:

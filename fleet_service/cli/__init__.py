@@ -83,5 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ):  # what it loads takes a second
         arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
         if arguments.verbose:
-            logging.basicConfig(level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+            logging.basicConfig(
+                level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+            )
         return commandline.run_guarded(lambda: int(arguments.run(arguments)))

@@ -26,7 +26,9 @@ USUAL_VEHICLES: Final = 2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known_questions().values())
+    parser.description = "; ".join(
+        f"{question.name}: {question.about}" for question in known_questions().values()
+    )
     parser.add_argument("question", metavar="NAME", help=" | ".join(known_questions()))
     parser.add_argument(
         "--archive",
@@ -37,18 +39,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_part(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
-    parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
-    parser.add_argument("--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map")
-    parser.add_argument("--stations", metavar="FILE", type=Path, help="weather, change-rates: readings, CSV or Parquet")
-    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: seconds between frames")
+    parser.add_argument(
+        "--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s"
+    )
+    parser.add_argument(
+        "--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map"
+    )
+    parser.add_argument(
+        "--stations",
+        metavar="FILE",
+        type=Path,
+        help="weather, change-rates: readings, CSV or Parquet",
+    )
+    parser.add_argument(
+        "--step", metavar="SECONDS", type=float, help="replay: seconds between frames"
+    )
     vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
     parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
-    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`")
+    parser.add_argument(
+        "--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`"
+    )
     parser.add_argument("--level", metavar="MU", type=float, help="contract: agreed grip, e.g. .35")
     parser.add_argument(
-        "--within", metavar="TIME", help="contract: time within which it must be restored, e.g. 4h or 90min"
+        "--within",
+        metavar="TIME",
+        help="contract: time within which it must be restored, e.g. 4h or 90min",
     )
-    parser.add_argument("--as-it-lies", action="store_true", help="do not compact the log; read compacted files only")
+    parser.add_argument(
+        "--as-it-lies",
+        action="store_true",
+        help="do not compact the log; read compacted files only",
+    )
     parser.add_argument("--json", action="store_true", help="print the rows as JSON, one per line")
 
 
@@ -61,7 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
     from schemas import query
 
     if arguments.engine not in engines.ENGINES:
-        raise InputError("engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}")
+        raise InputError(
+            "engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}"
+        )
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*span(arguments), bbox)
     if not arguments.as_it_lies:
@@ -73,7 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
         at=at, stations=arguments.stations, least_vehicles=vehicles, step_s=arguments.step, roads=arguments.roads,
         level=arguments.level, within_s=_seconds(arguments.within), report=_report,
     )  # fmt: skip
-    _report(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
+    _report(
+        f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations"
+    )
     found = question.ask(engine, options)
     print(output.lines(found, question) if arguments.json else output.text(found, question))
     if arguments.out is not None:
@@ -91,17 +116,27 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
     question = question_of(arguments.question)
     if arguments.out is not None:
         commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
-        if question.colour is None and arguments.out.name.endswith((".html", ".geojson", ".geo.parquet")):
-            raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
+        if question.colour is None and arguments.out.name.endswith(
+            (".html", ".geojson", ".geo.parquet")
+        ):
+            raise InputError(
+                "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+            )
     for name, takers in FOR.items():
         if getattr(arguments, name) is not None and question.name not in takers:
-            raise InputError(name.replace("_", "-"), f"is not for {question.name}", f"it is for {', '.join(takers)}")
+            raise InputError(
+                name.replace("_", "-"),
+                f"is not for {question.name}",
+                f"it is for {', '.join(takers)}",
+            )
     if arguments.level is not None and not mugrid.LOWER < arguments.level < mugrid.UPPER:
         problem = f"{arguments.level} lies outside {mugrid.LOWER} to {mugrid.UPPER}"
         raise InputError("level", problem, "give a friction, e.g. .35")
     _seconds(arguments.within)
     if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
-        raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
+        raise InputError(
+            "min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1"
+        )
     return question
 
 

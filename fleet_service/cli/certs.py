@@ -31,16 +31,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the certificates; run again to renew and to revoke",
     )
     parser.add_argument(
-        "--at", metavar="DIR", type=Path, help="folder in which the routers find the files (default: --out)"
+        "--at",
+        metavar="DIR",
+        type=Path,
+        help="folder in which the routers find the files (default: --out)",
     )
-    parser.add_argument("--days", type=float, default=365.0, help="validity of a certificate (default 365)")
-    parser.add_argument("--ca-days", type=float, default=3650.0, help="validity of a new authority (default 3650)")
     parser.add_argument(
-        "--renew-days", type=float, default=30.0, help="renew certificates that end sooner (default 30)"
+        "--days", type=float, default=365.0, help="validity of a certificate (default 365)"
     )
-    parser.add_argument("--revoke", metavar="N", type=int, help=f"revoke so many names; more than {ASKED} want it said")
-    parser.add_argument("--dry-run", action="store_true", help="only print the names that would be revoked")
-    parser.add_argument("--ca", choices=("next", "switch", "drop"), help="next step of the change to another authority")
+    parser.add_argument(
+        "--ca-days", type=float, default=3650.0, help="validity of a new authority (default 3650)"
+    )
+    parser.add_argument(
+        "--renew-days",
+        type=float,
+        default=30.0,
+        help="renew certificates that end sooner (default 30)",
+    )
+    parser.add_argument(
+        "--revoke",
+        metavar="N",
+        type=int,
+        help=f"revoke so many names; more than {ASKED} want it said",
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="only print the names that would be revoked"
+    )
+    parser.add_argument(
+        "--ca",
+        choices=("next", "switch", "drop"),
+        help="next step of the change to another authority",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -51,14 +72,20 @@ def run(arguments: argparse.Namespace) -> int:
     days, out = (arguments.days, arguments.ca_days, arguments.renew_days), arguments.out
     for name, value in zip(("days", "ca-days", "renew-days"), days, strict=True):
         if not 0.0 < value <= LONGEST_DAYS:
-            raise InputError(name, f"{value:g} is no time", f"give more than 0 and at most {LONGEST_DAYS:g} days")
+            raise InputError(
+                name, f"{value:g} is no time", f"give more than 0 and at most {LONGEST_DAYS:g} days"
+            )
     if days[2] >= days[0]:
-        raise InputError("renew-days", f"is not less than the {days[0]:g} days of a certificate", "give fewer")
+        raise InputError(
+            "renew-days", f"is not less than the {days[0]:g} days of a certificate", "give fewer"
+        )
     fleet = load(arguments.fleet, Enrolment)
     try:
         from fleet_service.enrolment.enrol import Registry, Terms
     except ImportError as error:
-        raise InputError("certs", "the package cryptography is missing", install_command("certs")) from error
+        raise InputError(
+            "certs", "the package cryptography is missing", install_command("certs")
+        ) from error
     try:
         registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
         leaving = registry.leaving(fleet)
@@ -68,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
         if len(leaving) > (ASKED if arguments.revoke is None else arguments.revoke):
             shown = ", ".join(leaving[:SHOWN]) + (" …" if len(leaving) > SHOWN else "")
             fix = f"put them back on the list, or add --revoke {len(leaving)}"
-            raise InputError("fleet", f"{len(leaving)} names with a certificate are not on it: {shown}", fix)
+            raise InputError(
+                "fleet", f"{len(leaving)} names with a certificate are not on it: {shown}", fix
+            )
         done = registry.enrol(fleet, arguments.ca)
     except OSError as error:
         problem = f"cannot write {error.filename or out} ({error.strerror})"

@@ -15,15 +15,29 @@ from schemas.errors import InputError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_connection(parser)
-    parser.add_argument("--amqp", metavar="URL", required=True, help="interchange, e.g. amqps://host:5671")
-    parser.add_argument("--to", metavar="ADDRESS", help="where our DENM go, e.g. a queue of deliveries")
-    parser.add_argument("--from", dest="source", metavar="ADDRESS", help="where foreign DENM come from")
-    parser.add_argument("--selector", default="messageType = 'DENM'", help="of foreign messages, in AMQP's language")
-    parser.add_argument("--witness", metavar="NAME", help="name of foreign DENM in the map; enrolled like a vehicle")
-    parser.add_argument("--station", metavar="N", type=int, help="identifier of the originating station")
+    parser.add_argument(
+        "--amqp", metavar="URL", required=True, help="interchange, e.g. amqps://host:5671"
+    )
+    parser.add_argument(
+        "--to", metavar="ADDRESS", help="where our DENM go, e.g. a queue of deliveries"
+    )
+    parser.add_argument(
+        "--from", dest="source", metavar="ADDRESS", help="where foreign DENM come from"
+    )
+    parser.add_argument(
+        "--selector", default="messageType = 'DENM'", help="of foreign messages, in AMQP's language"
+    )
+    parser.add_argument(
+        "--witness", metavar="NAME", help="name of foreign DENM in the map; enrolled like a vehicle"
+    )
+    parser.add_argument(
+        "--station", metavar="N", type=int, help="identifier of the originating station"
+    )
     parser.add_argument("--country", metavar="CC", help="of the publisher, e.g. SE")
     parser.add_argument("--publisher", metavar="ID", help="at the interchange, e.g. SE00001")
-    parser.add_argument("--state", metavar="FILE", type=Path, help="open events and unsent messages; keep it")
+    parser.add_argument(
+        "--state", metavar="FILE", type=Path, help="open events and unsent messages; keep it"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,7 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("to", "nothing is sent or received", "give --to, --from or both")
     needed = {"to": ("station", "country", "publisher", "state"), "source": ("witness",)}
     for way, names in needed.items():
-        missing = [name for name in names if getattr(arguments, way) is not None and getattr(arguments, name) is None]
+        missing = [
+            name
+            for name in names
+            if getattr(arguments, way) is not None and getattr(arguments, name) is None
+        ]
         if missing:
             raise InputError(missing[0], "is missing", f"give --{missing[0]}")
     sending = None

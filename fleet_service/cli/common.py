@@ -43,9 +43,16 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
 def add_supplier(parser: argparse.ArgumentParser) -> None:
     """Declare the supplier of a DATEX II publication."""
     parser.add_argument("--country", metavar="CC", help="datex: country of the supplier, e.g. se")
-    parser.add_argument("--supplier", metavar="NAME", help="datex: name of the supplier at its National Access Point")
     parser.add_argument(
-        "--status", choices=STATUSES, default="test", help="datex: status of the information; default test"
+        "--supplier",
+        metavar="NAME",
+        help="datex: name of the supplier at its National Access Point",
+    )
+    parser.add_argument(
+        "--status",
+        choices=STATUSES,
+        default="test",
+        help="datex: status of the information; default test",
     )
 
 
@@ -65,16 +72,26 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 
 def add_part(parser: argparse.ArgumentParser) -> None:
     """Declare the options that select a part of the archive."""
-    parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC")
-    parser.add_argument("--last", metavar="TIME", help="instead of --from: so long until now, e.g. 12h, 90min or 7d")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)")
+    parser.add_argument(
+        "--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC"
+    )
+    parser.add_argument(
+        "--last", metavar="TIME", help="instead of --from: so long until now, e.g. 12h, 90min or 7d"
+    )
+    parser.add_argument(
+        "--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)"
+    )
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
 
 
 def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Declare the archive of a command, and the form of its report."""
     parser.add_argument(
-        "--archive", metavar="DIR", type=Path, required=required, help="archive of a service, running or not"
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        required=required,
+        help="archive of a service, running or not",
     )
     parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
 
@@ -102,7 +119,9 @@ def duration_s(field: str, text: str) -> float:
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
     if found is None:
-        raise InputError(field, f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d")
+        raise InputError(
+            field, f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d"
+        )
     return float(found[1]) * UNITS[found[2]]
 
 
@@ -115,11 +134,17 @@ def span(arguments: argparse.Namespace) -> tuple[int, int]:
     since = 0 if arguments.since is None else moment(arguments.since, "from")
     if arguments.last is not None:
         if arguments.since is not None or arguments.until is not None:
-            raise InputError("last", "does not go together with --from or --to", "give one or the other")
+            raise InputError(
+                "last", "does not go together with --from or --to", "give one or the other"
+            )
         since = time.time_ns() - round(duration_s("last", arguments.last) * NS)
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
     if since >= until:
-        raise InputError("to", f"{arguments.until or 'now'} is not after --from {arguments.since}", "give a later time")
+        raise InputError(
+            "to",
+            f"{arguments.until or 'now'} is not after --from {arguments.since}",
+            "give a later time",
+        )
     return since, until
 
 
@@ -130,7 +155,9 @@ class ArchiveReport(NamedTuple):
     values: dict[str, object]
 
 
-def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]) -> int:
+def on_archive(
+    arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]
+) -> int:
     """Run a command on its archive and print its report.
 
     Raises:
@@ -141,9 +168,15 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     require_archive(arguments.archive)
     try:
         done = command(arguments)
-        print(json.dumps({"command": arguments.command, **done.values}) if arguments.json else done.line)
+        print(
+            json.dumps({"command": arguments.command, **done.values})
+            if arguments.json
+            else done.line
+        )
     except OSError as error:
-        raise InputError("archive", f"cannot use {error.filename} ({error.strerror})", "nothing is lost") from error
+        raise InputError(
+            "archive", f"cannot use {error.filename} ({error.strerror})", "nothing is lost"
+        ) from error
     return 0
 
 

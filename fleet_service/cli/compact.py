@@ -12,10 +12,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument(
-        "--put-to", "--to", dest="to", metavar="URI", help="then copy new files there, e.g. s3://bucket/folder"
+        "--put-to",
+        "--to",
+        dest="to",
+        metavar="URI",
+        help="then copy new files there, e.g. s3://bucket/folder",
     )  # --to: its name until 0.2
     parser.add_argument(
-        "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"
+        "--round-rows",
+        metavar="N",
+        type=int,
+        help="rows in memory at once; default a million, half a gigabyte",
     )
 
 
@@ -35,7 +42,12 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     done = compact(arguments.archive, rows)
     parts = rollup.complete(arguments.archive)
     summary = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
-    values: dict[str, object] = {"rows": done.rows, "segments": done.segments, "files": done.files, "rolled_up": parts}
+    values: dict[str, object] = {
+        "rows": done.rows,
+        "segments": done.segments,
+        "files": done.files,
+        "rolled_up": parts,
+    }
     if arguments.to is not None:
         put = mirror.copy_new_files(arguments.archive, arguments.to)
         summary, values = f"{summary}, {put} put", {**values, "put": put}

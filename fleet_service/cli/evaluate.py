@@ -10,15 +10,25 @@ from schemas.errors import InputError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots")
-    parser.add_argument("--quick", action="store_true", help="one seed, to check that it runs; judges nothing")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="one seed, to check that it runs; judges nothing"
+    )
     # the second names are those of earlier versions
     way = parser.add_mutually_exclusive_group()
     way.add_argument(
-        "--skip-end-to-end", "--skip-whole-way", action="store_true", help="omit the vehicles with real estimators"
+        "--skip-end-to-end",
+        "--skip-whole-way",
+        action="store_true",
+        help="omit the vehicles with real estimators",
     )
     way.add_argument(
-        "--end-to-end", "--whole-way", action="store_true", help="only those, in a level town and on hills"
+        "--end-to-end",
+        "--whole-way",
+        action="store_true",
+        help="only those, in a level town and on hills",
     )
 
 
@@ -33,8 +43,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(line, flush=True)
 
     try:
-        found = campaign.run(arguments.out, arguments.quick, drives, log_line, alone=arguments.end_to_end)
+        found = campaign.run(
+            arguments.out, arguments.quick, drives, log_line, alone=arguments.end_to_end
+        )
     except OSError as error:
-        raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
+        raise InputError(
+            "out", f"cannot write {error.filename} ({error.strerror})", "give another folder"
+        ) from error
     print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")
     return 0 if arguments.quick or campaign.holds(found) else 1

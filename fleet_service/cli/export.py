@@ -40,7 +40,8 @@ _NOT: Final = {  # options of another kind of export
     DATEX: ("archive", *_PART, *_TABLE, *_ROADS),
     ICEBERG: (*_LIVE, *_PART, *_ROADS, "out", "snapshot"),
     **dict.fromkeys(
-        ROUTERS, ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "last", "snapshot")
+        ROUTERS,
+        ("archive", "country", "supplier", "follow", *_TABLE, "since", "until", "last", "snapshot"),
     ),
 }
 _NEEDS: Final = {
@@ -60,25 +61,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="|".join((*WHAT, DATEX, ICEBERG, *ROUTERS)),
         help="the part of the archive, or of the live map",
     )
-    parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml"
+    )
     add_part(parser)
     parser.add_argument(
-        "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells with at least K vehicles"
+        "--min-vehicles",
+        metavar="K",
+        type=int,
+        default=1,
+        help="map: only cells with at least K vehicles",
     )
-    parser.add_argument("--snapshot", action="store_true", help="map: use the service's last hourly snapshot, at once")
+    parser.add_argument(
+        "--snapshot",
+        action="store_true",
+        help="map: use the service's last hourly snapshot, at once",
+    )
     add_connection(parser)
     add_supplier(parser)
-    parser.add_argument("--roads", metavar="FILE", type=Path, help="valhalla, graphhopper: extract of the road network")
-    parser.add_argument("--exclude-ice", action="store_true", help="valhalla: forbid sure ice, not only make it dear")
-    parser.add_argument("--follow", action="store_true", help="datex: keep the file current until a signal")
+    parser.add_argument(
+        "--roads",
+        metavar="FILE",
+        type=Path,
+        help="valhalla, graphhopper: extract of the road network",
+    )
+    parser.add_argument(
+        "--exclude-ice",
+        action="store_true",
+        help="valhalla: forbid sure ice, not only make it dear",
+    )
+    parser.add_argument(
+        "--follow", action="store_true", help="datex: keep the file current until a signal"
+    )
     parser.add_argument(
         "--catalog",
         metavar="NAME|URI",
         help="iceberg: name in pyiceberg's configuration, or sqlite:///FILE, postgresql+…",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="iceberg: namespace of the tables (default: gripmap)")
     parser.add_argument(
-        "--at", metavar="URL", help="iceberg: URL at which readers find the archive's files (default: its path)"
+        "--namespace", metavar="NAME", help="iceberg: namespace of the tables (default: gripmap)"
+    )
+    parser.add_argument(
+        "--at",
+        metavar="URL",
+        help="iceberg: URL at which readers find the archive's files (default: its path)",
     )
 
 
@@ -106,7 +132,9 @@ def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register
 
     root = arguments.archive.resolve()
-    place = Place(arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri())
+    place = Place(
+        arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri()
+    )
     done = register(root, place)
     line = f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in {place.catalog}"
     return ArchiveReport(line, dict(done._asdict()))
@@ -120,8 +148,12 @@ def _route_costs(arguments: argparse.Namespace) -> int:
     commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".json",))
     links = read_network(arguments.roads).links
     box = {"format": "arrow"} | ({} if arguments.bbox is None else {"bbox": arguments.bbox})
-    table = map_client.served_table(map_client.ask(map_client.settings(arguments.connect, arguments.config), box))
-    lines = routing.cost_lines(table, (routing.RoadLine(link.latitude, link.longitude) for link in links))
+    table = map_client.served_table(
+        map_client.ask(map_client.settings(arguments.connect, arguments.config), box)
+    )
+    lines = routing.cost_lines(
+        table, (routing.RoadLine(link.latitude, link.longitude) for link in links)
+    )
     if arguments.what == "graphhopper":
         costs = routing.graphhopper(lines)
     else:
@@ -138,8 +170,14 @@ def _datex(arguments: argparse.Namespace) -> int:
     from fleet_service.client.map_client import settings
 
     commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".xml",))
-    feed = DatexFeed(DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True)))
-    publish(settings(arguments.connect, arguments.config), feed, stop_on_signals() if arguments.follow else None)
+    feed = DatexFeed(
+        DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True))
+    )
+    publish(
+        settings(arguments.connect, arguments.config),
+        feed,
+        stop_on_signals() if arguments.follow else None,
+    )
     return 0
 
 
@@ -149,7 +187,9 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
 
     commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
     if arguments.min_vehicles < 1:
-        raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
+        raise InputError(
+            "min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1"
+        )
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = extract.Extract(*span(arguments), bbox)
     as_of = ""
@@ -166,9 +206,12 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     if arguments.what == "map":
         table = extract.with_vehicles(table, arguments.min_vehicles)
     extract.write(table, arguments.out)
-    line = f"{table.num_rows} rows in {arguments.out}" + (f": the map as of {as_of}" if as_of else "")
+    line = f"{table.num_rows} rows in {arguments.out}" + (
+        f": the map as of {as_of}" if as_of else ""
+    )
     return ArchiveReport(
-        line, {"rows": table.num_rows, "out": str(arguments.out), **({"as_of": as_of} if as_of else {})}
+        line,
+        {"rows": table.num_rows, "out": str(arguments.out), **({"as_of": as_of} if as_of else {})},
     )
 
 

@@ -25,8 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="remove only the rows of this vehicle")
-    parser.add_argument("--config", metavar="FILE", help="the service's configuration, with the archive's copy")
-    parser.add_argument("--put-to", metavar="URI", help="mirror to which rewritten files are copied again")
+    parser.add_argument(
+        "--config", metavar="FILE", help="the service's configuration, with the archive's copy"
+    )
+    parser.add_argument(
+        "--put-to", metavar="URI", help="mirror to which rewritten files are copied again"
+    )
     add_dry_run(parser)
 
 
@@ -43,18 +47,35 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     root, month, vehicle = arguments.archive, arguments.period, arguments.vehicle
     key_of(root, month)
     rows = 0 if vehicle is None else rows_of_vehicle(root, vehicle, month)
-    what = f"the key of {month} is destroyed" if vehicle is None else f"{rows} rows of {vehicle} are removed"
+    what = (
+        f"the key of {month} is destroyed"
+        if vehicle is None
+        else f"{rows} rows of {vehicle} are removed"
+    )
     if arguments.dry_run:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
     if not confirm(arguments, what):
         return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
     done = _erase(root, Erasure(month, vehicle), arguments.config)
-    still = "" if done.kept is None else f"; the copy holds it still, and the service tries again ({done.kept})"
+    still = (
+        ""
+        if done.kept is None
+        else f"; the copy holds it still, and the service tries again ({done.kept})"
+    )
     if vehicle is None:
         return ArchiveReport(what + still, {"rows": 0, "key": True, "copy": done.kept})
-    removed = f"{done.rows} rows removed" if done.rows else f"no rows of {vehicle} in {month}: nothing removed"
+    removed = (
+        f"{done.rows} rows removed"
+        if done.rows
+        else f"no rows of {vehicle} in {month}: nothing removed"
+    )
     line = removed + still
-    report: dict[str, object] = {"rows": done.rows, "key": False, "files": len(done.files), "copy": done.kept}
+    report: dict[str, object] = {
+        "rows": done.rows,
+        "key": False,
+        "files": len(done.files),
+        "copy": done.kept,
+    }
     if arguments.put_to is not None:
         report["put"] = mirror.copy_new_files(root, arguments.put_to, done.files)
         line += f", {report['put']} files put to {arguments.put_to}"
@@ -70,13 +91,19 @@ def _erase(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
     """
     from fleet_service.archive.format.files import is_served
     from fleet_service.archive.identity import erasure_requests
-    from fleet_service.archive.maintenance.retention import ErasureResult, forget_period, forget_vehicle
+    from fleet_service.archive.maintenance.retention import (
+        ErasureResult,
+        forget_period,
+        forget_vehicle,
+    )
 
     question = erasure_requests.write_request(root, wanted) if is_served(root) else None
     looked = time.monotonic()
     while question is not None:  # a service that ends meanwhile leaves it to us
         if (answer := erasure_requests.answer_to(question)) is not None:
-            return ErasureResult(answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy"))
+            return ErasureResult(
+                answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy")
+            )
         time.sleep(ASK_S)
         if time.monotonic() - looked > LOOK_S:
             looked = time.monotonic()
@@ -108,12 +135,18 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
         return
     if config.archive.second is None:
         fix = "give --config with the service's configuration"
-        raise InputError("config", f"the archive has a copy at {url}, where it is to be forgotten too", fix)
+        raise InputError(
+            "config", f"the archive has a copy at {url}, where it is to be forgotten too", fix
+        )
     with closing(BucketReplica(root, url, config.archive.options)) as copy:
-        copy.begin(config.name)  # what only the copy has comes first, or it would be found there later
+        copy.begin(
+            config.name
+        )  # what only the copy has comes first, or it would be found there later
         yield
         try:
             copy.sync()
         except OSError as error:
             fix = "start the service, which goes on with it, when the copy is reached"
-            raise InputError("archive.copy", f"it is forgotten here, and not yet at {url} ({error})", fix) from error
+            raise InputError(
+                "archive.copy", f"it is forgotten here, and not yet at {url} ({error})", fix
+            ) from error

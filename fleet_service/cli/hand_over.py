@@ -11,7 +11,9 @@ from fleet_service.cli.common import add_connection
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("region", metavar="REGION", help="region key expression, e.g. 1202/310/*")
-    parser.add_argument("--to", metavar="NAME", required=True, help="name of the standby that takes over")
+    parser.add_argument(
+        "--to", metavar="NAME", required=True, help="name of the standby that takes over"
+    )
     add_connection(parser)
 
 
@@ -23,8 +25,14 @@ def run(arguments: argparse.Namespace) -> int:
     from schemas.errors import InputError
 
     if not re.fullmatch(REGION_PATTERN, arguments.region):
-        raise InputError("region", f"{arguments.region!r} is none", "give chunks of 4, 3 and 3 digits, or * for all")
-    with map_client.open_connected(map_client.settings(arguments.connect, arguments.config)) as session:
+        raise InputError(
+            "region",
+            f"{arguments.region!r} is none",
+            "give chunks of 4, 3 and 3 digits, or * for all",
+        )
+    with map_client.open_connected(
+        map_client.settings(arguments.connect, arguments.config)
+    ) as session:
         moved = hand_over(session, arguments.region, arguments.to, print)
     if moved is None:
         print(f"{arguments.to} serves {arguments.region} already")

@@ -18,11 +18,23 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--archive", metavar="DIR", type=Path, help="archive of a service on this machine, for past and history"
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        help="archive of a service on this machine, for past and history",
     )
-    parser.add_argument("--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)")
-    parser.add_argument("--port", type=int, default=8080, help="port; 0 selects a free one (default 8080)")
-    parser.add_argument("--name", action="append", default=[], help="host name under which a proxy forwards requests")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)"
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port; 0 selects a free one (default 8080)"
+    )
+    parser.add_argument(
+        "--name",
+        action="append",
+        default=[],
+        help="host name under which a proxy forwards requests",
+    )
     parser.add_argument(
         "--metrics",
         metavar="URL",
@@ -30,16 +42,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="metrics address of a service, for the health view",
     )
-    parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to draw over the map")
     parser.add_argument(
-        "--base-map", metavar="URL|FILE", help="map below the roads: .pmtiles or .mbtiles, or URL with {z}, {x}, {y}"
-    )
-    parser.add_argument("--attribution", metavar="TEXT", help="of the base map (default: what its file says)")
-    parser.add_argument(
-        "--roads", metavar="FILE", type=Path, help="GeoJSON of road lines with names (default: learned from the fleet)"
+        "--overlay",
+        metavar="FILE",
+        type=Path,
+        help="Parquet of cell, sector, mu to draw over the map",
     )
     parser.add_argument(
-        "--datex", metavar="FILE", type=Path, help="keep a DATEX II publication current in this file, and serve it"
+        "--base-map",
+        metavar="URL|FILE",
+        help="map below the roads: .pmtiles or .mbtiles, or URL with {z}, {x}, {y}",
+    )
+    parser.add_argument(
+        "--attribution", metavar="TEXT", help="of the base map (default: what its file says)"
+    )
+    parser.add_argument(
+        "--roads",
+        metavar="FILE",
+        type=Path,
+        help="GeoJSON of road lines with names (default: learned from the fleet)",
+    )
+    parser.add_argument(
+        "--datex",
+        metavar="FILE",
+        type=Path,
+        help="keep a DATEX II publication current in this file, and serve it",
     )
     add_supplier(parser)
     add_connection(parser)
@@ -79,7 +106,10 @@ def _check_archive(root: Path) -> None:
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         require_archive(root)
     else:
-        print(f"waiting for the archive {root}: its service creates it; the past appears then", flush=True)
+        print(
+            f"waiting for the archive {root}: its service creates it; the past appears then",
+            flush=True,
+        )
 
 
 def _publication(arguments: argparse.Namespace) -> DatexFile | None:

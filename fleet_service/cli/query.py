@@ -12,20 +12,41 @@ from schemas.errors import InputError
 from schemas.runtime import commandline
 
 # The ending of a file decides what is asked for: a form of answer of the service.
-FORMS: Final = {".arrow": "arrow", ".parquet": "arrow", ".csv": "arrow", ".geojson": "geojson", ".json": "json"}
+FORMS: Final = {
+    ".arrow": "arrow",
+    ".parquet": "arrow",
+    ".csv": "arrow",
+    ".geojson": "geojson",
+    ".json": "json",
+}
 NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
-    parser.add_argument("--route", metavar="LON,LAT|LON,LAT", help="route; returns the cells ahead in driving order")
-    parser.add_argument("--min-vehicles", metavar="K", help="only cells with at least K vehicles")
-    parser.add_argument("--at", metavar="TIME", help="moment of the map, e.g. 2026-01-31T07:00:00Z; UTC without a zone")
-    parser.add_argument("--basis", metavar="borrowed", help="borrowed: also unvisited cells, imputed from neighbours")
-    parser.add_argument("--format", metavar="arrow|geojson|json", help="arrow (default) prints a table")
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, help=f"write it there, as the ending says: {', '.join(FORMS)}"
+        "--route", metavar="LON,LAT|LON,LAT", help="route; returns the cells ahead in driving order"
+    )
+    parser.add_argument("--min-vehicles", metavar="K", help="only cells with at least K vehicles")
+    parser.add_argument(
+        "--at",
+        metavar="TIME",
+        help="moment of the map, e.g. 2026-01-31T07:00:00Z; UTC without a zone",
+    )
+    parser.add_argument(
+        "--basis",
+        metavar="borrowed",
+        help="borrowed: also unvisited cells, imputed from neighbours",
+    )
+    parser.add_argument(
+        "--format", metavar="arrow|geojson|json", help="arrow (default) prints a table"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help=f"write it there, as the ending says: {', '.join(FORMS)}",
     )
     add_connection(parser)
 
@@ -35,11 +56,18 @@ def run(arguments: argparse.Namespace) -> int:
     form = _form(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
-    asked = {name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis")}
-    parameters = {name: value for name, value in (*asked.items(), ("format", form)) if value is not None}
+    asked = {
+        name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis")
+    }
+    parameters = {
+        name: value for name, value in (*asked.items(), ("format", form)) if value is not None
+    }
     answer = map_client.ask(map_client.settings(arguments.connect, arguments.config), parameters)
     if not answer.served:
-        print("no service answers for the map: start one; that is not the same as an empty map", file=sys.stderr)
+        print(
+            "no service answers for the map: start one; that is not the same as an empty map",
+            file=sys.stderr,
+        )
         return NOBODY
     if arguments.bbox is not None and answer.table is not None and not answer.table.num_rows:
         _say_what_is_covered(arguments)
@@ -65,9 +93,18 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
     whole = map_client.ask(map_client.settings(arguments.connect, arguments.config), {}).table
     if whole is None or not whole.num_rows:
         return
-    west_end, south_end, east_end, north_end = (whole[name].to_numpy() for name in ("west", "south", "east", "north"))
-    box = [float(west_end.min()), float(south_end.min()), float(east_end.max()), float(north_end.max())]
-    words = "no cell lies in this box; the map covers --bbox " + ",".join(f"{side:.3f}" for side in box)
+    west_end, south_end, east_end, north_end = (
+        whole[name].to_numpy() for name in ("west", "south", "east", "north")
+    )
+    box = [
+        float(west_end.min()),
+        float(south_end.min()),
+        float(east_end.max()),
+        float(north_end.max()),
+    ]
+    words = "no cell lies in this box; the map covers --bbox " + ",".join(
+        f"{side:.3f}" for side in box
+    )
     west, south, east, north = (float(side) for side in arguments.bbox.split(","))
     if box[0] < north and box[2] > south and box[1] < east and box[3] > west:
         words += ": longitude comes before latitude"
@@ -82,5 +119,7 @@ def _form(out: Path | None, given: str | None) -> str | None:
         return given
     form = FORMS[commandline.ending_of("out", out, tuple(FORMS))]
     if given not in (None, form):
-        raise InputError("format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}")
+        raise InputError(
+            "format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}"
+        )
     return form

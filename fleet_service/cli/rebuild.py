@@ -14,11 +14,23 @@ from schemas.runtime import progress_messages
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder: map/ and rollup/ by zone")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="moment of the map (default: now)")
-    parser.add_argument("--engine", default="local", metavar="local|spark", help="default %(default)s")
     parser.add_argument(
-        "--as-it-lies", action="store_true", help="do not compact the log; roll up compacted files only"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="a new folder: map/ and rollup/ by zone",
+    )
+    parser.add_argument(
+        "--to", dest="until", metavar="TIME", help="moment of the map (default: now)"
+    )
+    parser.add_argument(
+        "--engine", default="local", metavar="local|spark", help="default %(default)s"
+    )
+    parser.add_argument(
+        "--as-it-lies",
+        action="store_true",
+        help="do not compact the log; roll up compacted files only",
     )
 
 
@@ -35,7 +47,15 @@ def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
     if not arguments.as_it_lies:
         compact_first(arguments.archive)
     progress_messages.set_status("replaying the archive by zone")
-    done = list(rebuild(Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine))
+    done = list(
+        rebuild(
+            Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine
+        )
+    )
     cells, parts = sum(one.cells for one in done), sum(one.parts for one in done)
-    line = f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"
-    return ArchiveReport(line, {"zones": len(done), "cells": cells, "parts": parts, "out": str(arguments.out)})
+    line = (
+        f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"
+    )
+    return ArchiveReport(
+        line, {"zones": len(done), "cells": cells, "parts": parts, "out": str(arguments.out)}
+    )

@@ -11,7 +11,9 @@ from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, co
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
-    parser.add_argument("--raw-days", metavar="N", type=int, required=True, help="days for which raw rows stay")
+    parser.add_argument(
+        "--raw-days", metavar="N", type=int, required=True, help="days for which raw rows stay"
+    )
     add_dry_run(parser)
 
 

@@ -10,10 +10,19 @@ from schemas.runtime import commandline, progress_messages
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("extract", metavar="EXTRACT", type=Path, help=".osm.pbf, .osm, or lines: .gpkg, .geojson, .shp")
+    parser.add_argument(
+        "extract",
+        metavar="EXTRACT",
+        type=Path,
+        help=".osm.pbf, .osm, or lines: .gpkg, .geojson, .shp",
+    )
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="ends in .parquet")
-    parser.add_argument("--id", metavar="COLUMN", default="id", help="of lines: the link's id; default %(default)s")
-    parser.add_argument("--name", metavar="COLUMN", default="name", help="of lines: its name; default %(default)s")
+    parser.add_argument(
+        "--id", metavar="COLUMN", default="id", help="of lines: the link's id; default %(default)s"
+    )
+    parser.add_argument(
+        "--name", metavar="COLUMN", default="name", help="of lines: its name; default %(default)s"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
-SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
+SWITCH_S = (
+    0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
+)
 LEAVE_AT_LAST_S = 2.5  # after a signal; the process is to have ended within 3 s
 FREEING_S = 0.4  # of them, for a bucket to take a word
 
@@ -39,10 +41,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the archive, one service per archive (default: the configuration's)",
     )
     parser.add_argument(
-        "--standby", action="store_true", help="run as standby: take over when the active service on this replica stops"
+        "--standby",
+        action="store_true",
+        help="run as standby: take over when the active service on this replica stops",
     )
     parser.add_argument(
-        "--weather", metavar="FILE", type=Path, help="Parquet file of road weather to read at the start"
+        "--weather",
+        metavar="FILE",
+        type=Path,
+        help="Parquet file of road weather to read at the start",
     )
 
 
@@ -59,7 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
     log_as(config.log, sys.stderr, service=config.name)
     root = arguments.archive or config.archive.path
     if root is None:
-        raise InputError("archive", "is missing", "give --archive DIR, or archive.path in the configuration")
+        raise InputError(
+            "archive", "is missing", "give --archive DIR, or archive.path in the configuration"
+        )
     if arguments.standby:
         config = config.model_copy(update={"standby": True})
     if arguments.weather is not None:
@@ -85,7 +94,9 @@ def run(arguments: argparse.Namespace) -> int:
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
     stopped = threading.Event()
-    threading.Thread(target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True).start()
+    threading.Thread(
+        target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True
+    ).start()
     service.run(stop)
     stopped.set()
     return service.exit_code if holding.lease is not None else 0
@@ -120,7 +131,10 @@ def _open_archive(
 
 
 def _force_exit_when_stuck(
-    stop: threading.Event, stopped: threading.Event, service: Service, log_line: Callable[[str], None]
+    stop: threading.Event,
+    stopped: threading.Event,
+    service: Service,
+    log_line: Callable[[str], None],
 ) -> None:
     """End a service whose shutdown hangs, on a frozen router or a long compaction.
 

@@ -18,15 +18,24 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
-    parser.add_argument("--alerts", action="store_true", help="only alerts: one per stretch, with length and direction")
+    parser.add_argument(
+        "--alerts",
+        action="store_true",
+        help="only alerts: one per stretch, with length and direction",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object per line")
-    parser.add_argument("--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format")
+    parser.add_argument(
+        "--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format"
+    )
     parser.add_argument(
         "--webhook-queue", metavar="FILE", type=Path,
         help="file for alerts that wait for the receiver (default: in the user's state folder)",
     )  # fmt: skip
     parser.add_argument(
-        "--health-port", metavar="PORT", type=int, help="serve /healthz and /metrics of the webhook on loopback"
+        "--health-port",
+        metavar="PORT",
+        type=int,
+        help="serve /healthz and /metrics of the webhook on loopback",
     )
     add_connection(parser)
 
@@ -36,7 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.client import map_client, watching
 
     stop = stop_on_signals()
-    wishes = watching.WatchOptions(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
+    wishes = watching.WatchOptions(
+        arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json
+    )
     settings = map_client.settings(arguments.connect, arguments.config)
     if arguments.webhook is None:
         for name in ("webhook_queue", "health_port"):
@@ -44,10 +55,14 @@ def run(arguments: argparse.Namespace) -> int:
                 raise InputError(name, "has no meaning without a webhook", "add --webhook URL")
         watching.watch(settings, wishes, stop, _say)
         return 0
-    return _watch_with_webhook(arguments, lambda hear: watching.watch(settings, wishes, stop, _say, hear))
+    return _watch_with_webhook(
+        arguments, lambda hear: watching.watch(settings, wishes, stop, _say, hear)
+    )
 
 
-def _watch_with_webhook(arguments: argparse.Namespace, watch: Callable[[Callable[[StretchAlert], None]], None]) -> int:
+def _watch_with_webhook(
+    arguments: argparse.Namespace, watch: Callable[[Callable[[StretchAlert], None]], None]
+) -> int:
     """Watch and send alerts; return 1 if any was lost or could not be delivered."""
     from fleet_service.client.alert_queue import AlertQueue
     from fleet_service.client.webhook import Webhook, check_url, queue_path

@@ -27,7 +27,9 @@ class AlertQueue:
         self._most, self._guard = most, threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(path, timeout=0.1, isolation_level=None, check_same_thread=False)
+            self._file = sqlite3.connect(
+                path, timeout=0.1, isolation_level=None, check_same_thread=False
+            )
             self._file.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._file.execute(
                 "CREATE TABLE IF NOT EXISTS waiting (number INTEGER PRIMARY KEY AUTOINCREMENT, text TEXT)"
@@ -37,7 +39,9 @@ class AlertQueue:
             self._file.execute("SELECT number, text FROM waiting LIMIT 1").fetchall()
         except (sqlite3.Error, OSError) as error:
             problem = f"{path} cannot be used ({error})"
-            raise InputError("webhook_queue", problem, "give another file; each watch needs its own") from error
+            raise InputError(
+                "webhook_queue", problem, "give another file; each watch needs its own"
+            ) from error
 
     def __len__(self) -> int:
         with self._guard:
@@ -52,18 +56,24 @@ class AlertQueue:
         with self._guard:
             self._file.execute("INSERT INTO waiting (text) VALUES (?)", (text,))
             keep = "SELECT number FROM waiting ORDER BY number DESC LIMIT ?"
-            return self._file.execute(f"DELETE FROM waiting WHERE number NOT IN ({keep})", (self._most,)).rowcount
+            return self._file.execute(
+                f"DELETE FROM waiting WHERE number NOT IN ({keep})", (self._most,)
+            ).rowcount
 
     def first(self) -> tuple[int, str] | None:
         """Return number and text of the oldest message; None if the queue is empty."""
         with self._guard:
-            row = self._file.execute("SELECT number, text FROM waiting ORDER BY number LIMIT 1").fetchone()
+            row = self._file.execute(
+                "SELECT number, text FROM waiting ORDER BY number LIMIT 1"
+            ).fetchone()
         return None if row is None else (int(row[0]), str(row[1]))
 
     def remove(self, number: int) -> bool:
         """Remove a message; return False if it was dropped before."""
         with self._guard:
-            return self._file.execute("DELETE FROM waiting WHERE number = ?", (number,)).rowcount > 0
+            return (
+                self._file.execute("DELETE FROM waiting WHERE number = ?", (number,)).rowcount > 0
+            )
 
     def close(self) -> None:
         """Release the file."""

@@ -23,7 +23,9 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
-KEPT_S: Final = 3600  # for which an ended situation is told: who pulls every few minutes does not miss the end
+KEPT_S: Final = (
+    3600  # for which an ended situation is told: who pulls every few minutes does not miss the end
+)
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
 CERTAIN, PROBABLE = 0.97, 0.8  # of P(slippery), from which on it is said
 DIGITS: Final = 6  # a tenth of a metre; a cell is ten
@@ -32,7 +34,9 @@ _SPACES: Final = {
     "d2": "http://datex2.eu/schema/3/d2Payload", "com": "http://datex2.eu/schema/3/common",
     "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing", "xsi": _XSI,
 }  # fmt: skip
-_BEARINGS: Final = {name: (90.0 - 90.0 * sector) % 360.0 for sector, name in enumerate(grid.HEADINGS)}
+_BEARINGS: Final = {
+    name: (90.0 - 90.0 * sector) % 360.0 for sector, name in enumerate(grid.HEADINGS)
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,9 @@ class Supplier:
     def __post_init__(self) -> None:
         """Check country and name."""
         if not re.fullmatch("[a-z]{2}", self.country):
-            raise InputError("country", f"{self.country!r} is no country", "give two letters, e.g. se")
+            raise InputError(
+                "country", f"{self.country!r} is no country", "give two letters, e.g. se"
+            )
         if not self.name.strip():
             raise InputError("supplier", "is empty", "give the supplier's name at the access point")
 
@@ -98,14 +104,17 @@ def publication(
         if name in written:
             continue
         place = (
-            float(child.text or "nan") for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
+            float(child.text or "nan")
+            for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
         )
         ended = _end_record(record, now) if _has_ended(record) or is_heard(*place) else record
         if ended is not None:
             root.append(_situation(supplier, ended))
     ET.indent(root)
     text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
-    used = f'xmlns:sit="{_SPACES["sit"]}"'.encode()  # by the payload's type too, where no situation declares it
+    used = (
+        f'xmlns:sit="{_SPACES["sit"]}"'.encode()
+    )  # by the payload's type too, where no situation declares it
     return text if used in text else text.replace(b"<d2:payload ", b"<d2:payload " + used + b" ", 1)
 
 
@@ -121,7 +130,13 @@ def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     _text(record, "sit:situationRecordCreationTime", iso(now))
     _text(record, "sit:situationRecordObservationTime", iso(alert.time))
     _text(record, "sit:situationRecordVersionTime", iso(now))
-    sure = "certain" if alert.p_slippery > CERTAIN else "probable" if alert.p_slippery > PROBABLE else "riskOf"
+    sure = (
+        "certain"
+        if alert.p_slippery > CERTAIN
+        else "probable"
+        if alert.p_slippery > PROBABLE
+        else "riskOf"
+    )
     _text(record, "sit:probabilityOfOccurrence", sure)
     _text(record, "sit:severity", "high" if alert.mu < SLIPPERY_MU / 2 else "medium")
     _text(record, "sit:safetyRelatedMessage", "true")
@@ -152,13 +167,23 @@ def _location(alert: StretchAlert) -> ET.Element:
     _coordinates(place, "loc:coordinatesForDisplay", alert.latitude, alert.longitude)
     about = ET.SubElement(place, _name("loc:supplementaryPositionalDescription"))
     _text(about, "loc:lengthAffected", f"{alert.length_m:.0f}")
-    _words(about, "loc:locationDescription", f"{alert.direction}; vehicles heading {' and '.join(alert.headings)}")
+    _words(
+        about,
+        "loc:locationDescription",
+        f"{alert.direction}; vehicles heading {' and '.join(alert.headings)}",
+    )
     if line:
         north, east = points[-1][0] - points[0][0], points[-1][1] - points[0][1]
         along = {"north": north, "south": -north, "east": east, "west": -east}
         points = points if along[alert.headings[0]] >= 0.0 else points[::-1]
-        drawn = ET.SubElement(place, _name("loc:gmlLineString"), {"srsName": "urn:ogc:def:crs:EPSG::4326"})
-        _text(drawn, "loc:posList", " ".join(f"{value:.{DIGITS}f}" for point in points for value in point))
+        drawn = ET.SubElement(
+            place, _name("loc:gmlLineString"), {"srsName": "urn:ogc:def:crs:EPSG::4326"}
+        )
+        _text(
+            drawn,
+            "loc:posList",
+            " ".join(f"{value:.{DIGITS}f}" for point in points for value in point),
+        )
     else:
         point = ET.SubElement(place, _name("loc:pointByCoordinates"))
         if len(alert.headings) == 1:
@@ -169,7 +194,10 @@ def _location(alert: StretchAlert) -> ET.Element:
 
 def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
     """Return a record as the next version of an old one; the old one if nothing but times has changed."""
-    for tag in ("sit:situationRecordCreationTime", "sit:validity/com:validityTimeSpecification/com:overallStartTime"):
+    for tag in (
+        "sit:situationRecordCreationTime",
+        "sit:validity/com:validityTimeSpecification/com:overallStartTime",
+    ):
         _found(record, tag).text = _found(old, tag).text
     times = ("sit:situationRecordVersionTime", "sit:situationRecordObservationTime")
     compared = [copy.deepcopy(one) for one in (record, old)]
@@ -203,7 +231,9 @@ def _has_ended(record: ET.Element) -> bool:
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
     """Return the situation that has a cell of a stretch, if a restarted reader gave it another name."""
-    cells = {f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points}
+    cells = {
+        f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points
+    }
     for name, record in old.items():
         if name not in written and not _has_ended(record) and cells & _cells(record):
             return name
@@ -215,24 +245,35 @@ def _cells(record: ET.Element) -> set[str]:
     point = record.find(".//loc:pointCoordinates", _SPACES)
     if point is not None:
         words = [f"{float(child.text or 'nan'):.{DIGITS}f}" for child in point]
-    return {f"{latitude} {longitude}" for latitude, longitude in zip(words[::2], words[1::2], strict=True)}
+    return {
+        f"{latitude} {longitude}"
+        for latitude, longitude in zip(words[::2], words[1::2], strict=True)
+    }
 
 
 def _records(document: bytes) -> dict[str, ET.Element]:
     """Return the records of a publication by id."""
-    problem = InputError("out", "holds something else than a publication of this command", "name another file")
+    problem = InputError(
+        "out", "holds something else than a publication of this command", "name another file"
+    )
     try:
         root = ET.fromstring(document)
     except ET.ParseError as error:
         raise problem from error
     if root.tag != _name("d2:payload") or root.get(_name("xsi:type")) != "sit:SituationPublication":
         raise problem
-    return {record.get("id", ""): record for record in root.iterfind(".//sit:situationRecord", _SPACES)}
+    return {
+        record.get("id", ""): record for record in root.iterfind(".//sit:situationRecord", _SPACES)
+    }
 
 
 def _situation(supplier: Supplier, record: ET.Element) -> ET.Element:
     situation = ET.Element(_name("sit:situation"), {"id": f"situation-{record.get('id')}"})
-    _text(situation, "sit:situationVersionTime", _found(record, "sit:situationRecordVersionTime").text or "")
+    _text(
+        situation,
+        "sit:situationVersionTime",
+        _found(record, "sit:situationRecordVersionTime").text or "",
+    )
     header = ET.SubElement(situation, _name("sit:headerInformation"))
     _text(header, "com:informationStatus", supplier.status)
     situation.append(record)

@@ -20,7 +20,9 @@ from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 
-REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
+REFRESH_S: Final = (
+    60.0  # between two looks at all that stands, and at the most between two times of publication
+)
 
 
 class DatexFile:
@@ -47,7 +49,9 @@ class DatexFile:
         """Return True if the time of publication must be renewed."""
         return time.monotonic() >= self._written + REFRESH_S
 
-    def keep_up(self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+    def keep_up(
+        self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
+    ) -> None:
         """Write the publication if its content changed, or if it is old.
 
         Args:
@@ -76,7 +80,9 @@ class StretchOutput(Protocol):
     def is_due(self) -> bool:
         """Return True if it must be looked at without news."""
 
-    def keep_up(self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+    def keep_up(
+        self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
+    ) -> None:
         """Publish the standing stretches."""
 
 
@@ -138,7 +144,11 @@ def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | 
     with open_connected(connection) as session:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))
         if not is_served(session, query.parse({})):
-            raise InputError("connect", "no service answers for the map", "start one; its silence ends no situation")
+            raise InputError(
+                "connect",
+                "no service answers for the map",
+                "start one; its silence ends no situation",
+            )
         feed.look(session)
         feed.write()
         looked = time.monotonic()

@@ -28,7 +28,9 @@ NAMED: Final = 5  # regions that a sentence names
 PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
-FALLS_S: Final = 0.1  # a router ends questions to a service that was killed, and tells then that its token fell
+FALLS_S: Final = (
+    0.1  # a router ends questions to a service that was killed, and tells then that its token fell
+)
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
                 "observations", "age_s")  # fmt: skip
 
@@ -57,7 +59,9 @@ class Answer:
         if not self.missing:
             return None
         more = f" and {len(self.missing) - NAMED} more" if len(self.missing) > NAMED else ""
-        return f"nobody serves {', '.join(self.missing[:NAMED])}{more}: what is not there is not known"
+        return (
+            f"nobody serves {', '.join(self.missing[:NAMED])}{more}: what is not there is not known"
+        )
 
 
 def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
@@ -81,17 +85,25 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         # and who went may have been asked in place of who followed it, even if it is back
         withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
-        whole = {one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)}
+        whole = {
+            one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)
+        }
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
         if not declared and services.refresh(session):  # it came while it was looked for
             declared, served = True, bool(payloads)
-        elif not declared and served and not payloads:  # likewise, and its token is on the way; or it has none
+        elif (
+            not declared and served and not payloads
+        ):  # likewise, and its token is on the way; or it has none
             payloads = sorted(replies(session, EVERYWHERE, parameters))
     answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
     if not declared:  # services of a former version, or an access list of one
         return answer
-    tiles = {regions.region_of(tile) for key, _ in payloads if (tile := keys.parse(key).quadint) is not None}
+    tiles = {
+        regions.region_of(tile)
+        for key, _ in payloads
+        if (tile := keys.parse(key).quadint) is not None
+    }
     whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)}
     somewhere = asked.bbox is not None or asked.route is not None
     missing = regions.unserved(asked, whole) if somewhere else sorted(withdrawn)
@@ -99,7 +111,9 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     return replace(answer, missing=tuple(missing), regions=found)
 
 
-def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> Iterator[tuple[str, bytes]]:
+def replies(
+    session: zenoh.Session, key: str, parameters: Mapping[str, str]
+) -> Iterator[tuple[str, bytes]]:
     """Yield key and payload of every reply for a key expression of the map.
 
     Raises:
@@ -122,11 +136,17 @@ def served_table(answer: Answer) -> pa.Table:
         InputError: no service answered, or the answer is empty and part of the area has no service.
     """
     if not answer.served or answer.table is None:
-        raise InputError("connect", "no service answers for the map", "start one; that is not the same as an empty map")
+        raise InputError(
+            "connect",
+            "no service answers for the map",
+            "start one; that is not the same as an empty map",
+        )
     if answer.gap is None:
         return answer.table
     if not answer.table.num_rows:
-        raise InputError("connect", answer.gap, "start its service; that is not the same as an empty map")
+        raise InputError(
+            "connect", answer.gap, "start its service; that is not the same as an empty map"
+        )
     log.warning("%s", answer.gap)
     return answer.table.replace_schema_metadata({"missing": ",".join(answer.missing)})
 
@@ -143,7 +163,10 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
         return True
     if point is None and any(True for _ in replies(session, EVERYWHERE, {})):
         return True
-    return any(reply.ok is not None for reply in session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S))
+    return any(
+        reply.ok is not None
+        for reply in session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S)
+    )
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
@@ -183,10 +206,16 @@ def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
         return Answer(table, None)
     documents = [json.loads(payload) for payload in payloads]
     if asked.format is Format.JSON:
-        return Answer(None, {"tiles": documents if rank is None else sorted(documents, key=_first(rank))})
+        return Answer(
+            None, {"tiles": documents if rank is None else sorted(documents, key=_first(rank))}
+        )
     features = [feature for document in documents for feature in document["features"]]
     if rank is not None:
-        features.sort(key=lambda feature: rank.of(feature["properties"]["cell"], feature["properties"]["sector"]))
+        features.sort(
+            key=lambda feature: rank.of(
+                feature["properties"]["cell"], feature["properties"]["sector"]
+            )
+        )
     return Answer(None, {"type": "FeatureCollection", "features": features})
 
 
@@ -208,7 +237,10 @@ def write(answer: Answer, path: Path) -> None:
         if answer.table is None:
             path.write_text(json.dumps(answer.document))
         else:
-            with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_stream(sink, answer.table.schema) as writer:
+            with (
+                pa.OSFile(str(path), "wb") as sink,
+                pa.ipc.new_stream(sink, answer.table.schema) as writer,
+            ):
                 writer.write_table(answer.table)
 
 

@@ -23,9 +23,19 @@ STEP_M: Final = 5.0  # between two looks along a link
 GOOD_GRIP: Final = 0.5  # lower bound of a wet road; above it costs nothing
 POWER: Final = 2.0
 MOST: Final = 20.0  # Valhalla refuses too great a spread, and finds no way round ice at the destination otherwise
-STEPS: Final = (1.0, 1.5, 2.5, 5.0, 10.0, MOST)  # factors that are written; neighbours of one class are one line
+STEPS: Final = (
+    1.0,
+    1.5,
+    2.5,
+    5.0,
+    10.0,
+    MOST,
+)  # factors that are written; neighbours of one class are one line
 SHORTEST_M: Final = 15.0  # a line that can be placed on a link
-ICE_LOWER, ICE_SURE = 0.3, 0.9  # upper end below which, and P(slippery) from which, a cell is taken out as ice
+ICE_LOWER, ICE_SURE = (
+    0.3,
+    0.9,
+)  # upper end below which, and P(slippery) from which, a cell is taken out as ice
 HALF_WIDTH_M: Final = 8.0  # of a polygon around a road
 
 
@@ -67,14 +77,18 @@ def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
         place = grid.SECTORS * grid.cell_of(latitude, longitude) + grid.sector_of(yaw)
         found = np.searchsorted(key, place)
         found[found == len(key)] = 0
-        cost = np.where(key[found] == place, factor[found], 1.0) if len(key) else np.ones(len(place))
+        cost = (
+            np.where(key[found] == place, factor[found], 1.0) if len(key) else np.ones(len(place))
+        )
         out += _lines(cost, latitude, longitude)
     return out
 
 
 def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
     """Return rings (longitude, latitude) of the cells that are surely ice."""
-    upper, slippery = (np.nan_to_num(_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery"))
+    upper, slippery = (
+        np.nan_to_num(_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery")
+    )
     ice = (upper < ICE_LOWER) & (slippery >= ICE_SURE) & _counts(table)
     cells = np.unique(np.asarray(table["cell"].to_numpy(), np.int64)[ice])
     west, south, east, north = grid.bounds(cells)
@@ -82,7 +96,9 @@ def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
     return [[(w, s), (e, s), (e, n), (w, n), (w, s)] for w, s, e, n in corners]
 
 
-def valhalla(lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()) -> dict[str, Any]:
+def valhalla(
+    lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()
+) -> dict[str, Any]:
     """Return what is merged into a Valhalla request for a route."""
     features = [
         {
@@ -117,13 +133,17 @@ def _column(table: pa.Table, name: str) -> FloatArray:
 
 
 def _counts(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    return np.array([basis in ("measured", "borrowed") for basis in table["basis"].to_pylist()], np.bool_)
+    return np.array(
+        [basis in ("measured", "borrowed") for basis in table["basis"].to_pylist()], np.bool_
+    )
 
 
 def _known(table: pa.Table) -> tuple[IntArray, FloatArray]:
     """Return cell and sector as one sorted number, and the factor there."""
     counts = _counts(table)
-    cell, sector = (np.asarray(table[name].to_numpy(), np.int64)[counts] for name in ("cell", "sector"))
+    cell, sector = (
+        np.asarray(table[name].to_numpy(), np.int64)[counts] for name in ("cell", "sector")
+    )
     factor = factors(_column(table, "mu_lower")[counts])
     key = grid.SECTORS * cell + sector
     order = np.argsort(key)
@@ -155,7 +175,11 @@ def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> lis
         begin, end = first, min(last, len(cost) - 1)
         while (end - begin) * STEP_M < SHORTEST_M and (begin > 0 or end < len(cost) - 1):
             begin, end = max(begin - 1, 0), min(end + 1, len(cost) - 1)
-        points = list(zip(longitude[begin : end + 1].tolist(), latitude[begin : end + 1].tolist(), strict=True))
+        points = list(
+            zip(
+                longitude[begin : end + 1].tolist(), latitude[begin : end + 1].tolist(), strict=True
+            )
+        )
         out.append(CostLine(float(cost[first]), points))
     return out
 
@@ -166,7 +190,10 @@ def _ribbon(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     east = METRES_PER_DEGREE * np.cos(np.radians(latitude.mean()))
     dx, dy = np.gradient(longitude) * east, np.gradient(latitude) * METRES_PER_DEGREE
     length = np.maximum(np.hypot(dx, dy), 1e-9)
-    across_x, across_y = -dy / length * HALF_WIDTH_M / east, dx / length * HALF_WIDTH_M / METRES_PER_DEGREE
+    across_x, across_y = (
+        -dy / length * HALF_WIDTH_M / east,
+        dx / length * HALF_WIDTH_M / METRES_PER_DEGREE,
+    )
     left = list(zip((longitude + across_x).tolist(), (latitude + across_y).tolist(), strict=True))
     right = list(zip((longitude - across_x).tolist(), (latitude - across_y).tolist(), strict=True))
     ring = [*left, *right[::-1]]

@@ -105,7 +105,11 @@ class Stretches:
     def take_all(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
         """Replace the standing alerts; others end if a service answers for their place."""
         present = {(alert.cell, alert.sector): alert for alert in standing}
-        self._standing = {place: one for place, one in self._standing.items() if place in present or not is_heard(one)}
+        self._standing = {
+            place: one
+            for place, one in self._standing.items()
+            if place in present or not is_heard(one)
+        }
         for alert in present.values():
             self.take(alert)
 
@@ -142,9 +146,19 @@ class Stretches:
         out: dict[str, list[Alert]] = {}
         for part in sorted(parts, key=len, reverse=True):
             cells = _cells(part)
-            names = [name for name, members in self._members.items() if members & cells and name not in out]
-            name = min(names, key=lambda one: (self._known[one].since, one)) if names else _new(part[0])
-            while not names and (name in out or name in self._known):  # a part that fell off begins with the same cell
+            names = [
+                name
+                for name, members in self._members.items()
+                if members & cells and name not in out
+            ]
+            name = (
+                min(names, key=lambda one: (self._known[one].since, one))
+                if names
+                else _new(part[0])
+            )
+            while not names and (
+                name in out or name in self._known
+            ):  # a part that fell off begins with the same cell
                 name += "b"
             out[name] = part
         return out
@@ -170,7 +184,9 @@ def link_cells(cell: IntArray) -> IntArray:
         return np.zeros(0, np.int64)
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
-    near = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell)))
+    near = coo_array(
+        (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell))
+    )
     return np.asarray(connected_components(near, directed=False)[1], np.int64)
 
 
@@ -187,7 +203,9 @@ def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
     apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    tree = minimum_spanning_tree(coo_array((apart, (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell))))
+    tree = minimum_spanning_tree(
+        coo_array((apart, (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell)))
+    )
     far = shortest_path(tree, directed=False, indices=0)
     end = int(np.argmax(far))
     length, before = shortest_path(tree, directed=False, indices=end, return_predecessors=True)
@@ -198,14 +216,18 @@ def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
     return tuple(zip(latitude.tolist(), longitude.tolist(), strict=True))
 
 
-def _shape(cell: IntArray) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
+def _shape(
+    cell: IntArray,
+) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
     """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of the largest
     spread."""
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
     x, y = (west + east) / 2 * scale, (south + north) / 2 * METRES_PER_DEGREE
     side = float((east[0] - west[0]) * scale)
-    spread, axes = np.linalg.eigh(np.cov(np.stack([x - x.mean(), y - y.mean()]), ddof=0).reshape(2, 2))
+    spread, axes = np.linalg.eigh(
+        np.cov(np.stack([x - x.mean(), y - y.mean()]), ddof=0).reshape(2, 2)
+    )
     along = (x - x.mean()) * axes[0, 1] + (y - y.mean()) * axes[1, 1]
     bearing = math.degrees(math.atan2(axes[1, 1], axes[0, 1])) % 180.0
     names = ("east-west", "northeast-southwest", "north-south", "northwest-southeast")

@@ -73,7 +73,9 @@ def watch(
         with lock:
             found = stretches.changes()
         for alert in found:
-            say(json.dumps({"event": "alert", **alert.values()}) if wishes.as_json else alert.line())
+            say(
+                json.dumps({"event": "alert", **alert.values()}) if wishes.as_json else alert.line()
+            )
             hear(alert)
 
     def tell_services() -> None:
@@ -105,11 +107,17 @@ def watch(
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
     """Return the standing alerts of all services that answer."""
-    replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S) if reply.ok is not None)
+    replies = (
+        reply.ok
+        for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S)
+        if reply.ok is not None
+    )
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 
-def _say_regions(say: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool) -> None:
+def _say_regions(
+    say: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool
+) -> None:
     for event, found in (("away", away), ("back", back)):
         if found and as_json:
             say(json.dumps({"event": event, "regions": sorted(found)}))

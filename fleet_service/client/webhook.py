@@ -28,7 +28,9 @@ from schemas.thresholds import SLIPPERY_MU
 if TYPE_CHECKING:
     import httpx
 
-TIMEOUT_S: Final = 5.0  # of a whole request, so that a receiver that drips bytes does not block the queue
+TIMEOUT_S: Final = (
+    5.0  # of a whole request, so that a receiver that drips bytes does not block the queue
+)
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 60.0
 # Answers by which a receiver refuses this message for good; repeating it would block the queue.
 REFUSALS: Final = frozenset({400, 413, 415, 422})
@@ -79,10 +81,14 @@ class Webhook:
         InputError: the URL is not valid, or the package for HTTP is missing.
     """
 
-    def __init__(self, url: str, say: Callable[[str], None], queue: AlertQueue, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(
+        self, url: str, say: Callable[[str], None], queue: AlertQueue, timeout_s: float = TIMEOUT_S
+    ) -> None:
         check_url(url)
         self._url, self._say, self._queue, self._timeout_s = url, say, queue, timeout_s
-        self._name = f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"  # a path may hold a secret
+        self._name = (
+            f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"  # a path may hold a secret
+        )
         self.counts: Counter[str] = Counter()
         self._failure, self._undelivered, self._is_closed = "", 0, False
         self._more, self._stop = threading.Event(), threading.Event()
@@ -110,7 +116,12 @@ class Webhook:
         alerts = {name: float(self.counts[name]) for name in ("delivered", *LOSSES)}
         return [
             Metric("webhook_alerts", "counter", "Alerts by outcome", alerts, "outcome"),
-            Metric("webhook_failures", "counter", "Failed deliveries", {"": float(self.counts["failures"])}),
+            Metric(
+                "webhook_failures",
+                "counter",
+                "Failed deliveries",
+                {"": float(self.counts["failures"])},
+            ),
             gauge("webhook_waiting", "Alerts in the queue", float(self.waiting)),
         ]
 
@@ -199,7 +210,9 @@ class Webhook:
         """Return the status of the answer; its body is not read."""
         async with asyncio.timeout(self._timeout_s):
             headers = {"Content-Type": "application/json"}
-            async with client.stream("POST", self._url, content=text.encode(), headers=headers) as answer:
+            async with client.stream(
+                "POST", self._url, content=text.encode(), headers=headers
+            ) as answer:
                 return answer.status_code
 
 
@@ -207,15 +220,21 @@ def check_url(url: str) -> None:
     """Raise InputError if a URL is not valid, or the package for HTTP is missing."""
     try:
         parts = urlsplit(url)
-        is_valid = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
+        is_valid = (
+            parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
+        )
     except ValueError:
         is_valid = False
     if not is_valid:
-        raise InputError("webhook", f"{url!r} is no URL", "give http://HOST/PATH or https://HOST/PATH")
+        raise InputError(
+            "webhook", f"{url!r} is no URL", "give http://HOST/PATH or https://HOST/PATH"
+        )
     try:
         import httpx  # noqa: F401
     except ImportError as error:
-        raise InputError("webhook", "the package httpx is missing", "pip install 'gripmap[webhook]'") from error
+        raise InputError(
+            "webhook", "the package httpx is missing", "pip install 'gripmap[webhook]'"
+        ) from error
 
 
 def _failure_of(status: int) -> str | None:

@@ -96,18 +96,30 @@ def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
 def _cap(name: str, where: Section) -> Section:
     capped = (*wire.Kind, *keys.PRIVATE)
     rules = [{"key_expr": f"{keys.ROOT}/{kind}/**", "freq": wire.MESSAGES_PER_S} for kind in capped]
-    return {"id": f"rate-{name}", "flows": ["ingress"], "messages": ["put", "delete"], **where, "rules": rules}
+    return {
+        "id": f"rate-{name}",
+        "flows": ["ingress"],
+        "messages": ["put", "delete"],
+        **where,
+        "rules": rules,
+    }
 
 
 def access_control(fleet: Enrolment) -> Section:
     """Return the access list of all routers."""
     rules = [
         _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
-        _rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*")) | {"permission": "deny"},
+        _rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
+        | {"permission": "deny"},
         _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _rule("told", ("egress",), ("put", "reply"), PUBLIC),
         # Declared publishers and queriers send nothing, silently, until they are told that somebody listens.
-        _rule("listened", ("egress",), ("declare_subscriber",), [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind]),
+        _rule(
+            "listened",
+            ("egress",),
+            ("declare_subscriber",),
+            [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
+        ),
         _rule("weather", ("ingress",), ("put",), [WEATHER]),
         _rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
         # Who serves which region is no secret: else a region without a service looks like one without grip reports.
@@ -118,8 +130,12 @@ def access_control(fleet: Enrolment) -> Section:
     roles = {
         "routers": list(fleet.routers), "services": fleet.services, "readers": fleet.readers, "weather": fleet.weather,
     }  # fmt: skip
-    subjects = [{"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names]
-    subjects += [{"id": name, "cert_common_names": [name]} for name in (*fleet.vehicles, *fleet.owners)]
+    subjects = [
+        {"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names
+    ]
+    subjects += [
+        {"id": name, "cert_common_names": [name]} for name in (*fleet.vehicles, *fleet.owners)
+    ]
     trusted = [f"role/{role}" for role in ("routers", "services") if roles[role]]
     policies = [{"rules": ["everything"], "subjects": trusted}]
     if fleet.services:
@@ -172,7 +188,9 @@ def _sees(name: str, expressions: list[str]) -> list[Section]:
     ]
 
 
-def _rule(name: str, flows: Sequence[str], messages: Sequence[str], expressions: Sequence[str]) -> Section:
+def _rule(
+    name: str, flows: Sequence[str], messages: Sequence[str], expressions: Sequence[str]
+) -> Section:
     return {
         "id": name,
         "permission": "allow",

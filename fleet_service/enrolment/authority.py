@@ -35,7 +35,9 @@ class KeyPair(NamedTuple):
     def write(self, stem: Path) -> None:
         """Write STEM.pem and STEM.key; `read` detects a pair that was written half."""
         secret = self.key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
         )
         write(stem.with_name(stem.name + ".key"), secret, 0o600)
         write(stem.with_name(stem.name + ".pem"), pem(self.certificate), 0o644)
@@ -65,7 +67,9 @@ def read(stem: Path) -> KeyPair | None:
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
     except (ValueError, TypeError) as error:
-        raise InputError("out", f"{path} is no private key", "move it away; it will be made anew") from error
+        raise InputError(
+            "out", f"{path} is no private key", "move it away; it will be made anew"
+        ) from error
     if not isinstance(key, Key) or key.public_key() != certificate.public_key():
         return None
     return KeyPair(certificate, key)
@@ -82,7 +86,9 @@ def read_certificate(path: Path) -> x509.Certificate | None:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as error:
-        raise InputError("out", f"{path} is no certificate", "move it away; it will be made anew") from error
+        raise InputError(
+            "out", f"{path} is no certificate", "move it away; it will be made anew"
+        ) from error
 
 
 def new_authority(days: float, now: datetime) -> KeyPair:
@@ -98,7 +104,9 @@ def new_authority(days: float, now: datetime) -> KeyPair:
     return KeyPair(certificate, key)
 
 
-def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime) -> KeyPair:
+def issue(
+    authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime
+) -> KeyPair:
     """Issue a certificate for a name; with `hosts` it is also valid for a server under them.
 
     Raises:
@@ -108,7 +116,9 @@ def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now:
     if until > authority.certificate.not_valid_after_utc:
         end = authority.certificate.not_valid_after_utc
         raise InputError(
-            "days", f"the authority ends before, on {end:%Y-%m-%d}", "give fewer, or bring in another (--ca next)"
+            "days",
+            f"the authority ends before, on {end:%Y-%m-%d}",
+            "give fewer, or bring in another (--ca next)",
         )
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
@@ -118,7 +128,10 @@ def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now:
         .add_extension(_usage(signs=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
         .add_extension(x509.SubjectAlternativeName(alternatives(name, hosts)), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
+            critical=False,
+        )
         .sign(authority.key, hashes.SHA256())
     )
     return KeyPair(certificate, key)
@@ -139,7 +152,11 @@ def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> 
     """Return True if the authority issued the certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
-    except (InvalidSignature, ValueError, TypeError):  # another key, another name, another kind of key
+    except (
+        InvalidSignature,
+        ValueError,
+        TypeError,
+    ):  # another key, another name, another kind of key
         return False
     return True
 

@@ -55,7 +55,9 @@ class Registry:
         used_at: folder in which the routers will find their files (default: `folder`).
     """
 
-    def __init__(self, folder: Path, terms: Terms, now: datetime, used_at: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, terms: Terms, now: datetime, used_at: Path | None = None
+    ) -> None:
         self._folder, self._terms, self._now, self._used_at = folder, terms, now, used_at or folder
         self._authority = folder / "authority"
         self._revoked = folder / "revoked"
@@ -81,7 +83,9 @@ class Registry:
                 done.kept.append(name)
             else:
                 self._refuse_revoked(name, signer.certificate)
-                ca.issue(signer, name, hosts, self._terms.days, self._now).write(self._folder / name)
+                ca.issue(signer, name, hosts, self._terms.days, self._now).write(
+                    self._folder / name
+                )
                 done.made.append(name)
         done.revoked += self._revoke(self.leaving(fleet))
         self._trust()
@@ -102,7 +106,9 @@ class Registry:
         if signer is None:
             if (self._authority / "ca.pem").exists():
                 raise InputError(
-                    "out", f"{self._authority} lacks the authority's key", "restore ca.key from its backup"
+                    "out",
+                    f"{self._authority} lacks the authority's key",
+                    "restore ca.key from its backup",
                 )
             signer = ca.new_authority(self._terms.ca_days, self._now)
             signer.write(current)
@@ -110,9 +116,16 @@ class Registry:
 
     def _switch(self) -> None:
         """Let the next authority sign; an interrupted call can be repeated."""
-        following, leaving = ca.read(self._authority / "next"), ca.read_certificate(self._authority / "ca.pem")
+        following, leaving = (
+            ca.read(self._authority / "next"),
+            ca.read_certificate(self._authority / "ca.pem"),
+        )
         if following is None or leaving is None:
-            raise InputError("ca", "there is no next authority", "begin with --ca next, and bring trust.pem to all")
+            raise InputError(
+                "ca",
+                "there is no next authority",
+                "begin with --ca next, and bring trust.pem to all",
+            )
         if leaving != following.certificate:
             ca.write(self._authority / "old.pem", ca.pem(leaving), 0o644)
         following.write(self._authority / "ca")
@@ -135,18 +148,30 @@ class Registry:
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
         """Refuse a revoked name: the access list knows names, so a lost certificate would be valid again."""
         lost = ca.read_certificate(self._revoked / f"{name}.pem")
-        if lost is None or lost.not_valid_after_utc < self._now or not ca.is_signed_by(lost, signer):
+        if (
+            lost is None
+            or lost.not_valid_after_utc < self._now
+            or not ca.is_signed_by(lost, signer)
+        ):
             return
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
         raise InputError(
-            "fleet", f"{name!r} was revoked and its certificate is good until {until}", "give another name"
+            "fleet",
+            f"{name!r} was revoked and its certificate is good until {until}",
+            "give another name",
         )
 
     def leaving(self, fleet: Enrolment) -> list[str]:
         """Return names that have a certificate of this authority and are not on the list: `enrol` would revoke them."""
-        found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))
+        found = (
+            ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
+        )
         signers = [signer for signer in found if signer is not None]
-        return [path.stem for path in sorted(self._folder.glob("*.pem")) if self._leaves(path, fleet, signers)]
+        return [
+            path.stem
+            for path in sorted(self._folder.glob("*.pem"))
+            if self._leaves(path, fleet, signers)
+        ]
 
     def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
         """Return True if a file is a certificate of this authority for a name that is not on the list."""
@@ -161,13 +186,19 @@ class Registry:
     def _revoke(self, gone: list[str]) -> list[str]:
         """Move certificates and keys of removed names to `revoked/`."""
         for name in gone:
-            for ending in (".key", ".json5", ".pem"):  # the certificate last: cut off half way, it is done again
+            for ending in (
+                ".key",
+                ".json5",
+                ".pem",
+            ):  # the certificate last: cut off half way, it is done again
                 path = self._folder / f"{name}{ending}"
                 if path.exists():
                     path.rename(self._revoked / path.name)
         return gone
 
     def _trust(self) -> None:
-        found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))
+        found = (
+            ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
+        )
         trusted = [certificate for certificate in found if certificate is not None]
         ca.write(self._folder / "trust.pem", b"".join(map(ca.pem, trusted)), 0o644)

@@ -12,7 +12,9 @@ from pydantic import AfterValidator, Field, model_validator
 from schemas.config import Settings, VehicleName
 
 _LABEL = r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"  # RFC 1123, section 2.1
-_HOST = re.compile(rf"(?:{_LABEL}\.)*{_LABEL}\.?")  # one way to read each letter, so that a wrong one is seen at once
+_HOST = re.compile(
+    rf"(?:{_LABEL}\.)*{_LABEL}\.?"
+)  # one way to read each letter, so that a wrong one is seen at once
 
 
 def _checked_host(host: str) -> str:
@@ -32,11 +34,19 @@ class Router(Settings):
     """One router."""
 
     hosts: list[Host] = Field(
-        default=["127.0.0.1", "localhost"], min_length=1, description="names and addresses by which others reach it"
+        default=["127.0.0.1", "localhost"],
+        min_length=1,
+        description="names and addresses by which others reach it",
     )
-    listen: Host = Field(default="127.0.0.1", description="address that it listens on; :: for every one")
-    port: int = Field(default=7447, ge=1, le=65535, description="of both transports: QUIC over UDP, TLS over TCP")
-    quic: bool = Field(default=True, description="listen on QUIC too; false where UDP cannot reach the router")
+    listen: Host = Field(
+        default="127.0.0.1", description="address that it listens on; :: for every one"
+    )
+    port: int = Field(
+        default=7447, ge=1, le=65535, description="of both transports: QUIC over UDP, TLS over TCP"
+    )
+    quic: bool = Field(
+        default=True, description="listen on QUIC too; false where UDP cannot reach the router"
+    )
     vehicle_interfaces: list[str] = Field(
         default=[],
         description="network interfaces on which no other router arrives; sessions over TLS are capped there as well",
@@ -70,26 +80,44 @@ def _endpoint(protocol: str, host: str, port: int) -> str:
 class Enrolment(Settings):
     """Names by role. A name has one role, because the certificate contains only the name."""
 
-    routers: dict[VehicleName, Router] = Field(min_length=1, description="each connects to those before it")
-    services: list[VehicleName] = Field(default=["shard-0"], description="everything under gripmap/")
+    routers: dict[VehicleName, Router] = Field(
+        min_length=1, description="each connects to those before it"
+    )
+    services: list[VehicleName] = Field(
+        default=["shard-0"], description="everything under gripmap/"
+    )
     readers: list[VehicleName] = Field(default=[], description="map and alerts, nothing else")
-    weather: list[VehicleName] = Field(default=[], description="who puts road weather, and does nothing else")
-    vehicles: list[VehicleName] = Field(default=[], description="their own keys; map and alerts to read")
+    weather: list[VehicleName] = Field(
+        default=[], description="who puts road weather, and does nothing else"
+    )
+    vehicles: list[VehicleName] = Field(
+        default=[], description="their own keys; map and alerts to read"
+    )
     owners: dict[VehicleName, list[VehicleName]] = Field(
-        default={}, description="who may see what lies ahead of and under which vehicles, and read as a reader does"
+        default={},
+        description="who may see what lies ahead of and under which vehicles, and read as a reader does",
     )
 
     @property
     def names(self) -> list[str]:
         """Return all names."""
-        return [*self.routers, *self.services, *self.readers, *self.weather, *self.vehicles, *self.owners]
+        return [
+            *self.routers,
+            *self.services,
+            *self.readers,
+            *self.weather,
+            *self.vehicles,
+            *self.owners,
+        ]
 
     @model_validator(mode="after")
     def _one_role_each(self) -> Enrolment:
         twice = [name for name, times in Counter(self.names).items() if times > 1]
         if twice:
             raise ValueError(f"{twice[0]!r} is there twice, and a name has one role")
-        strange = [name for owned in self.owners.values() for name in owned if name not in self.vehicles]
+        strange = [
+            name for owned in self.owners.values() for name in owned if name not in self.vehicles
+        ]
         if strange:
             raise ValueError(f"{strange[0]!r} has an owner and is no vehicle")
         return self

@@ -30,18 +30,26 @@ Bins = NDArray[np.floating[Any]]
 
 BOUND, VALUE = 0, 1  # kinds of vote
 _BINS: Final = mugrid.BINS
-_DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0  # bins² per second, half the variance
+_DIFFUSION: Final = (
+    0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
+)  # bins² per second, half the variance
 _STEP: Final = 0.25  # largest share that leaves a bin to each side in one diffusion step: stable and without ripple
 _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)  # of steps
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
 _EDGE: Final = (c.SLIPPERY - mugrid.LOWER) / c.BIN_WIDTH
-SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)  # of each bin that lies below SLIPPERY
+SLIPPERY_SHARE: Final[FloatArray] = np.clip(
+    _EDGE - np.arange(_BINS), 0.0, 1.0
+)  # of each bin that lies below SLIPPERY
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
 FULL: Final = np.uint16(65535)
-REACH: Final = 6  # bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
-_LEAST_TAP: Final = 1e-9  # single precision has numbers below 1e-38 that cost a hundred times as much to multiply
+REACH: Final = (
+    6  # bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
+)
+_LEAST_TAP: Final = (
+    1e-9  # single precision has numbers below 1e-38 that cost a hundred times as much to multiply
+)
 PADDED: Final = _BINS + 2 * REACH
 
 

@@ -31,7 +31,9 @@ from schemas.thresholds import NS
 
 _ANY: Final = 1 << 62
 # What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape: (kernels, 2, 32).
-SLIPPERY_WEIGHTS: Final = tuple(np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS)
+SLIPPERY_WEIGHTS: Final = tuple(
+    np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
+)
 
 
 class Updated(NamedTuple):
@@ -72,7 +74,9 @@ class Fusion:
 
     def __init__(self, lateness_s: float) -> None:
         self._lateness_ns = int(lateness_s * NS)
-        self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
+        self._kept_epochs = (
+            self._lateness_ns // c.EPOCH_NS + 2
+        )  # whose trust an observation in time may still need
         self._epoch: int | None = None
         self.store = Store()
         self.standings: list[Standing] = [first_standing(initial_trust(False))]
@@ -140,7 +144,11 @@ class Fusion:
         if before is None:
             checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
             late = o.time < checkpoint
-            late_by = np.where(late & (checkpoint - o.time <= LATE_MOST_NS), fused_at(o.time, checkpoint) - o.time, 0)
+            late_by = np.where(
+                late & (checkpoint - o.time <= LATE_MOST_NS),
+                fused_at(o.time, checkpoint) - o.time,
+                0,
+            )
         else:
             late, late_by = before.late, before.late_by
         old = late_by > 0
@@ -157,7 +165,9 @@ class Fusion:
             else:
                 used[rows] = before.weight[rows]
             arrivals = _arrivals(o, vehicle, used, old)
-            slots, left_out = self._absorb(o, rows, arrivals, c.WAITING_MOST if before is None else _ANY)
+            slots, left_out = self._absorb(
+                o, rows, arrivals, c.WAITING_MOST if before is None else _ANY
+            )
             touched.append(slots)
             late, left = late | left_out, left | left_out
         used[left] = 0.0
@@ -176,9 +186,14 @@ class Fusion:
     def update_weather(self, reports: Reports) -> None:
         """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
         came."""
-        columns = (np.concatenate([getattr(r, f.name) for r in (self.reports, reports)]) for f in fields(Reports))
+        columns = (
+            np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])
+            for f in fields(Reports)
+        )
         self.reports = Reports(*columns)
-        if self.checkpoint is not None:  # all that a belief may still ask for is younger than its last visit
+        if (
+            self.checkpoint is not None
+        ):  # all that a belief may still ask for is younger than its last visit
             self.reports = _recent(self.reports, self._oldest())
         self._weather = weather_of(self.reports)
 
@@ -193,7 +208,9 @@ class Fusion:
 
     def slippery(self, slots: IntArray) -> FloatArray:
         """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
-        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots)
+        return _slippery(
+            self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
+        )
 
     def alarming(self, slots: IntArray) -> FloatArray:
         """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
@@ -228,7 +245,9 @@ class Fusion:
         who, when = self._sources(np.array([slot]), side, since)
         return [int(self.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
 
-    def _sources(self, slots: IntArray, side: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
+    def _sources(
+        self, slots: IntArray, side: int, since: IntArray | int
+    ) -> tuple[IntArray, IntArray]:
         """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does not count."""
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
@@ -238,7 +257,9 @@ class Fusion:
         return who, np.where(counted, when, 0)
 
     def _standing(self, epoch: int) -> Standing:
-        return next(found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0)
+        return next(
+            found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0
+        )
 
     def _advance(self, epoch: int) -> None:
         """Move T to `epoch`, one epoch at a time while the window holds anything."""
@@ -255,7 +276,11 @@ class Fusion:
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
             standing = judged(store.peers, last._replace(weight=weight), self._epoch)
-            self.standings = [self.standings[0], *self.standings[1:][-self._kept_epochs :], standing]
+            self.standings = [
+                self.standings[0],
+                *self.standings[1:][-self._kept_epochs :],
+                standing,
+            ]
             self._find_shape()
 
     def _find_shape(self) -> None:
@@ -264,11 +289,15 @@ class Fusion:
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
-        rows = rows[np.argsort(o.time[rows], kind="stable")]  # in the order of time nothing has to be computed anew
+        rows = rows[
+            np.argsort(o.time[rows], kind="stable")
+        ]  # in the order of time nothing has to be computed anew
         at, keys, share = _votes(o, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
-        return slots, absorb(self.store.state, self._weather, arrivals, Votes(at, slots, share), most)
+        return slots, absorb(
+            self.store.state, self._weather, arrivals, Votes(at, slots, share), most
+        )
 
     def _oldest(self) -> int:
         times = self.live.time[: self.size]
@@ -300,7 +329,11 @@ def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32
         share.append(o.other_share[rows[elsewhere], which])
     whole = np.concatenate(at)
     order = np.argsort(o.time[whole], kind="stable") if len(at) > 1 else slice(None)
-    return whole[order], np.concatenate(keys)[order], np.concatenate(share)[order].astype(np.float32)
+    return (
+        whole[order],
+        np.concatenate(keys)[order],
+        np.concatenate(share)[order].astype(np.float32),
+    )
 
 
 def _recent(reports: Reports, oldest: int) -> Reports:

@@ -43,7 +43,9 @@ _RECORDS: Final = {
     "cells": CELL, "base_cells": CELL, "base_sources": SOURCE, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR,
     "reporters": REPORTER, "peers": PEER, "names": VEHICLE,
 }  # fmt: skip
-LAYOUT: Final = hashlib.blake2b(repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8).hexdigest()
+LAYOUT: Final = hashlib.blake2b(
+    repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8
+).hexdigest()
 
 
 def image_of(fusion: Fusion) -> Image:
@@ -61,9 +63,14 @@ def image_of(fusion: Fusion) -> Image:
     image["base_belief"] = {"bins": base.belief.reshape(-1)}
     image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
     image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
-    image["used"] = {"count": state.used, "more": np.array([store.size, store.vehicles, store.hour, fusion.epoch])}
+    image["used"] = {
+        "count": state.used,
+        "more": np.array([store.size, store.vehicles, store.hour, fusion.epoch]),
+    }
     image["trust"] = {
-        "epoch": np.concatenate([np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]),
+        "epoch": np.concatenate(
+            [np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]
+        ),
         "weight": np.concatenate([standing.weight for standing in fusion.standings]),
     }
     image["trusts"] = {
@@ -73,7 +80,9 @@ def image_of(fusion: Fusion) -> Image:
     }
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
-    return {name: {key: column.copy() for key, column in table.items()} for name, table in image.items()}
+    return {
+        name: {key: column.copy() for key, column in table.items()} for name, table in image.items()
+    }
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:

@@ -43,13 +43,19 @@ def delayed(o: Observations, late_by: IntArray, weather: Weather) -> Observation
     rows = np.flatnonzero(late_by)
     evidence = o.evidence.copy()
     evidence[rows] = aged_evidence(
-        o.evidence[rows], o.cell[rows] * grid.SECTORS, o.time[rows], o.time[rows] + late_by[rows], weather
+        o.evidence[rows],
+        o.cell[rows] * grid.SECTORS,
+        o.time[rows],
+        o.time[rows] + late_by[rows],
+        weather,
     )
     return replace(o, time=o.time + late_by, evidence=evidence)
 
 
 @compiled
-def aged_evidence(evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather) -> ByteArray:
+def aged_evidence(
+    evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
+) -> ByteArray:
     """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same roads at `end` [ns]."""
     out = np.empty_like(evidence)
     likelihood, padded = np.empty(mugrid.BINS, np.float32), np.empty(PADDED, np.float32)

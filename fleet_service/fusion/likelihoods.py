@@ -26,7 +26,9 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 _LESS: Final = 0.5 * c.UTILISED_STD
-_USED_STEP: Final = 0.005  # of the grip used where its bound is looked up, rounded down: a seventh of a bin
+_USED_STEP: Final = (
+    0.005  # of the grip used where its bound is looked up, rounded down: a seventh of a bin
+)
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
@@ -46,7 +48,8 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
     rest = np.flatnonzero(~with_likelihood)
     if len(rest):
         mu, lower, upper, used = (
-            columns[n][rest].astype(np.float64) for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
+            columns[n][rest].astype(np.float64)
+            for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
         )
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
         log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))

@@ -89,13 +89,19 @@ def beliefs(
         for side in range(3):
             most, there = 0.0, cell
             for step in range(1, c.NEIGHBOURS + 1):
-                if side == 2:  # the other direction: of the same cell, or of the one to the left or right
+                if (
+                    side == 2
+                ):  # the other direction: of the same cell, or of the one to the left or right
                     if step > 3:
                         break
-                    there = cell if step == 1 else stepped(cell, (sector + 2 * step - 3) % grid.SECTORS)
+                    there = (
+                        cell if step == 1 else stepped(cell, (sector + 2 * step - 3) % grid.SECTORS)
+                    )
                 else:
                     there = stepped(there, sector if side == 0 else back)
-                row = find(table, live.cells, there * grid.SECTORS + (back if side == 2 else sector))
+                row = find(
+                    table, live.cells, there * grid.SECTORS + (back if side == 2 else sector)
+                )
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
                 kept = _kept(live, row)

@@ -10,7 +10,9 @@ import numpy as np
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-_FAR: Final = -12.0  # below, the logarithm's series is better than a part in 10⁶, and its argument may not be held
+_FAR: Final = (
+    -12.0
+)  # below, the logarithm's series is better than a part in 10⁶, and its argument may not be held
 
 
 def distribution(x: FloatArray) -> FloatArray:

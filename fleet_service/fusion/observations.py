@@ -16,7 +16,9 @@ from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 
 SmallArray = NDArray[np.int8]
-ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
+ROWS_PER_SEQ: Final = (
+    64  # more than a batch has rows: seq and row become one number that keeps their order
+)
 UNTOLD_SHARE: Final = 0.5  # of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
 USED_MOST: Final = 2.0  # of the grip, as in the contract
 _US: Final = 1000  # ns: the archive keeps whole microseconds
@@ -72,8 +74,12 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
     steps, reported = evidence(columns, columns["with_likelihood"])
-    used = np.where(np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"])
-    other, share = other_cells(columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"])
+    used = np.where(
+        np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"]
+    )
+    other, share = other_cells(
+        columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
+    )
     return Observations(
         time=columns["leave_time"] // _US * _US,
         cell=columns["cell"],

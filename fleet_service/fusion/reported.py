@@ -57,5 +57,7 @@ def _describe(steps: ByteArray, reported: Float32Array) -> None:
         for i in range(mugrid.BINS):
             second += likelihood[i] * (mugrid.CENTRES[i] - mean) ** 2
         reported[n, 0] = mean
-        reported[n, 1] = math.sqrt(second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2)
+        reported[n, 1] = math.sqrt(
+            second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2
+        )
         reported[n, 2] = slippery / whole

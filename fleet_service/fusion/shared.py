@@ -52,7 +52,11 @@ _MOST: Final = 255.0
 def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
     """Manoeuvre of visits (n,) by how they used the grip; UNKNOWN where that is NaN."""
     along = np.abs(longitudinal) >= np.abs(lateral)
-    kind = np.where(along, np.where(longitudinal >= 0.0, DRIVING, BRAKING), np.where(lateral >= 0.0, LEFT, RIGHT))
+    kind = np.where(
+        along,
+        np.where(longitudinal >= 0.0, DRIVING, BRAKING),
+        np.where(lateral >= 0.0, LEFT, RIGHT),
+    )
     return np.where(np.isfinite(longitudinal) & np.isfinite(lateral), kind, UNKNOWN).astype(np.int8)
 
 
@@ -89,7 +93,9 @@ SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)  # doubts of the tables; the nearest 
 UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 
 
-def shared_kernel(used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader) -> FloatArray:
+def shared_kernel(
+    used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
+) -> FloatArray:
     """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32)."""
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
@@ -156,7 +162,9 @@ def kernel_of(cells: RecordArray, row: int) -> int:
 
 
 @refcount_free_inlined
-def read_road(kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray) -> None:
+def read_road(
+    kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray
+) -> None:
     """Belief about the road of a belief `p` (32) about what the fleet takes it for; sums to one."""
     kernel = kernels[kernel_of(cells, row)]
     for i in range(mugrid.BINS):
@@ -172,12 +180,18 @@ def read_road(kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray
 
 
 @refcount_free
-def note_value(cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float) -> None:
+def note_value(
+    cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
+) -> None:
     """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
     is, the less it counts."""
     used, shared = entries[entry].used / USED, entries[entry].shared / SHARED
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
-    weight = strength * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2 / (1.0 + (shared / c.SHARED_WIDE) ** 2)
+    weight = (
+        strength
+        * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2
+        / (1.0 + (shared / c.SHARED_WIDE) ** 2)
+    )
     before, largest = 0.0, 0
     for k in range(MANOEUVRES):
         before += cells[row].manoeuvres[k]

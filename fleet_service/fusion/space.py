@@ -42,7 +42,10 @@ def other_cells(
     x, y = grid.deinterleave(cell)
     n = 1 << grid.CELL_ZOOM
     ahead = np.rint(_STEPS * (cosine / steep)[:, None]), np.rint(_STEPS * (-sine / steep)[:, None])
-    columns, rows = (x[:, None] + ahead[0].astype(np.int64)) % n, y[:, None] + ahead[1].astype(np.int64)
+    columns, rows = (
+        (x[:, None] + ahead[0].astype(np.int64)) % n,
+        y[:, None] + ahead[1].astype(np.int64),
+    )
     other = grid.interleave(columns, np.clip(rows, 0, n - 1))
     good = (share >= c.SPREAD_LEAST) & np.isfinite(yaw)[:, None] & (rows >= 0) & (rows < n)
     good &= grid.region_of(other) == grid.region_of(cell)[:, None]
@@ -52,7 +55,9 @@ def other_cells(
 def shares(std: FloatArray, length: FloatArray) -> FloatArray:
     """π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w (n,)."""
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
-    return np.asarray((_g((_STEPS + 1) * ratio) - 2.0 * _g(_STEPS * ratio) + _g((_STEPS - 1) * ratio)) / ratio)
+    return np.asarray(
+        (_g((_STEPS + 1) * ratio) - 2.0 * _g(_STEPS * ratio) + _g((_STEPS - 1) * ratio)) / ratio
+    )
 
 
 def _g(x: FloatArray) -> FloatArray:

@@ -60,7 +60,9 @@ def compare(
             if c.REVISIT_S <= now - reported[k] <= c.PEER_S:
                 both = 0.5 * (mean + here.mean[k])
                 difference = (mean - here.mean[k]) / both
-                variance = _own_variance(mean, std) + _own_variance(float(here.mean[k]), float(here.std[k]))
+                variance = _own_variance(mean, std) + _own_variance(
+                    float(here.mean[k]), float(here.std[k])
+                )
                 if difference * difference < c.PEERS_DISAGREE**2 * variance:  # both of one road
                     _note_shape(peers, vehicle, (used - here.used[k]) / both, difference, variance)
             break
@@ -86,7 +88,9 @@ def compare(
 
 
 @refcount_free
-def _note_shape(peers: RecordArray, vehicle: int, used: float, difference: float, variance: float) -> None:
+def _note_shape(
+    peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
+) -> None:
     """Note how a vehicle's values of one cell differ with the grip that it used: its gain error is in both of them."""
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)
@@ -109,7 +113,9 @@ def _rank(vehicle: int, other: int) -> int:
     Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as a frequent one; or
     those that report most would displace the others.
     """
-    mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
+        0xBF58476D1CE4E5B9
+    )
     mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0x94D049BB133111EB)
     return int(np.int64(mixed >> np.uint64(33)))
 

@@ -26,7 +26,17 @@ from fleet_service.fusion.belief import (
 )  # fmt: skip
 from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade, note_value
 from fleet_service.fusion.store.pairs import returning
-from fleet_service.fusion.store.records import AGED, FINE, GRIP, ICE, NONE, SOURCES, UNTRUSTED, USED, Rows
+from fleet_service.fusion.store.records import (
+    AGED,
+    FINE,
+    GRIP,
+    ICE,
+    NONE,
+    SOURCES,
+    UNTRUSTED,
+    USED,
+    Rows,
+)
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
 from schemas.numeric import Float32Array
@@ -38,7 +48,9 @@ from schemas.thresholds import NS
 P, PADDED, LIKELIHOOD = 0, 1, 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
-_GRIP_MEAN: Final = 0.5 * (c.SOURCE_USED + mugrid.UPPER)  # of "at least u" against the uniform prior
+_GRIP_MEAN: Final = 0.5 * (
+    c.SOURCE_USED + mugrid.UPPER
+)  # of "at least u" against the uniform prior
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, c.SLIPPERY))  # first that is no ice
 _NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
@@ -103,7 +115,11 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         time, mean = entries[earlier].time // NS, _coarse(entries[earlier].last_mean)
         std, spent = _coarse(entries[earlier].last_std), _coarse(entries[earlier].spent)
     else:
-        seen = seen or pairs[pair].time[BOUND] >= max(least, 1) or pairs[pair].time[VALUE] >= max(least, 1)
+        seen = (
+            seen
+            or pairs[pair].time[BOUND] >= max(least, 1)
+            or pairs[pair].time[VALUE] >= max(least, 1)
+        )
         time, mean = int(pairs[pair].time[kind]), _coarse(pairs[pair].mean[kind])
         std, spent = _coarse(pairs[pair].std), _coarse(pairs[pair].spent[kind])
     new_mean, new_std = entries[entry].mean, max(entries[entry].std, np.float32(c.NOVELTY_STD))
@@ -129,7 +145,9 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 @refcount_free_inlined
 def _fine(number: float | np.floating[Any]) -> np.uint16:
     """A number in parts of 1/FINE."""
-    return np.uint16(min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0)))
+    return np.uint16(
+        min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0))
+    )
 
 
 @refcount_free_inlined
@@ -180,7 +198,11 @@ def update(
     if kind == VALUE and not new:
         ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
     if kind == VALUE:
-        vote(p, scratch[LIKELIHOOD], min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST))
+        vote(
+            p,
+            scratch[LIKELIHOOD],
+            min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST),
+        )
     else:
         vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
     pack(p, belief, row)
@@ -191,7 +213,10 @@ def update(
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if entries[entry].slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:
+        if (
+            entries[entry].slippery >= c.SOURCE_SHARE
+            and ice_evidence(entries, entry) >= c.WITNESS_NATS
+        ):
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
@@ -221,7 +246,9 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
             away = road - mugrid.CENTRES[j]
             if away > 3.0 * doubt:
                 break
-            nats = evidence[j] / mugrid.STEPS_PER_NAT + (0.5 * (away / doubt) ** 2 if away > 0.0 else 0.0)
+            nats = evidence[j] / mugrid.STEPS_PER_NAT + (
+                0.5 * (away / doubt) ** 2 if away > 0.0 else 0.0
+            )
             least = min(least, nats)
     return float(least)
 
@@ -243,7 +270,9 @@ def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> No
 
 
 @refcount_free_inlined
-def _untrusted_weight(cells: RecordArray, row: int, kind: int, power: float, weight: float) -> float:
+def _untrusted_weight(
+    cells: RecordArray, row: int, kind: int, power: float, weight: float
+) -> float:
     """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
 
     So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.

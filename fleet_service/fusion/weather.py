@@ -81,9 +81,14 @@ class Weather(NamedTuple):
 def rates(reports: Reports) -> FloatArray:
     """Rates of drift and of change, (n, 2); 1 where nothing is known."""
     road = np.where(
-        np.isnan(reports.road_temperature), reports.air_temperature - AIR_ABOVE_ROAD_C, reports.road_temperature
+        np.isnan(reports.road_temperature),
+        reports.air_temperature - AIR_ABOVE_ROAD_C,
+        reports.road_temperature,
     )
-    wet, dry = reports.precipitation >= WET_MM_H, reports.precipitation < WET_MM_H  # both False where unknown
+    wet, dry = (
+        reports.precipitation >= WET_MM_H,
+        reports.precipitation < WET_MM_H,
+    )  # both False where unknown
     freezing = (road >= FREEZING_C[0]) & (road <= FREEZING_C[1])
     change = np.select(
         [wet & freezing, wet, freezing, dry & (road >= STEADY_C)],
@@ -103,13 +108,19 @@ def priors(reports: Reports) -> Float32Array:
 def weather_of(reports: Reports) -> Weather:
     """Road time of all regions in `reports`; of several of one region and time the last counts."""
     last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
-    keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(np.diff(reports.time[last]) != 0, True)
+    keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(
+        np.diff(reports.time[last]) != 0, True
+    )
     reports = reports.take(last[keep[: len(last)]])
     rate, prior = rates(reports), priors(reports)
-    rows: list[tuple[int, float, float, Float32Array]] = [(0, 1.0, 1.0, mugrid.PRIOR.astype(np.float32))]
+    rows: list[tuple[int, float, float, Float32Array]] = [
+        (0, 1.0, 1.0, mugrid.PRIOR.astype(np.float32))
+    ]
     region, begin = np.unique(reports.region, return_index=True)
     starts = [1]
-    for first, end in zip(begin.tolist(), np.append(begin, len(reports.time))[1:].tolist(), strict=True):
+    for first, end in zip(
+        begin.tolist(), np.append(begin, len(reports.time))[1:].tolist(), strict=True
+    ):
         for k in range(first, end):
             rows.append((int(reports.time[k]), rate[k, 0], rate[k, 1], prior[k]))
             until = int(reports.time[k]) + VALID_NS
@@ -117,10 +128,18 @@ def weather_of(reports: Reports) -> Weather:
                 rows.append((until, 1.0, 1.0, rows[0][3]))
         starts.append(len(rows))
     time = np.array([row[0] for row in rows])
-    return _clocked(region, np.array(starts), time, np.array([row[1:3] for row in rows]), [row[3] for row in rows])
+    return _clocked(
+        region,
+        np.array(starts),
+        time,
+        np.array([row[1:3] for row in rows]),
+        [row[3] for row in rows],
+    )
 
 
-def _clocked(region: IntArray, start: IntArray, time: IntArray, rate: FloatArray, prior: list[Float32Array]) -> Weather:
+def _clocked(
+    region: IntArray, start: IntArray, time: IntArray, rate: FloatArray, prior: list[Float32Array]
+) -> Weather:
     clock = np.zeros_like(rate)
     for first, end in zip(start[:-1].tolist(), start[1:].tolist(), strict=True):
         passed = np.diff(time[first:end])[:, None] * 1e-9 * rate[first : end - 1]

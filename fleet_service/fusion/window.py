@@ -28,7 +28,14 @@ from fleet_service.fusion.store.records import (
 )  # fmt: skip
 from fleet_service.fusion.store.table import AHEAD, first_place
 from fleet_service.fusion.trust import compare
-from fleet_service.fusion.votes import SCRATCH, describe_vote, discount, load_likelihood, needs_reporters, update
+from fleet_service.fusion.votes import (
+    SCRATCH,
+    describe_vote,
+    discount,
+    load_likelihood,
+    needs_reporters,
+    update,
+)
 from fleet_service.fusion.weather import Weather
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 from schemas.runtime.jit import prefetch, refcount_free, refcount_free_inlined
@@ -75,7 +82,9 @@ class Marks(NamedTuple):
     stale: Int32Array
 
 
-def absorb(state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int) -> BoolArray:
+def absorb(
+    state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
+) -> BoolArray:
     """Take the votes of a batch into the windows of their slots, and update the beliefs.
 
     Every pool must have k free places. Returns which observations (n,) were left out, because `most` of their vehicle
@@ -136,8 +145,16 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
-    new.vehicle, new.weight, new.time = arrivals.vehicle[row], arrivals.weight[row], arrivals.time[row]
-    new.number, new.boot, new.sequence = arrivals.number[row], arrivals.boot[row], arrivals.sequence[row]
+    new.vehicle, new.weight, new.time = (
+        arrivals.vehicle[row],
+        arrivals.weight[row],
+        arrivals.time[row],
+    )
+    new.number, new.boot, new.sequence = (
+        arrivals.number[row],
+        arrivals.boot[row],
+        arrivals.sequence[row],
+    )
     for i in range(arrivals.evidence.shape[1]):
         new.evidence[i] = arrivals.evidence[row, i]
     new.used, new.shared = arrivals.used[row], arrivals.shared[row]

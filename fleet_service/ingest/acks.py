@@ -39,11 +39,15 @@ class Acks:
 
     def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """Record that a batch was rejected."""
-        self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
+        self._rejected[vehicle][batch.boot, batch.kind, batch.region].append(
+            (batch.seq, row, reason)
+        )
 
     def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
         """Return vehicle and `Ack` bytes of everything collected, with the service's `time` [ns]; reset."""
-        settled: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
+        settled: dict[str, dict[AckedStream, list[int]]] = {
+            vehicle: {} for vehicle in self._rejected
+        }
         late: dict[tuple[str, AckedStream], set[int]] = defaultdict(set)
         for stream, seqs in self._durable.items():
             name = (stream.boot, *stream.key[2:])

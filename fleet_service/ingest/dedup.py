@@ -20,7 +20,9 @@ from schemas.wire import Kind
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
-StreamKey = tuple[int, int, Kind, int]  # numbers of the vehicle's pseudonym and of its start, kind, region
+StreamKey = tuple[
+    int, int, Kind, int
+]  # numbers of the vehicle's pseudonym and of its start, kind, region
 
 
 class SequenceTracker:
@@ -65,7 +67,9 @@ class SequenceTracker:
 
     def add(self, seqs: list[int]) -> None:
         """Record ascending accepted seqs."""
-        if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:  # as most often: a run that goes on
+        if (
+            seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
+        ):  # as most often: a run that goes on
             self.raise_to(seqs[-1] + 1)
         else:
             for seq in seqs:
@@ -125,7 +129,11 @@ class SequenceTrackers:
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
         return np.array(
-            [one is not None and one.accepted(seq) for one, seq in zip(found, names[:, 3].tolist(), strict=True)], bool
+            [
+                one is not None and one.accepted(seq)
+                for one, seq in zip(found, names[:, 3].tolist(), strict=True)
+            ],
+            bool,
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
@@ -173,13 +181,19 @@ class SequenceTrackers:
         group, first = group_rows(vehicle, boot, region)
         streams = [
             self[one, start, kind, where]
-            for one, start, where in zip(*(column[first].tolist() for column in (vehicle, boot, region)), strict=True)
+            for one, start, where in zip(
+                *(column[first].tolist() for column in (vehicle, boot, region)), strict=True
+            )
         ]
-        held, newest = (largest_of(column, group, len(first)).tolist() for column in (first_held, time))
+        held, newest = (
+            largest_of(column, group, len(first)).tolist() for column in (first_held, time)
+        )
         for stream, least, last in zip(streams, held, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)
-        above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])  # few: senders hold little
+        above = np.flatnonzero(
+            seq > np.array([stream.low for stream in streams])[group]
+        )  # few: senders hold little
         above = above[np.lexsort((seq[above], group[above]))]
         starts = np.flatnonzero(np.diff(group[above], prepend=-1))
         for start, stop in pairwise([*starts.tolist(), len(above)]):

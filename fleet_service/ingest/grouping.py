@@ -18,7 +18,9 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
     table = np.full(places, -1, np.int32)
     group, first, k = np.empty(len(a), np.int32), np.empty(len(a), np.int64), 0
     for i in range(len(a)):
-        mixed = (np.uint64(a[i]) * np.uint64(0x9E3779B97F4A7C15)) ^ (np.uint64(b[i]) * np.uint64(0xBF58476D1CE4E5B9))
+        mixed = (np.uint64(a[i]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
+            np.uint64(b[i]) * np.uint64(0xBF58476D1CE4E5B9)
+        )
         mixed = (mixed ^ (mixed >> np.uint64(29)) ^ np.uint64(c[i])) * np.uint64(0x94D049BB133111EB)
         place = np.int64((mixed >> np.uint64(11)) % np.uint64(places))
         while table[place] >= 0:

@@ -48,9 +48,13 @@ STEP_BYTES: Final = 768 * 1024
 # interpreter is free for answers.
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
-QUEUE_BYTES: Final = 64 << 20  # that wait at the most: half a minute's work, whatever the number of messages
+QUEUE_BYTES: Final = (
+    64 << 20
+)  # that wait at the most: half a minute's work, whatever the number of messages
 FORGET_NS: Final = 600 * NS  # between two looks for streams too old to matter
-KNOWN_NS: Final = (MAP_DAYS + 2) * DAY_NS  # a restart reads whole days again, and asks which of them it knows
+KNOWN_NS: Final = (
+    MAP_DAYS + 2
+) * DAY_NS  # a restart reads whole days again, and asks which of them it knows
 
 
 class Message(NamedTuple):
@@ -72,7 +76,9 @@ class Inbox:
     """
 
     def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
-        self._queue: queue.SimpleQueue[Message] = queue.SimpleQueue()  # without locks in Python, a fifth of the cost
+        self._queue: queue.SimpleQueue[Message] = (
+            queue.SimpleQueue()
+        )  # without locks in Python, a fifth of the cost
         self._capacity, self._counts, self._limits = capacity, counts, limits
         self._bytes, self._guard = 0, Lock()
 
@@ -82,7 +88,9 @@ class Inbox:
         def take(sample: zenoh.Sample) -> None:
             key, payload = str(sample.key_expr), sample.payload
             encoding = str(sample.encoding)
-            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(key, len(payload), encoding):
+            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(
+                key, len(payload), encoding
+            ):
                 self.put(Message(kind, key, payload.to_bytes(), encoding))
 
         return take
@@ -136,13 +144,22 @@ class BatchIntake:
         acks: receives refusals and batches that are durable already.
     """
 
-    def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
-        self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
+    def __init__(
+        self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks
+    ) -> None:
+        self._streams, self._pseudonyms, self._counts, self._acks = (
+            streams,
+            pseudonyms,
+            counts,
+            acks,
+        )
         self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
-        self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
+        self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {
+            kind: {} for kind in Kind
+        }
         self._forgot, self._now = 0, 0.0
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
@@ -176,18 +193,29 @@ class BatchIntake:
         found_owners = [validation.owner_of(message.key) for message in messages]
         if None in found_owners:
             self._count("key", found_owners.count(None))
-            messages = [message for message, owner in zip(messages, found_owners, strict=True) if owner is not None]
+            messages = [
+                message
+                for message, owner in zip(messages, found_owners, strict=True)
+                if owner is not None
+            ]
         found = decode_many(kind, [(message.payload, message.encoding) for message in messages])
         keyed = [owner for owner in found_owners if owner is not None]
         for index, error in found.errors:
             self._refuse_unusable(kind, keyed[index], messages[index], error)
         time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
-        owners = keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
+        owners = (
+            keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
+        )
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
         self._tell_time(owners, time)
         for place in np.flatnonzero(broken >= 0).tolist():
-            if rules[broken[place]].rule == "time" and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt:
-                self._counts["clock_doubted"] += 1  # neither let in nor refused: its sender keeps it
+            if (
+                rules[broken[place]].rule == "time"
+                and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt
+            ):
+                self._counts["clock_doubted"] += (
+                    1  # neither let in nor refused: its sender keeps it
+                )
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
@@ -207,7 +235,11 @@ class BatchIntake:
         self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
         yesterday = clock.now // DAY_NS - 1
         for known in self._known.values():
-            old = [name for name, stream in known.items() if name[3] < yesterday or stream.key not in self._streams]
+            old = [
+                name
+                for name, stream in known.items()
+                if name[3] < yesterday or stream.key not in self._streams
+            ]
             for name in old:
                 del known[name]
 
@@ -230,7 +262,9 @@ class BatchIntake:
         """Return valid batches that were not accepted before, each once, with their positions."""
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
-        batches = zip(range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True)
+        batches = zip(
+            range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True
+        )
         known, pending, again = self._known[kind], self._pending, 0
         for place, vehicle, boot, region, day, seq, first_held in compress(batches, good.tolist()):
             name = vehicle, boot, region, day
@@ -251,7 +285,9 @@ class BatchIntake:
             self._counts["duplicates"] += again
         return out
 
-    def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> SequenceTracker | None:
+    def _look_up(
+        self, kind: Kind, name: tuple[str, int, int, int], time: int
+    ) -> SequenceTracker | None:
         """Return the stream of a (vehicle, boot, region, day); None without a key, or if the vehicle opens too many.
         The vehicle then keeps its batch until the disk works again, or the hour is over."""
         vehicle, boot, region, _ = name
@@ -263,7 +299,9 @@ class BatchIntake:
             self._counts["key_failures"] += 1
             return None
         key = (pseudonym, boot, kind, region)
-        if key not in self._streams:  # else its archive is older, and keeps starts as they were sent
+        if (
+            key not in self._streams
+        ):  # else its archive is older, and keeps starts as they were sent
             key = (pseudonym, boot_pseudonym, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
             self._counts["too_many_streams"] += 1
@@ -272,7 +310,9 @@ class BatchIntake:
         stream.vehicle, stream.boot, stream.witness = vehicle, boot, witness
         return stream
 
-    def _rows(self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock) -> AcceptedBatches:
+    def _rows(
+        self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock
+    ) -> AcceptedBatches:
         batches, (rows, heads, sizes) = list(new), _select_batches(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
@@ -280,7 +320,9 @@ class BatchIntake:
         rows["row"] -= np.repeat((np.cumsum(sizes) - sizes).astype(np.int32), sizes)
         good = np.ones(len(batches), bool)
         owner = np.repeat(np.arange(len(batches)), sizes)
-        for index in np.flatnonzero(broken >= 0).tolist():  # only refused rows are visited one by one
+        for index in np.flatnonzero(
+            broken >= 0
+        ).tolist():  # only refused rows are visited one by one
             place = int(owner[index])
             if good[place]:
                 good[place] = False
@@ -292,7 +334,9 @@ class BatchIntake:
         newest = _newest(rows[FIRST_TIME[kind]], sizes).tolist()
         for place, at in compress(enumerate(newest), good.tolist()):
             stream, seq = batches[place]
-            if not stream.accept(seq, at):  # no room to remember it: older ones must come first, it is no rejection
+            if not stream.accept(
+                seq, at
+            ):  # no room to remember it: older ones must come first, it is no rejection
                 self._counts["too_many_gaps"] += 1
                 good[place] = False
         if not good.all():
@@ -302,18 +346,33 @@ class BatchIntake:
         return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
-        if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream
+        if (
+            refusal.rule != "vehicle"
+        ):  # else the name in the batch is not the sender's, and nor is the stream
             self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 
-    def _refuse_unusable(self, kind: Kind, owner: Parsed, message: Message, error: InputError) -> None:
+    def _refuse_unusable(
+        self, kind: Kind, owner: Parsed, message: Message, error: InputError
+    ) -> None:
         """Refuse a batch whose records cannot be used: with a rejection if its head can be read, because it would be
         sent for ever otherwise; else it is only counted."""
         head = head_of(kind, message.payload, message.encoding)
-        named = head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
-        if head is not None and named and head.boot >= 0 and head.seq >= 1 and owner.quadint is not None:
+        named = (
+            head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
+        )
+        if (
+            head is not None
+            and named
+            and head.boot >= 0
+            and head.seq >= 1
+            and owner.quadint is not None
+        ):
             self._acks.record_rejected(
-                head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150]
+                head.vehicle,
+                head._replace(region=owner.quadint),
+                validation.BATCH,
+                str(error)[:150],
             )
         self._count(error.field)
 
@@ -336,10 +395,16 @@ def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, In
     kept = np.zeros(len(found.sizes), bool)
     kept[indices] = True
     mine = np.repeat(kept, found.sizes)
-    return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
+    return (
+        {name: column[mine] for name, column in rows.items()},
+        found.heads.take(kept),
+        found.sizes[kept],
+    )
 
 
-def _with_identity(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+def _with_identity(
+    kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock
+) -> Rows:
     """Return rows with the identity of their batches, for the archive."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {

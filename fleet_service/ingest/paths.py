@@ -25,7 +25,9 @@ LEAP_M: Final = 2_000.0  # of positions that come back after a tunnel or a ferry
 LEAP_M_PER_S: Final = 0.5  # by which this budget fills
 ANCHORS: Final = 16  # 280 bytes a vehicle
 VEHICLES: Final = 200_000  # that are remembered
-_RECENT_NS: Final = 10 * NS  # is added to an anchor's age, so that the newest are not treated as infinitely dense
+_RECENT_NS: Final = (
+    10 * NS
+)  # is added to an anchor's age, so that the newest are not treated as infinitely dense
 _DETOUR_M: Final = 2_000.0  # of a way through a gap, compared with the straight one
 _START: Final = 64  # vehicles for which there is room at first
 
@@ -40,7 +42,9 @@ class VehiclePaths:
     def _make_room(self, rows: int) -> None:
         self._time: IntArray = np.zeros((rows, ANCHORS), np.int64)
         self._place: Float32Array = np.zeros((rows, ANCHORS, 2), np.float32)
-        self._is_gap: BoolArray = np.zeros((rows, ANCHORS), np.bool_)  # an anchor after this one was dropped
+        self._is_gap: BoolArray = np.zeros(
+            (rows, ANCHORS), np.bool_
+        )  # an anchor after this one was dropped
         self._count: IntArray = np.zeros(rows, np.int64)
         self._leap: FloatArray = np.full(rows, LEAP_M)
 
@@ -55,7 +59,9 @@ class VehiclePaths:
         if len(self._rows) + len(names) > max(VEHICLES, len(names)):
             self._rows.clear()
             self._make_room(_START)
-        row = np.array([self._rows.setdefault(name, len(self._rows)) for name in names.tolist()], np.int64)
+        row = np.array(
+            [self._rows.setdefault(name, len(self._rows)) for name in names.tolist()], np.int64
+        )
         while len(self._rows) > len(self._count):
             self._grow()
         place = np.column_stack([latitude, longitude]).astype(np.float64)
@@ -65,7 +71,13 @@ class VehiclePaths:
         )  # fmt: skip
 
     def _grow(self) -> None:
-        time, place, is_gap, count, leap = self._time, self._place, self._is_gap, self._count, self._leap
+        time, place, is_gap, count, leap = (
+            self._time,
+            self._place,
+            self._is_gap,
+            self._count,
+            self._leap,
+        )
         rows = len(count)
         self._make_room(2 * rows)
         self._time[:rows] = time

@@ -40,7 +40,13 @@ class RateLimiter:
         counts: Counter[str],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._rate, self._burst, self._known, self._counts, self._clock = rate, burst, known, counts, clock
+        self._rate, self._burst, self._known, self._counts, self._clock = (
+            rate,
+            burst,
+            known,
+            counts,
+            clock,
+        )
         self._buckets: dict[str, tuple[float, float]] = {}  # what is left, and when that was [s]
         self._swept = -float("inf")
 
@@ -55,7 +61,9 @@ class RateLimiter:
             name = _OTHERS
         left, since = self._buckets.get(name, (self._burst, now))
         left = min(self._burst, left + (now - since) * self._rate)
-        cost = min(max(size, LEAST_BYTES) * (JSON_COST if encoding.startswith(JSON) else 1), self._burst)
+        cost = min(
+            max(size, LEAST_BYTES) * (JSON_COST if encoding.startswith(JSON) else 1), self._burst
+        )
         fits = left >= cost
         self._buckets[name] = (left - cost if fits else left, now)
         if not fits:
@@ -70,5 +78,7 @@ class RateLimiter:
         rate, burst = self._rate, self._burst
         if now - self._swept >= burst / rate:
             self._swept = now
-            self._buckets = {n: b for n, b in list(self._buckets.items()) if b[0] + (now - b[1]) * rate < burst}
+            self._buckets = {
+                n: b for n, b in list(self._buckets.items()) if b[0] + (now - b[1]) * rate < burst
+            }
         return len(self._buckets) < MOST_NAMES

@@ -27,10 +27,16 @@ from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
-MAX_SPAN_NS: Final = 3_600_000_000_000  # of a batch; agents cut at ten minutes, and flush each second
-YAW_TOLERANCE: Final = np.radians(75.0)  # between yaw and the sector's axis: 45° and what a bend turns in one visit
+MAX_SPAN_NS: Final = (
+    3_600_000_000_000  # of a batch; agents cut at ten minutes, and flush each second
+)
+YAW_TOLERANCE: Final = np.radians(
+    75.0
+)  # between yaw and the sector's axis: 45° and what a bend turns in one visit
 ESTIMATOR_PATTERN: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-KEYS_REMEMBERED: Final = 1 << 16  # a vehicle has two; reading one costs as much as all else that is asked of a message
+KEYS_REMEMBERED: Final = (
+    1 << 16
+)  # a vehicle has two; reading one costs as much as all else that is asked of a message
 _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
@@ -44,7 +50,11 @@ class Range(NamedTuple):
 
 
 RANGES: Final = {
-    kind: tuple(Range(f.name, *f.range, optional=f.name not in NEEDED[kind]) for f in fields if f.range is not None)
+    kind: tuple(
+        Range(f.name, *f.range, optional=f.name not in NEEDED[kind])
+        for f in fields
+        if f.range is not None
+    )
     for kind, fields in ((Kind.OBSERVATION, tables.OBSERVATION), (Kind.STATE, tables.STATE))
 }
 
@@ -88,10 +98,17 @@ def check_heads(
         (k,) index of the first broken rule into the second value, -1 for a valid one; and the rules.
     """
     topic, held = _TOPIC[kind], heads.first_held
-    wrong_owner = [o.name != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
+    wrong_owner = [
+        o.name != name or o.topic.name != topic
+        for o, name in zip(owners, heads.vehicle, strict=True)
+    ]
     wrong_region = np.array([owner.quadint for owner in owners], np.int64) != heads.region
     bad_names = {name for name in set(heads.estimator) if name and not _is_estimator(name)}
-    bad_name = [name in bad_names for name in heads.estimator] if bad_names else np.zeros(len(owners), bool)
+    bad_name = (
+        [name in bad_names for name in heads.estimator]
+        if bad_names
+        else np.zeros(len(owners), bool)
+    )
     broken = (
         np.array(wrong_owner, bool), wrong_region, (heads.boot < 0) | (held < 1) | (held > heads.seq),
         np.array(bad_name, bool), _untimely(time, time, clock),
@@ -102,7 +119,11 @@ def check_heads(
 _HEAD_RULES: Final = (
     Refusal("vehicle", BATCH, "vehicle: is not the one of the key; publish on your own key"),
     Refusal("region", BATCH, "region: is not the one of the key; never let a batch span regions"),
-    Refusal("seq", BATCH, "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps"),
+    Refusal(
+        "seq",
+        BATCH,
+        "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps",
+    ),
     Refusal("estimator", BATCH, "estimator: is no name; use up to 64 of a-z, 0-9 and -"),
     Refusal("time", 0, "time: too old or in the future; set the clock"),
 )
@@ -132,7 +153,9 @@ def owner_of(key: str) -> keys.Parsed | None:
     return None if parsed.name is None else parsed
 
 
-def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> tuple[IntArray, tuple[Refusal, ...]]:
+def check_rows(
+    kind: Kind, columns: Columns, region: IntArray, clock: Clock
+) -> tuple[IntArray, tuple[Refusal, ...]]:
     """Return the first broken rule of every row.
 
     Args:
@@ -145,16 +168,30 @@ def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> 
         (n,) index into the second value, -1 for a valid row; and the rules.
     """
     broken, rules = _broken_ranges(kind, columns)
-    extra = _broken_observation(columns, clock) if kind is Kind.OBSERVATION else _broken_state(columns, clock)
+    extra = (
+        _broken_observation(columns, clock)
+        if kind is Kind.OBSERVATION
+        else _broken_state(columns, clock)
+    )
     cell = columns["cell"] if kind is Kind.OBSERVATION else _cell_of(columns)
-    extra.append((grid.region_of(cell) != region, "region", "cell: lies outside the batch's region; start a batch"))
+    extra.append(
+        (
+            grid.region_of(cell) != region,
+            "region",
+            "cell: lies outside the batch's region; start a batch",
+        )
+    )
     broken += [rows for rows, _, _ in extra]
     rules += [Refusal(rule, 0, reason) for _, rule, reason in extra]
     return _first(broken), tuple(rules)
 
 
-ERASED: Final = Refusal("erased", BATCH, "time: its month, or its vehicle in it, was erased; delete it")
-TOO_LONG: Final = Refusal("time", BATCH, "time: more than an hour between the batch's records; send one each second")
+ERASED: Final = Refusal(
+    "erased", BATCH, "time: its month, or its vehicle in it, was erased; delete it"
+)
+TOO_LONG: Final = Refusal(
+    "time", BATCH, "time: more than an hour between the batch's records; send one each second"
+)
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
@@ -162,21 +199,33 @@ def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
     if not len(time):
         return np.zeros(len(sizes), bool)
     starts = np.cumsum(sizes) - sizes
-    return np.asarray(np.maximum.reduceat(time, starts) - np.minimum.reduceat(time, starts) > MAX_SPAN_NS)
+    return np.asarray(
+        np.maximum.reduceat(time, starts) - np.minimum.reduceat(time, starts) > MAX_SPAN_NS
+    )
 
 
 def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]], list[Refusal]]:
     broken, rules = [], []
     for column, least, most, optional in RANGES[kind]:
         values = columns[column]
-        broken.append((values < least) | (values > most) if optional else ~((values >= least) & (values <= most)))
-        rules.append(Refusal(column, 0, f"{column}: lies outside [{least:g}, {most:g}]; correct it at the source"))
+        broken.append(
+            (values < least) | (values > most)
+            if optional
+            else ~((values >= least) & (values <= most))
+        )
+        rules.append(
+            Refusal(
+                column, 0, f"{column}: lies outside [{least:g}, {most:g}]; correct it at the source"
+            )
+        )
     return broken, rules
 
 
 def _cell_of(columns: Columns) -> IntArray:
     """Return the cell of the pose; an invalid cell if the pose is not finite (another rule refuses it)."""
-    return grid.cell_of(*(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude")))
+    return grid.cell_of(
+        *(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude"))
+    )
 
 
 def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:

@@ -36,7 +36,9 @@ from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
-WAITING: Final = 10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
+WAITING: Final = (
+    10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
+)
 AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
 _DIGITS: Final = 20  # of the time in a file's name [ns]
 _TURNS: Final = 100  # a reader that is overtaken so often has another trouble
@@ -131,10 +133,15 @@ def _table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Tab
 
 
 def _reports(table: pa.Table) -> Reports:
-    prior = [np.full(mugrid.BINS, np.nan) if row is None else np.array(row) for row in table["prior"].to_pylist()]
+    prior = [
+        np.full(mugrid.BINS, np.nan) if row is None else np.array(row)
+        for row in table["prior"].to_pylist()
+    ]
     air, road, water = (table[name].to_numpy().astype(np.float64) for name in weather.RANGES)
     acts = nanoseconds(table["acts_from"])
-    return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
+    return Reports(
+        table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS)
+    )
 
 
 def archived_reports(
@@ -155,13 +162,17 @@ def archived_reports(
     for _ in range(_TURNS):
         try:
             paths = [path for path in files(root) if path.name not in known]
-            parts = [load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths]
+            parts = [
+                load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths
+            ]
             break
         except FileNotFoundError:  # gathered meanwhile
             continue
     else:
         raise OSError(f"the weather of {root} changes faster than it can be read")
-    table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)])
+    table = pa.concat_tables(
+        [tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)]
+    )
     if received_until is not None:
         table = table.filter(pa.array(nanoseconds(table["received_at"]) <= received_until))
     return _reports(table)
@@ -204,7 +215,10 @@ def retire(root: Path, until_day: int) -> int:
     removed = 0
     for path in files(root):
         table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
-        if table is not None and int(nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day:
+        if (
+            table is not None
+            and int(nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day
+        ):
             path.unlink()
             removed += 1
     return removed
@@ -227,7 +241,9 @@ def read_file(path: Path) -> list[tuple[int, Report]]:
     try:
         rows = pq.read_table(path).to_pylist()
     except (OSError, pa.ArrowInvalid) as error:
-        raise InputError("weather", f"cannot read {path}", "give a Parquet file of road weather") from error
+        raise InputError(
+            "weather", f"cannot read {path}", "give a Parquet file of road weather"
+        ) from error
     return [_row(number, row) for number, row in enumerate(rows)]
 
 
@@ -238,8 +254,14 @@ def _row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
     try:
         region, at = row["region"], row["time"]
         region = grid.from_quadkey(region) if isinstance(region, str) else int(region)
-        when = int(at) if isinstance(at, int) else int(np.datetime64(at.replace(tzinfo=None), "ns").astype(np.int64))
-        values = {name: np.nan if row.get(name) is None else float(row[name]) for name in weather.RANGES}
+        when = (
+            int(at)
+            if isinstance(at, int)
+            else int(np.datetime64(at.replace(tzinfo=None), "ns").astype(np.int64))
+        )
+        values = {
+            name: np.nan if row.get(name) is None else float(row[name]) for name in weather.RANGES
+        }
         prior = None if row.get("prior") is None else np.array(row["prior"], np.float64)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("weather", f"row {number}: no region, time and numbers", fix) from error

@@ -158,7 +158,9 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     )  # fmt: skip
 
 
-def likelihood(reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE) -> FloatArray:
+def likelihood(
+    reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
+) -> FloatArray:
     """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a constant."""
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)

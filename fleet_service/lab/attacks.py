@@ -75,7 +75,9 @@ def differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolA
         raised |= attacked[minute] & ~alone[minute]
         suppressed |= alone[minute] & ~attacked[minute]
     mu = drive.town.mu[BEGIN]
-    return int(np.sum(drive.counted & ((raised & (mu > CLEARLY_DRY)) | (suppressed & (mu < CLEARLY_ICY)))))
+    return int(
+        np.sum(drive.counted & ((raised & (mu > CLEARLY_DRY)) | (suppressed & (mu < CLEARLY_ICY))))
+    )
 
 
 def _attackers(v: Visits, count: int) -> BoolArray:
@@ -101,7 +103,14 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
     """What they truly learn, reported of a place elsewhere in the town."""
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
-    return Visits(v.seconds, v.vehicle, np.where(_attackers(v, ATTACKERS), moved, v.place), v.mu, v.excited, v.reports)
+    return Visits(
+        v.seconds,
+        v.vehicle,
+        np.where(_attackers(v, ATTACKERS), moved, v.place),
+        v.mu,
+        v.excited,
+        v.reports,
+    )
 
 
 def victims(drive: AttackedDrive) -> IntArray:
@@ -116,22 +125,30 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
     which = rng.integers(0, 2, count)
     claim = np.where(which == 0, rng.choice([0.1, 0.3], count), rng.choice([0.7, 1.1], count))
-    return _added(drive.visits, seconds, rng.integers(0, FLOODERS, count), victims(drive)[which], claim)
+    return _added(
+        drive.visits, seconds, rng.integers(0, FLOODERS, count), victims(drive)[which], claim
+    )
 
 
 def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
     """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on that of the iciest."""
     roads = victims(drive) // LENGTH * LENGTH
-    who, which, along = (a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH)))
+    who, which, along = (
+        a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH))
+    )
     seconds: FloatArray = 60.0 * BEGIN + rng.uniform(0.0, 300.0, NAMES)[who] + 20.0 * which + along
     claim: FloatArray = np.where(which == 0, 0.2, 0.85)
     return _added(drive.visits, seconds, VEHICLES + who, roads[which] + along, claim)
 
 
-def _added(v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray) -> Visits:
+def _added(
+    v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray
+) -> Visits:
     std = np.full(len(claim), agent.OVERCONFIDENT_STD)
     reports = (claim, std, claim, np.zeros(len(claim), np.int64), agent.overconfident(claim))
-    joined = (np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True))
+    joined = (
+        np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True)
+    )
     both = Visits(
         np.append(v.seconds, seconds), np.append(v.vehicle, vehicle), np.append(v.place, place),
         np.append(v.mu, np.full(len(claim), np.nan)), np.append(v.excited, np.zeros(len(claim), bool)),
@@ -151,13 +168,19 @@ def replayed(rng: Generator, drive: AttackedDrive) -> int:
     at = drive.visits.seconds[[m.last for m in sent]]
     old = np.flatnonzero(at < 60.0 * BEGIN)
     again = rng.choice(old, min(len(old), 600), replace=False)
-    forged = [m for k in again.tolist() for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))]
+    forged = [
+        m
+        for k in again.tolist()
+        for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))
+    ]
     key = rng.bytes(32)
     alone, attacked = _alerted(sent, at, [], key), _alerted(sent, at, forged, key)
     return differing(drive, alone, attacked)
 
 
-def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes) -> list[BoolArray]:
+def _alerted(
+    sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
+) -> list[BoolArray]:
     """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with them the same peers."""
     out = []
     with tempfile.TemporaryDirectory() as folder:
@@ -165,9 +188,17 @@ def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message], key
         Path(folder, "keys", "witness.key").write_bytes(key)
         engine = Engine(ServiceConfig(), Path(folder))
         for minute in range(MINUTES):
-            part = [sent[k].message for k in np.flatnonzero((at >= 60.0 * minute) & (at < 60.0 * (minute + 1)))]
+            part = [
+                sent[k].message
+                for k in np.flatnonzero((at >= 60.0 * minute) & (at < 60.0 * (minute + 1)))
+            ]
             extra = forged[minute - BEGIN :: MINUTES - BEGIN] if minute >= BEGIN else []
             engine.intake.ingest([*part, *extra], clock_of(60.0 * (minute + 1)))
-            out.append(np.isin(engine.state.fusion.slots_of(CELL, np.zeros(CELLS, np.int64)), engine.alerts.slots))
+            out.append(
+                np.isin(
+                    engine.state.fusion.slots_of(CELL, np.zeros(CELLS, np.int64)),
+                    engine.alerts.slots,
+                )
+            )
         engine.close()
     return out

@@ -30,12 +30,20 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.clean.rmse": MapBar(0.05, "less", "cells with 3 or more excited vehicles"),
     "fusion.clean.coverage90": MapBar((0.87, 0.95), "within", _SHARE),
     **{f"fusion.clean.coverage90.n{n}": MapBar((0.87, 0.95), "within", _SHARE) for n in COUNTS},
-    "fusion.clean.width.n1": MapBar(0.45, "less", "of the interval, one excited vehicle with a record"),
+    "fusion.clean.width.n1": MapBar(
+        0.45, "less", "of the interval, one excited vehicle with a record"
+    ),
     "fusion.clean.width.n3": MapBar(0.28, "less", "of the interval, three or four"),
-    **{f"fusion.clean.vs_best_rule.n{n}": MapBar(1, "less", "ratio of interval scores") for n in COUNTS},
+    **{
+        f"fusion.clean.vs_best_rule.n{n}": MapBar(1, "less", "ratio of interval scores")
+        for n in COUNTS
+    },
     "fusion.resampled.coverage90": MapBar((0.87, 0.95), "within", _SHARE),
     **{f"fusion.resampled.coverage90.n{n}": MapBar((0.87, 0.95), "within", _SHARE) for n in COUNTS},
-    **{f"fusion.resampled.vs_best_rule.n{n}": MapBar(1, "less", "ratio of interval scores") for n in COUNTS},
+    **{
+        f"fusion.resampled.vs_best_rule.n{n}": MapBar(1, "less", "ratio of interval scores")
+        for n in COUNTS
+    },
     "fusion.shared10.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.moderate.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.winter.coverage90.n10": MapBar(0.85, "more", _SHARE),
@@ -45,11 +53,24 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.third_party.rmse": MapBar(0.05, "less", "all cells"),
     "fusion.third_party.missed_ice": MapBar(0.03, "less", "of icy cells: no alert"),
     "fusion.third_party.false_ice": MapBar(0.002, "less", "of cells above .45: an alert"),
-    "fusion.third_party.gain_common.coverage90": MapBar(0.88, "more", "of cells, gain errors of 10 %"),
-    "fusion.third_party.gain_common.false_grip": MapBar(0.05, "less", "of cells, gain errors of 10 %"),
-    **{f"fusion.third_party.raise.excited_passes.median.e{e}": MapBar(4, "less", _ICE) for e in EXCITED},
-    **{f"fusion.third_party.raise.excited_passes.p95.e{e}": MapBar(8, "less", _ICE) for e in EXCITED},
-    **{f"fusion.third_party.raise.never.e{e}": MapBar(0, "less", "cells without an alert") for e in EXCITED},
+    "fusion.third_party.gain_common.coverage90": MapBar(
+        0.88, "more", "of cells, gain errors of 10 %"
+    ),
+    "fusion.third_party.gain_common.false_grip": MapBar(
+        0.05, "less", "of cells, gain errors of 10 %"
+    ),
+    **{
+        f"fusion.third_party.raise.excited_passes.median.e{e}": MapBar(4, "less", _ICE)
+        for e in EXCITED
+    },
+    **{
+        f"fusion.third_party.raise.excited_passes.p95.e{e}": MapBar(8, "less", _ICE)
+        for e in EXCITED
+    },
+    **{
+        f"fusion.third_party.raise.never.e{e}": MapBar(0, "less", "cells without an alert")
+        for e in EXCITED
+    },
     "fusion.cold.ice_passes.median": MapBar(2, "less", "passes, a service that knows nobody"),
     "fusion.cold.ice_passes.p90": MapBar(4, "less", "passes, a service that knows nobody"),
     "fusion.same_manoeuvre.false_alerts": MapBar(0, "less", "fleets on a wet curve"),
@@ -67,22 +88,35 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.mis15.rmse": MapBar(0.07, "less", "cells with 3 or more excited vehicles"),
     "fusion.mis15.coverage90": MapBar(0.85, "more", _SHARE),
     "fusion.mis30_colluding.coverage90": MapBar(0.85, "more", _SHARE),
-    **{f"fusion.attack.{name}": MapBar(0, "less", "alerts raised or suppressed") for name in ATTACKS},
+    **{
+        f"fusion.attack.{name}": MapBar(0, "less", "alerts raised or suppressed")
+        for name in ATTACKS
+    },
     "fusion.unexcited.upper_shift": MapBar(0.02, "less", ""),
     "fusion.order.max_difference": MapBar(1e-6, "less", "probability"),
     "fusion.replay.max_difference": MapBar(1e-6, "less", "probability"),
     "fusion.whole_way.ways": MapBar(10, "more", "independent ways"),
-    **{f"fusion.whole_way.rmse.after{m}": MapBar(0.085, "less", "measured cells, mean of ways") for m in (6, 30)},
-    **{f"fusion.whole_way.rmse.after{m}.worst": MapBar(0.095, "less", "measured cells, worst way") for m in (6, 30)},
     **{
-        f"fusion.whole_way.coverage90.measured.after{m}": MapBar((0.88, 0.95), "within", "measured cells, mean")
+        f"fusion.whole_way.rmse.after{m}": MapBar(0.085, "less", "measured cells, mean of ways")
+        for m in (6, 30)
+    },
+    **{
+        f"fusion.whole_way.rmse.after{m}.worst": MapBar(0.095, "less", "measured cells, worst way")
+        for m in (6, 30)
+    },
+    **{
+        f"fusion.whole_way.coverage90.measured.after{m}": MapBar(
+            (0.88, 0.95), "within", "measured cells, mean"
+        )
         for m in (1, 6, 30)
     },
     "fusion.whole_way.crps": MapBar(0.058, "less", "all cells, 30 minutes"),
     "fusion.whole_way.slippery.brier": MapBar(0.047, "less", "P(slippery), all cells, 30 minutes"),
     "fusion.whole_way.slippery.ece": MapBar(0.045, "less", "P(slippery), ten bins, all ways"),
     "fusion.whole_way.slippery.missed": MapBar(0.08, "less", "of slippery cells: P(slippery) < .3"),
-    "fusion.whole_way.slippery.grip_raised": MapBar(0.05, "less", "of cells with grip: P(slippery) > .5"),
+    "fusion.whole_way.slippery.grip_raised": MapBar(
+        0.05, "less", "of cells with grip: P(slippery) > .5"
+    ),
     "fusion.resampled.coverage90.ice": MapBar(0.82, "more", _SHARE),
     "fusion.whole_way.level.coverage90": MapBar((0.85, 0.97), "within", _SHARE),
     "fusion.whole_way.level.rmse": MapBar(0.08, "less", "measured cells"),

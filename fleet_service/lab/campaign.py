@@ -34,15 +34,22 @@ SEEDS, QUICK_SEEDS = 10, 1
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)} | dict.fromkeys(
     end_to_end.WAYS, (20, 1800.0)
 )  # vehicles, seconds
-END_TO_END: Final = ("fusion.whole_way", "fusion.resampled")  # prefixes of what is measured end to end
-EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
+END_TO_END: Final = (
+    "fusion.whole_way",
+    "fusion.resampled",
+)  # prefixes of what is measured end to end
+EXACT_SEEDS: Final = (
+    8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
+)
 
 LogLine = Callable[[str], None]
 Part = Callable[[], dict[str, float]]
 Drives = Mapping[end_to_end.World, end_to_end.Drive]
 
 
-def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: bool = False) -> list[Figure]:
+def run(
+    folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: bool = False
+) -> list[Figure]:
     """Run all parts and write `figures.json` and `figures.md` into `folder`.
 
     Args:
@@ -59,8 +66,12 @@ def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: 
         began = time.perf_counter()
         found |= part()
         log_line(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(END_TO_END)]
-    figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
+    judged = [
+        figure for figure in bars.judged(found) if not alone or figure.name.startswith(END_TO_END)
+    ]
+    figures.write(
+        folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged
+    )
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
     (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")

@@ -65,7 +65,10 @@ def measure(seeds: range) -> dict[str, float]:
     out: dict[str, float] = {}
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):
         found: FloatArray = np.concatenate(
-            [delays(np.random.default_rng([seed, 5]), before, after).astype(float) for seed in seeds]
+            [
+                delays(np.random.default_rng([seed, 5]), before, after).astype(float)
+                for seed in seeds
+            ]
         )
         out[f"fusion.{name}.passes.median"] = float(np.median(found))
         out[f"fusion.{name}.passes.p95"] = float(np.quantile(found, 0.95, method="higher"))

@@ -36,7 +36,10 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     """
     n, nan = len(v), np.full(len(v), np.nan, np.float32)
     cell, used = cells[v.place], v.reports.used.astype(np.float32)
-    along, across = (used * np.array(part, np.float32)[v.reports.manoeuvre] for part in ((1, -1, 0, 0), (0, 0, 1, -1)))
+    along, across = (
+        used * np.array(part, np.float32)[v.reports.manoeuvre]
+        for part in ((1, -1, 0, 0), (0, 0, 1, -1))
+    )
     order = np.lexsort((v.seconds, v.vehicle))
     seq = np.empty(n, np.int64)
     first = np.searchsorted(v.vehicle[order], v.vehicle[order])
@@ -55,7 +58,9 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
     """When each delivery comes [s] and which visit it brings, in order of arrival: some late, some twice."""
     n = len(v)
-    delay = rng.exponential(DELAY_S, n) + np.where(rng.random(n) < LATE_SHARE, rng.uniform(0.0, LATE_S, n), 0.0)
+    delay = rng.exponential(DELAY_S, n) + np.where(
+        rng.random(n) < LATE_SHARE, rng.uniform(0.0, LATE_S, n), 0.0
+    )
     twice = np.flatnonzero(rng.random(n) < TWICE_SHARE)
     which = np.concatenate([np.arange(n), twice])
     at = v.seconds[which] + np.concatenate([delay, delay[twice] + rng.exponential(5.0, len(twice))])
@@ -99,11 +104,15 @@ class AlertWatch:
 
 def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
     """The observations that arrive in each minute."""
-    for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[:count]:
+    for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
+        :count
+    ]:
         yield o.take(rows)
 
 
-def watch(rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None) -> AlertWatch:
+def watch(
+    rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
+) -> AlertWatch:
     """Deliver the visits and ask the map after each of `count` minutes, or only those `asked`."""
     rows = rows_of(v)
     at, which = arrivals(rng, v)

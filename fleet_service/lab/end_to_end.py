@@ -29,7 +29,9 @@ from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Alert
 
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
-SEVERAL: Final = 2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
+SEVERAL: Final = (
+    2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
+)
 SAME: Final = 0.02  # of friction within a cell of one surface
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder
@@ -46,10 +48,14 @@ class World(NamedTuple):
 
 WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the figures
 LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
-HILLS: Final = World("hills-20000", 0.5, f"{WHOLE_WAY}.hills")  # frictions and hills that nobody tuned on
+HILLS: Final = World(
+    "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
+)  # frictions and hills that nobody tuned on
 # Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without a further name, see
 # `moments`. All cells of a way share one snow, so that fewer ways say little about P(slippery).
-WAYS: Final = tuple(World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011))
+WAYS: Final = tuple(
+    World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
+)
 
 
 def command(vehicles: int, seconds: float, world: World) -> Drive:
@@ -58,10 +64,19 @@ def command(vehicles: int, seconds: float, world: World) -> Drive:
 
     def drive(folder: Path) -> None:
         options = ["--out", str(folder), "--vehicles", str(vehicles), "--duration", str(seconds)]
-        options += ["--scenario", world.scenario, "--rough", str(world.rough), "--seed", str(world.seed)]
+        options += [
+            "--scenario",
+            world.scenario,
+            "--rough",
+            str(world.rough),
+            "--seed",
+            str(world.seed),
+        ]
         done = subprocess.run([sys.executable, "-m", "deploy.end_to_end", *options], check=False)
         if done.returncode:
-            raise InputError("end-to-end", "the simulated vehicles failed", "see above, or --skip-end-to-end")
+            raise InputError(
+                "end-to-end", "the simulated vehicles failed", "see above, or --skip-end-to-end"
+            )
 
     return drive
 
@@ -97,7 +112,9 @@ def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
     second = (o.time - o.time.min()) // NS
     for rows in np.split(np.argsort(second, kind="stable"), np.cumsum(np.bincount(second))[:-1]):
         if len(rows):
-            raised += [alert for alert in alerts.update(fusion.update(o.take(rows)).slots) if alert.raised]
+            raised += [
+                alert for alert in alerts.update(fusion.update(o.take(rows)).slots) if alert.raised
+            ]
     return raised
 
 

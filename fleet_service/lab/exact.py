@@ -47,7 +47,9 @@ def order(rng: Generator) -> float:
     straight, mixed = Fusion(LATENESS_S), Fusion(LATENESS_S)
     straight.update(o)
     arrival = np.argsort(visits.seconds + rng.uniform(0.0, 0.5 * LATENESS_S, len(visits)))
-    late = sum(int(mixed.update(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS))
+    late = sum(
+        int(mixed.update(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS)
+    )
     return 1.0 if late else difference(straight, mixed)
 
 
@@ -79,10 +81,14 @@ def upper_shift(rng: Generator) -> float:
             who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
             shares = agent.shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
-            passes = Passes(who, road, 0.0 * road, shares, agent.noise(rng, along), along, along > 0)
+            passes = Passes(
+                who, road, 0.0 * road, shares, agent.noise(rng, along), along, along > 0
+            )
             reports = agent.report(rng, Errors.draw(rng, vehicles), passes)
             fusion = Fusion(LATENESS_S)
-            fusion.update(observations_of(rows_of(Visits(seconds, who, along, road, along > 0, reports)), who))
+            fusion.update(
+                observations_of(rows_of(Visits(seconds, who, along, road, along > 0, reports)), who)
+            )
             slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
             belief = fusion.beliefs(slot, int(fusion.live.time[slot[0]]))
             worst = max(worst, prior - float(mugrid.quantiles(belief, 0.95)[0]))

@@ -55,12 +55,22 @@ def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
     """Lower end at each of AFTER_MIN, after excited passes over a dry road for an hour."""
     seconds, who = np.sort(rng.random(PASSES)) * HOUR_S, rng.integers(0, CARS, PASSES)
     mu, nothing, excited = np.full(PASSES, DRY), np.zeros(PASSES, np.int64), np.ones(PASSES, bool)
-    passes = Passes(who, mu, np.zeros(PASSES), rng.uniform(0.6, 1.0, PASSES), rng.normal(size=PASSES), nothing, excited)
+    passes = Passes(
+        who,
+        mu,
+        np.zeros(PASSES),
+        rng.uniform(0.6, 1.0, PASSES),
+        rng.normal(size=PASSES),
+        nothing,
+        excited,
+    )
     reports = agent.report(rng, Errors.draw(rng, CARS), passes)
     fusion = Fusion(LATENESS_S)
     if known is not None:
         fusion.update_weather(_reports(known))
-    fusion.update(observations_of(rows_of(Visits(seconds, who, nothing, mu, excited, reports)), who))
+    fusion.update(
+        observations_of(rows_of(Visits(seconds, who, nothing, mu, excited, reports)), who)
+    )
     slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
     at = [START + int((HOUR_S + 60.0 * minutes) * NS) for minutes in AFTER_MIN]
     return np.array([mugrid.quantiles(fusion.beliefs(slot, moment), 0.05)[0] for moment in at])
@@ -79,7 +89,10 @@ def _reports(known: WeatherSince) -> Reports:
 def table(values: Mapping[str, float]) -> str:
     """Lower end, and the deceleration [m/s²] that it bears, by weather and time."""
     times = [f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in AFTER_MIN]
-    lines = [f"| weather | {' | '.join(['at once', *times[1:]])} |", f"|{'---|' * (1 + len(times))}"]
+    lines = [
+        f"| weather | {' | '.join(['at once', *times[1:]])} |",
+        f"|{'---|' * (1 + len(times))}",
+    ]
     for name, title in TITLES.items():
         lower = [values[f"{PREFIX}.{name}.min{minutes}"] for minutes in AFTER_MIN]
         cells = [f"{mu:.2f}".removeprefix("0") + f", {GRAVITY * mu:.1f}" for mu in lower]

@@ -28,7 +28,10 @@ from schemas.numeric import BoolArray
 VEHICLES: Final = 60
 CHANGING: Final = 0.1  # share of roads that get another surface during the drive
 DRY, ICY = 0.7, 0.25  # truths that count as dry and as ice
-ENOUGH, EARLIER = 5, 20  # excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
+ENOUGH, EARLIER = (
+    5,
+    20,
+)  # excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
 
 
 class Fleet(NamedTuple):
@@ -74,7 +77,9 @@ def one(fleet: Fleet, seed: int, found: Found) -> None:
     place, errors = town.build(rng, fleet.minutes, CHANGING), Errors.draw(rng, VEHICLES)
     visits = town.drive(rng, place, errors, fleet.minutes)
     if fleet.share:
-        visits = town.wrong(visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim)
+        visits = town.wrong(
+            visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim
+        )
     watched = watch(rng, visits, fleet.minutes)
     at = tuple(minute for minute in AT if minute > fleet.begin)
     found.ours.append(snapshots(watched.beliefs, place, visits, at, VEHICLES))
@@ -108,7 +113,11 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
     ours, out = joined(found.ours), {}
     name = f"fusion.{fleet.name}"
-    out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = rmse(ours), coverage(ours), safe(ours)
+    out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = (
+        rmse(ours),
+        coverage(ours),
+        safe(ours),
+    )
     out[f"{name}.interval_score"] = float(ours.interval.mean())
     out[f"fusion.false_ice.{fleet.name}"] = _share(found.false_ice)
     out[f"fusion.missed_ice.{fleet.name}"] = _share(found.missed_ice)

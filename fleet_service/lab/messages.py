@@ -43,7 +43,9 @@ def messages(v: Visits) -> list[SentMessage]:
     streams = np.flatnonzero(np.diff(v.vehicle[order]) | np.diff(rows["region"][order])) + 1
     for stream in np.split(order, streams):
         for seq, start in enumerate(range(0, len(stream), BATCH_ROWS), 1):
-            out.append(_message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq))
+            out.append(
+                _message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq)
+            )
     return out
 
 
@@ -64,7 +66,8 @@ def _message(
     batch = Batch(Kind.OBSERVATION, name, vehicle + 1, region, seq, 1, columns, "synthetic")
     key = keys.observation_key(region, name)
     return SentMessage(
-        Message(Kind.OBSERVATION, key, wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]), int(part[-1])
+        Message(Kind.OBSERVATION, key, wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]),
+        int(part[-1]),
     )
 
 

@@ -49,7 +49,9 @@ MODELS: Final[dict[str, ErrorModel]] = {
 }
 
 
-def one(model: ErrorModel, seed: int, ways: DrivenVisits | None = None) -> tuple[Scores, list[Scores]]:
+def one(
+    model: ErrorModel, seed: int, ways: DrivenVisits | None = None
+) -> tuple[Scores, list[Scores]]:
     """Scores of the map, and of the rules, on one town; its reports are drawn from those of `ways`, if there are."""
     rng = np.random.default_rng([seed, 11])
     place, errors = town.build(rng, MINUTES, 0.0, model), Errors.draw(rng, VEHICLES, model)
@@ -70,7 +72,9 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
     for name, model in MODELS.items():
         out |= _figures(f"fusion.{name}", [one(model, seed) for seed in seeds])
         log_line(f"{name}: {len(seeds)} towns")
-    return out | {"fusion.reliability.ece": max(out[f"fusion.{name}.slippery.ece"] for name in MODELS)}
+    return out | {
+        "fusion.reliability.ece": max(out[f"fusion.{name}.slippery.ece"] for name in MODELS)
+    }
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
@@ -83,7 +87,10 @@ def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
 def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
     ours, theirs = zip(*towns, strict=True)
     whole, others = joined(list(ours)), [joined(list(of)) for of in zip(*theirs, strict=True)]
-    out = {f"{prefix}.coverage90": coverage(whole), f"{prefix}.interval_score": _mean(whole.interval)}
+    out = {
+        f"{prefix}.coverage90": coverage(whole),
+        f"{prefix}.interval_score": _mean(whole.interval),
+    }
     out |= {f"{prefix}.false_grip": false_grip(whole), f"{prefix}.false_ice": false_ice(whole)}
     out |= {f"{prefix}.slippery.{name}": value for name, value in slippery_scores([whole]).items()}
     out[f"{prefix}.coverage90.spread"] = float(np.std([coverage(s) for s in ours]))
@@ -93,8 +100,13 @@ def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[
         out[f"{prefix}.coverage90.n{n}"] = coverage(here)
         out[f"{prefix}.rmse.n{n}"] = _root(here.error)
         out[f"{prefix}.width.n{n}"] = _mean(here.width)
-        best = min((_mean(of_class(s, n).interval), label) for s, label in zip(others, rules.RULES, strict=True))
-        out[f"{prefix}.vs_best_rule.n{n}"] = _mean(here.interval) / best[0] if here.error.size else float("nan")
+        best = min(
+            (_mean(of_class(s, n).interval), label)
+            for s, label in zip(others, rules.RULES, strict=True)
+        )
+        out[f"{prefix}.vs_best_rule.n{n}"] = (
+            _mean(here.interval) / best[0] if here.error.size else float("nan")
+        )
     return out
 
 

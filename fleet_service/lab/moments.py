@@ -64,7 +64,12 @@ def moments(folder: Path) -> list[AskedWay]:
         belief = fusion.beliefs(slots, until)
         lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
         scores = of_beliefs(belief, truth, end_to_end.excited(fusion, past)[slots])
-        out.append(AskedWay(scores, is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)))
+        out.append(
+            AskedWay(
+                scores,
+                is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE),
+            )
+        )
     return out
 
 
@@ -82,15 +87,24 @@ def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]
         cover = np.array([end_to_end.mean(s.covered) for s in known])
         every = joined([moment.scores for moment in now])
         out |= {f"{prefix}.rmse.{name}": rmse.mean(), f"{prefix}.rmse.{name}.worst": rmse.max()}
-        out |= {f"{prefix}.rmse.{name}.spread": rmse.std(), f"{prefix}.coverage90.measured.{name}": cover.mean()}
+        out |= {
+            f"{prefix}.rmse.{name}.spread": rmse.std(),
+            f"{prefix}.coverage90.measured.{name}": cover.mean(),
+        }
         out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest(cover)}
         out |= {f"{prefix}.false_grip.{name}": false_grip(joined(known))}
         out |= {f"{prefix}.false_ice.{name}": false_ice(joined(known))}
         out |= {f"{prefix}.crps.{name}": end_to_end.mean(every.crps)}
         out |= {f"{prefix}.interval_score.{name}": end_to_end.mean(every.interval)}
-        out |= {f"{prefix}.slippery.{of}.{name}": value for of, value in slippery_scores([every]).items()}
+        out |= {
+            f"{prefix}.slippery.{of}.{name}": value
+            for of, value in slippery_scores([every]).items()
+        }
     last = [way[-1].scores for way in ways]
-    out |= {f"{prefix}.coverage90.{surface}": share for surface, share in by_surface(joined(last)).items()}
+    out |= {
+        f"{prefix}.coverage90.{surface}": share
+        for surface, share in by_surface(joined(last)).items()
+    }
     out |= {f"{prefix}.slippery.{of}": value for of, value in slippery_scores(last).items()}
     return out | {f"{prefix}.crps": end_to_end.mean(joined(last).crps)}
 

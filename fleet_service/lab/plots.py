@@ -16,7 +16,9 @@ from schemas.runtime.palette import ESTIMATORS
 SIZE = (5.5, 4.2)
 
 
-def draw(found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")) -> list[Path]:
+def draw(
+    found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")
+) -> list[Path]:
     """Write the four plots into `folder`, in each form.
 
     Raises:
@@ -41,18 +43,31 @@ def draw(found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "
 
 
 def _family(values: Mapping[str, float], prefix: str) -> tuple[list[float], list[float]]:
-    pairs = sorted((float(name.removeprefix(prefix)), v) for name, v in values.items() if name.startswith(prefix))
+    pairs = sorted(
+        (float(name.removeprefix(prefix)), v)
+        for name, v in values.items()
+        if name.startswith(prefix)
+    )
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
 def _reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401 matplotlib has no types here
     axes.plot([0, 1], [0, 1], color="0.7")
     axes.plot(*_family(values, "fusion.clean.reliability."), marker="o", markersize=3)
-    axes.set(title="Reliability, honest fleet", xlabel="said: P(μ ≤ x)", ylabel="happened: share of truths ≤ x")
+    axes.set(
+        title="Reliability, honest fleet",
+        xlabel="said: P(μ ≤ x)",
+        ylabel="happened: share of truths ≤ x",
+    )
 
 
 def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
-    axes.plot(COUNTS, [values.get(f"fusion.clean.rmse.n{n}", float("nan")) for n in COUNTS], marker="o", label="fusion")
+    axes.plot(
+        COUNTS,
+        [values.get(f"fusion.clean.rmse.n{n}", float("nan")) for n in COUNTS],
+        marker="o",
+        label="fusion",
+    )
     axes.axhline(0.05, color="0.7", linewidth=1)
     axes.set(
         title="Error against excited vehicles", xlabel="excited vehicles of the cell", ylabel="RMSE of the median",
@@ -61,15 +76,27 @@ def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
 
 
 def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
-    for name, label in (("ice_onset", "ice comes: P(μ < .4) > .9"), ("ice_end", "ice goes: alert cleared")):
-        axes.plot(*_family(values, f"fusion.{name}.share_after."), marker="o", markersize=3, label=label)
-    axes.set(title="Detection delay", xlabel="excited passes", ylabel="share of cells", ylim=(0, 1.02))
+    for name, label in (
+        ("ice_onset", "ice comes: P(μ < .4) > .9"),
+        ("ice_end", "ice goes: alert cleared"),
+    ):
+        axes.plot(
+            *_family(values, f"fusion.{name}.share_after."), marker="o", markersize=3, label=label
+        )
+    axes.set(
+        title="Detection delay", xlabel="excited passes", ylabel="share of cells", ylim=(0, 1.02)
+    )
     axes.legend()
 
 
 def _misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     shares = {"clean": 0.0, "mis05": 5.0, "mis15": 15.0, "mis30_colluding": 30.0}
-    axes.plot(shares.values(), [values.get(f"fusion.{n}.rmse", float("nan")) for n in shares], "o-", label="fusion")
+    axes.plot(
+        shares.values(),
+        [values.get(f"fusion.{n}.rmse", float("nan")) for n in shares],
+        "o-",
+        label="fusion",
+    )
     for rule, style in zip(RULES, list(ESTIMATORS.values())[1:], strict=False):
         label = rule.replace(" ", "_")
         axes.plot(

@@ -28,7 +28,9 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
 NEAREST: Final = 8  # visits, by friction, of which one is drawn
-FARTHEST: Final = 0.35  # |ln c|; beyond it another vehicle's visit is drawn: surfaces of one kind lie closer
+FARTHEST: Final = (
+    0.35  # |ln c|; beyond it another vehicle's visit is drawn: surfaces of one kind lie closer
+)
 
 
 class TrueVisits(NamedTuple):
@@ -110,7 +112,9 @@ def _near(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> Int
 def _scaled(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
     """Rows of reports, on roads with `by` times the grip."""
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
-    place = np.clip((mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0)
+    place = np.clip(
+        (mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0
+    )
     left = np.minimum(place.astype(np.int64), mugrid.BINS - 2)
     reported, part = reports.log_likelihood[row], place - left
     below, above = (np.take_along_axis(reported, at, axis=1) for at in (left, left + 1))

@@ -30,7 +30,10 @@ RULES: Final = (
     "newest report", "inverse variance", "one per pass", "covariance intersection", "federated reset", "median",
 )  # fmt: skip
 MEDIAN_MIN: Final = 60  # minutes that the median looks back
-MEDIAN_COMMON, MEDIAN_OWN = 0.06, 0.12  # relative standard deviations of the median's interval: of all, and of one
+MEDIAN_COMMON, MEDIAN_OWN = (
+    0.06,
+    0.12,
+)  # relative standard deviations of the median's interval: of all, and of one
 SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
 PRIOR_MEAN: Final = 0.5 * (mugrid.LOWER + mugrid.UPPER)
 PRIOR_VAR: Final = (mugrid.UPPER - mugrid.LOWER) ** 2 / 12.0
@@ -41,7 +44,9 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 
 
 @compiled
-def posteriors(vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int) -> FloatArray:
+def posteriors(
+    vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
+) -> FloatArray:
     """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior along the road."""
     mean, variance = np.full(vehicles, PRIOR_MEAN), np.full(vehicles, PRIOR_VAR)
     out = np.empty((len(vehicle), 2))
@@ -70,7 +75,9 @@ def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatA
         while k < len(place) and seconds[k] < asked[t]:
             cell = place[k]
             for rule in range(5):
-                variance[rule, cell] = min(variance[rule, cell] + DRIFT_VAR * (seconds[k] - last[cell]), PRIOR_VAR)
+                variance[rule, cell] = min(
+                    variance[rule, cell] + DRIFT_VAR * (seconds[k] - last[cell]), PRIOR_VAR
+                )
             last[cell] = seconds[k]
             m, p = sent[k, 0], sent[k, 1]
             for rule in range(5):
@@ -118,10 +125,14 @@ def scores(
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)
-        of_rules = [(found[k, rule, :, 0], np.sqrt(found[k, rule, :, 1])) for rule in range(_KALMAN)]
+        of_rules = [
+            (found[k, rule, :, 0], np.sqrt(found[k, rule, :, 1])) for rule in range(_KALMAN)
+        ]
         for (mean, std), per_rule in zip([*of_rules, medians(v, minute)], out, strict=True):
             half = Z_95 * std
-            lower, mid, upper = (np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0))
+            lower, mid, upper = (
+                np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0)
+            )
             nothing = np.full(CELLS, np.nan)
             answers = of_intervals(lower, mid, upper, town.mu[minute], n, nothing, nothing)
             per_rule.append(answers.taken((n >= 1) & where))

@@ -17,7 +17,10 @@ from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
 ENOUGH: Final = 3  # excited vehicles, for an error to count
-MISSED, RAISED = 0.3, 0.5  # of P(slippery): slippery road below it is missed, grip above it is called slippery
+MISSED, RAISED = (
+    0.3,
+    0.5,
+)  # of P(slippery): slippery road below it is missed, grip above it is called slippery
 SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
 BINS: Final = 10  # of P(slippery)
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
@@ -48,7 +51,12 @@ class Scores:
 
 def joined(scores: list[Scores]) -> Scores:
     """All answers of several runs."""
-    return Scores(*(np.concatenate(columns) for columns in zip(*(vars(s).values() for s in scores), strict=True)))
+    return Scores(
+        *(
+            np.concatenate(columns)
+            for columns in zip(*(vars(s).values() for s in scores), strict=True)
+        )
+    )
 
 
 def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
@@ -73,13 +81,27 @@ def of_intervals(
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
     nothing: FloatArray = np.full(len(truth), np.nan)
-    return Scores(vehicles, mid - truth, missed == 0.0, interval, rank, truth, upper - lower, slippery, nothing)
+    return Scores(
+        vehicles,
+        mid - truth,
+        missed == 0.0,
+        interval,
+        rank,
+        truth,
+        upper - lower,
+        slippery,
+        nothing,
+    )
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
     """Scores of beliefs (k, 32); `rank` is P(μ ≤ truth), uniform where the beliefs are right."""
     lower, mid, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.5, 0.95))
-    place = np.clip((truth - mugrid.LOWER) / (mugrid.UPPER - mugrid.LOWER) * mugrid.BINS, 0.0, mugrid.BINS - 1e-9)
+    place = np.clip(
+        (truth - mugrid.LOWER) / (mugrid.UPPER - mugrid.LOWER) * mugrid.BINS,
+        0.0,
+        mugrid.BINS - 1e-9,
+    )
     cdf = np.cumsum(belief, axis=1)
     bin_ = place.astype(np.int64)
     mass = np.take_along_axis(belief, bin_[:, None], axis=1)[:, 0]
@@ -140,7 +162,10 @@ def of_class(s: Scores, n: int) -> Scores:
 
 def by_surface(s: Scores) -> dict[str, float]:
     """Share of the truths inside the interval, by SURFACES."""
-    return {name: coverage(s.taken((s.truth > above) & (s.truth <= to))) for name, (above, to) in SURFACES.items()}
+    return {
+        name: coverage(s.taken((s.truth > above) & (s.truth <= to)))
+        for name, (above, to) in SURFACES.items()
+    }
 
 
 def calibration(scores: Sequence[Scores]) -> FloatArray:

@@ -49,11 +49,17 @@ def bounded(used: float, path: str) -> float:
         above = np.where(used > mugrid.CENTRES, -6.0, 0.3 * mugrid.CENTRES)
         columns["log_likelihood"] = np.tile(mugrid.encode_log_likelihood(above), (n, 1))
     else:
-        columns |= {"mu": np.full(n, 0.9), "mu_lower": np.full(n, 0.2), "mu_upper": np.full(n, 1.14)}
+        columns |= {
+            "mu": np.full(n, 0.9),
+            "mu_lower": np.full(n, 0.2),
+            "mu_upper": np.full(n, 1.14),
+        }
     fusion = Fusion(LATENESS_S)
     for k in range(n):
         one = {name: column[k : k + 1] for name, column in columns.items()}
-        fusion.update(_received(Batch(Kind.OBSERVATION, "car-1", 1, 0, 1, 1, one), k, as_json="json" in path))
+        fusion.update(
+            _received(Batch(Kind.OBSERVATION, "car-1", 1, 0, 1, 1, one), k, as_json="json" in path)
+        )
     slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
     lower = float(mugrid.quantiles(fusion.beliefs(slot, int(fusion.live.time[slot[0]])), 0.05)[0])
     return lower - max(used, float(mugrid.quantiles(mugrid.PRIOR, 0.05)))
@@ -99,7 +105,9 @@ def backlog_fused(rng: Generator) -> float:
 def safe_excess(rng: Generator) -> float:
     """Safe deceleration less the truth's half an hour after black ice came under drivers who use a fifth of the grip,
     on a road that was dry for an hour; the weather is known to be FREEZING_C, and nothing falls."""
-    seconds: FloatArray = np.concatenate([np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0])
+    seconds: FloatArray = np.concatenate(
+        [np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0]
+    )
     icy = seconds >= HOUR_S
     n, who = len(seconds), rng.integers(0, 40, len(seconds))
     share: FloatArray = np.where(icy, 0.2, rng.uniform(0.6, 1.0, n))
@@ -120,8 +128,13 @@ def _weather(temperature: float) -> Reports:
     nothing = np.full((1, mugrid.BINS), np.nan)
     region = grid.region_of(CELL[:1])
     value: FloatArray = np.array([temperature])
-    reports = [Reports(region, np.array([START + h * 3600 * NS]), value, value, 0.0 * value, nothing) for h in (0, 1)]
-    return Reports(*(np.concatenate(of) for of in zip(*(vars(r).values() for r in reports), strict=True)))
+    reports = [
+        Reports(region, np.array([START + h * 3600 * NS]), value, value, 0.0 * value, nothing)
+        for h in (0, 1)
+    ]
+    return Reports(
+        *(np.concatenate(of) for of in zip(*(vars(r).values() for r in reports), strict=True))
+    )
 
 
 def false_alert(rng: Generator) -> bool:
@@ -134,11 +147,15 @@ def false_alert(rng: Generator) -> bool:
     turning: IntArray = np.full(n, 2)
     passes = Passes(who, mu, common, share, rng.normal(size=n), turning, valued)
     seconds = np.asarray(20.0 * who, np.float64)
-    visits = Visits(seconds, who, 0 * who, mu, valued, agent.report(rng, Errors.draw(rng, n, WINTER), passes))
+    visits = Visits(
+        seconds, who, 0 * who, mu, valued, agent.report(rng, Errors.draw(rng, n, WINTER), passes)
+    )
     o, fusion = observations_of(rows_of(visits), who), Fusion(LATENESS_S)
     alerts, raised = Alerts(fusion), False
     for k in range(n):
-        raised |= any(alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots))
+        raised |= any(
+            alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots)
+        )
     return raised
 
 
@@ -147,8 +164,12 @@ def measure(seeds: range) -> dict[str, float]:
     few = seeds[:4]
     return {
         "fusion.bounds.lower_excess": lower_excess(),
-        "fusion.backlog.fused": min(backlog_fused(np.random.default_rng([seed, 13])) for seed in few),
-        "fusion.gentle_after_dry.safe_excess": max(safe_excess(np.random.default_rng([seed, 17])) for seed in few),
+        "fusion.backlog.fused": min(
+            backlog_fused(np.random.default_rng([seed, 13])) for seed in few
+        ),
+        "fusion.gentle_after_dry.safe_excess": max(
+            safe_excess(np.random.default_rng([seed, 17])) for seed in few
+        ),
         "fusion.same_manoeuvre.false_alerts": float(
             sum(false_alert(np.random.default_rng([seeds[0], 19, k])) for k in range(CURVES))
         ),

@@ -70,7 +70,9 @@ class ForeignDrive(NamedTuple):
     cells: IntArray
 
 
-def report(rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray) -> SimulatedReports:
+def report(
+    rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray
+) -> SimulatedReports:
     """Return the reports of visits (n,) by vehicles with gain errors `gain` (V,)."""
     n = len(mu)
     share = np.where(excited, rng.uniform(*SHARE, n), rng.uniform(*GENTLE, n))
@@ -92,7 +94,9 @@ def report(rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, 
 def observe(drive: ForeignDrive) -> Observations:
     """Return the drive's visits as the service takes them: without a single optional column."""
     rows = rows_of(drive.visits, drive.cells)
-    rows["used_longitudinal"] = rows["used_lateral"] = np.full(len(drive.visits), np.nan, np.float32)
+    rows["used_longitudinal"] = rows["used_lateral"] = np.full(
+        len(drive.visits), np.nan, np.float32
+    )
     return observations_of(rows, drive.visits.vehicle)
 
 
@@ -120,7 +124,9 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 def take(v: Visits, rows: IntArray) -> Visits:
     """Return some of the visits."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
-    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports)
+    return Visits(
+        v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
+    )
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
@@ -179,14 +185,21 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
     seconds = np.sort(rng.uniform(0.0, 3 * 60.0 * MINUTES, n))
     road = (seconds // (60.0 * MINUTES)).astype(np.int64)
     here = rng.random(n) < changing / n
-    place = np.where(here, rng.integers(0, CHANGE_CELLS, n), CHANGE_CELLS + rng.integers(0, CELLS, n))
-    mu = np.where(here, np.where(road == 1, WHITE, DRY), town_mu[np.maximum(place - CHANGE_CELLS, 0)])
+    place = np.where(
+        here, rng.integers(0, CHANGE_CELLS, n), CHANGE_CELLS + rng.integers(0, CELLS, n)
+    )
+    mu = np.where(
+        here, np.where(road == 1, WHITE, DRY), town_mu[np.maximum(place - CHANGE_CELLS, 0)]
+    )
     vehicle = rng.integers(0, VEHICLES, n)
     excited = rng.random(n) < excitement
     reports = report(rng, GAINS["third_party"] * rng.normal(size=VEHICLES), vehicle, mu, excited)
     roads = cell_numbers(CHANGE_CELLS * CHANGE_STRETCH + CELLS)
     cells = np.concatenate(
-        [roads[: CHANGE_CELLS * CHANGE_STRETCH : CHANGE_STRETCH], roads[CHANGE_CELLS * CHANGE_STRETCH :]]
+        [
+            roads[: CHANGE_CELLS * CHANGE_STRETCH : CHANGE_STRETCH],
+            roads[CHANGE_CELLS * CHANGE_STRETCH :],
+        ]
     )
     return ForeignDrive(Visits(seconds, vehicle, place, mu, excited, reports), cells)
 
@@ -229,7 +242,10 @@ def measure_change(seeds: range) -> dict[str, float]:
     """Return medians and 95 % quantiles of the passes by share of excited visits, and how many cells had no alert."""
     out: dict[str, float] = {}
     for percent in CHANGE_EXCITED:
-        found = [count_passes(np.random.default_rng([seed, 29]), percent / 100.0) for seed in seeds[:CHANGE_SEEDS]]
+        found = [
+            count_passes(np.random.default_rng([seed, 29]), percent / 100.0)
+            for seed in seeds[:CHANGE_SEEDS]
+        ]
         for name, which in (("raise", 0), ("clear", 1)):
             passes = np.concatenate([one[which] for one in found])
             label = f"third_party.{name}.excited_passes"
@@ -248,7 +264,9 @@ def count_cold(rng: Generator) -> int:
     along = np.zeros(n, np.int64)
     share = agent.shares(rng, sure)
     manoeuvre = rng.integers(0, MANOEUVRES, n)
-    passes = agent.Passes(who, mu, agent.COMMON * rng.normal() + 0.0 * mu, share, rng.normal(size=n), manoeuvre, sure)
+    passes = agent.Passes(
+        who, mu, agent.COMMON * rng.normal() + 0.0 * mu, share, rng.normal(size=n), manoeuvre, sure
+    )
     reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
     seconds = np.asarray(COLD_GAP_S * who, np.float64)
     o = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)

@@ -29,7 +29,11 @@ SURFACES: Final = {"dry": (0.85, 0.08, 0.45), "wet": (0.55, 0.07, 0.25), "snow":
 LEAST, MOST = 0.08, 1.10  # of any road
 DRIFT: Final = 0.03  # per square root of an hour
 ZONE: Final = 6  # cells of one EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
-EXCITEMENT: Final = ((0.40, 0.2), (0.08, 0.4), (0.02, 0.4))  # P(a pass is excited), share of such cells
+EXCITEMENT: Final = (
+    (0.40, 0.2),
+    (0.08, 0.4),
+    (0.02, 0.4),
+)  # P(a pass is excited), share of such cells
 CELL_M, FIX_STD_M = 10.0, 1.5
 _NORTH, _WEST = 57.70, 11.90
 
@@ -55,7 +59,9 @@ class Town:
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
         """Friction at a time and place, (n,)."""
-        return np.asarray(self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place])
+        return np.asarray(
+            self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place]
+        )
 
 
 def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
@@ -68,16 +74,24 @@ def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLE
         mean, spread = (np.array([n[k] for n in names])[drawn] for k in (0, 1))
         return np.repeat(mean + spread * rng.normal(size=stretches), STRETCH)
 
-    steps = DRIFT * np.sqrt(1 / 60) * np.vstack([np.zeros(stretches), rng.normal(size=(minutes, stretches))])
+    steps = (
+        DRIFT
+        * np.sqrt(1 / 60)
+        * np.vstack([np.zeros(stretches), rng.normal(size=(minutes, stretches))])
+    )
     before, after = surface(), surface()
-    change = np.where(rng.random(ROADS) < changing, rng.uniform(0.2, 0.8, ROADS) * minutes, np.inf).repeat(LENGTH)
+    change = np.where(
+        rng.random(ROADS) < changing, rng.uniform(0.2, 0.8, ROADS) * minutes, np.inf
+    ).repeat(LENGTH)
     now = np.where(np.arange(minutes + 1)[:, None] < change, before, after)
     classes, weights = zip(*EXCITEMENT, strict=True)
     excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
     mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
     own = rng.spawn(1)[0]  # the same towns whatever the errors
     zones = CELLS // ZONE
-    common = model.common * own.normal(size=(zones, 1)) + model.by_manoeuvre * own.normal(size=(zones, MANOEUVRES))
+    common = model.common * own.normal(size=(zones, 1)) + model.by_manoeuvre * own.normal(
+        size=(zones, MANOEUVRES)
+    )
     usual = np.repeat(own.integers(0, MANOEUVRES, zones), ZONE)
     return Town(mu, excitement, np.ceil(change), np.repeat(common, ZONE, axis=0), usual)
 
@@ -97,7 +111,9 @@ class Visits:
         return len(self.seconds)
 
 
-def drive(rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0) -> Visits:
+def drive(
+    rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
+) -> Visits:
     """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
 
     Until the minute `acquainted` only the first half of the roads are driven, from then on the other half, if it is not
@@ -115,11 +131,15 @@ def drive(rng: Generator, town: Town, errors: Errors, minutes: float, acquainted
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
     manoeuvre = np.where(
-        rng.random(len(place)) < model.alike, town.usual[place], rng.integers(0, MANOEUVRES, len(place))
+        rng.random(len(place)) < model.alike,
+        town.usual[place],
+        rng.integers(0, MANOEUVRES, len(place)),
     )
     shares, noise = agent.shares(rng, excited, model), agent.noise(rng, along, model.tails)
     common = town.common[place, manoeuvre]
-    reports = agent.report(rng, errors, Passes(vehicle, mu, common, shares, noise, manoeuvre, excited))
+    reports = agent.report(
+        rng, errors, Passes(vehicle, mu, common, shares, noise, manoeuvre, excited)
+    )
     offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
     reported_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
     reported_place = np.where(reported_at // LENGTH == place // LENGTH, reported_at, place)
@@ -131,7 +151,9 @@ def drive(rng: Generator, town: Town, errors: Errors, minutes: float, acquainted
 def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
     """Some of the visits."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
-    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports)
+    return Visits(
+        v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
+    )
 
 
 def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:

@@ -56,6 +56,9 @@ def _inside(box: Sequence[float], longitude: float, latitude: float) -> bool:
 
 def _name(latitude: float, longitude: float, named: Sequence[tuple[str, float, float]]) -> str:
     scale = METRES_PER_DEGREE * math.cos(math.radians(latitude))
-    far = [(math.hypot((x - longitude) * scale, (y - latitude) * METRES_PER_DEGREE), name) for name, x, y in named]
+    far = [
+        (math.hypot((x - longitude) * scale, (y - latitude) * METRES_PER_DEGREE), name)
+        for name, x, y in named
+    ]
     distance, name = min(far, default=(math.inf, ""))
     return name if distance <= NEAR_M else ""

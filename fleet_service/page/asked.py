@@ -26,7 +26,11 @@ def moment(request: Request) -> int | None:
 
 def level(request: Request) -> int:
     """Return the zoom of the places, 14 to 21."""
-    return _number(request, "level", LEAST_LEVEL, CELL_LEVEL) if "level" in request.query_params else CELL_LEVEL
+    return (
+        _number(request, "level", LEAST_LEVEL, CELL_LEVEL)
+        if "level" in request.query_params
+        else CELL_LEVEL
+    )
 
 
 def tiles(request: Request) -> list[int]:
@@ -75,7 +79,11 @@ def _interval(text: str, now: int) -> tuple[int, int | None]:
     first, is_interval, last = text.partition("/")
     begin, end = _instant(first), _instant(last if is_interval else first)
     if begin is None and end is None and not is_interval:
-        raise InputError("datetime", f"{text[:40]!r} is no time", "give 2026-01-31T07:00:00Z, or two with / between")
+        raise InputError(
+            "datetime",
+            f"{text[:40]!r} is no time",
+            "give 2026-01-31T07:00:00Z, or two with / between",
+        )
     if begin is not None and end is not None and begin > end:
         raise InputError("datetime", "ends before it begins", "give the earlier time first")
     return (begin or 0) if is_interval else 0, None if end is None or end >= now else end
@@ -87,7 +95,9 @@ def _instant(text: str) -> int | None:
     try:
         found = query.parse({"at": text}).at
     except InputError as error:
-        raise InputError("datetime", error.problem, "give 2026-01-31T07:00:00Z, or two with / between") from error
+        raise InputError(
+            "datetime", error.problem, "give 2026-01-31T07:00:00Z, or two with / between"
+        ) from error
     return None if found is None else nanoseconds(found)
 
 
@@ -113,7 +123,9 @@ def _whole(name: str, text: str, least: int, most: int) -> int:
     try:
         found = reading(text)
     except ValueError as error:
-        raise InputError(name, f"{text[:40]!r} is no whole number", f"give {least} to {most}") from error
+        raise InputError(
+            name, f"{text[:40]!r} is no whole number", f"give {least} to {most}"
+        ) from error
     if not least <= found <= most:
         raise InputError(name, f"{text[:40]} is out of range", f"give {least} to {most}")
     return found

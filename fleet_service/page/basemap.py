@@ -56,14 +56,22 @@ class TileFile:
         if not path.is_file():
             raise _refused(f"{path} is not there")
         try:
-            self._table = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
-            self.metadata: dict[str, Any] = dict(self._table.execute("select name, value from metadata"))
-            least, most = self._table.execute("select min(zoom_level), max(zoom_level) from tiles").fetchone()
+            self._table = sqlite3.connect(
+                f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False
+            )
+            self.metadata: dict[str, Any] = dict(
+                self._table.execute("select name, value from metadata")
+            )
+            least, most = self._table.execute(
+                "select min(zoom_level), max(zoom_level) from tiles"
+            ).fetchone()
         except sqlite3.Error as error:
             raise _refused(f"{path} cannot be read ({error})") from error
         form = str(self.metadata.get("format"))
         if form not in KINDS or least is None:
-            raise _refused(f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile")
+            raise _refused(
+                f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile"
+            )
         self.kind = KINDS[form]
         self.zooms = (int(least), int(most))
 
@@ -71,7 +79,9 @@ class TileFile:
         """Return a tile, counted from the north-west and unpack_tile; None if there is none."""
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
-        asked = "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
+        asked = (
+            "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
+        )
         with self._lock:
             found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
         return None if found is None else unpack_tile(bytes(found[0]))
@@ -115,9 +125,13 @@ def base_map(text: str, attribution: str | None = None) -> BaseMap:
     """
     if text.endswith((MBTILES, PMTILES)):
         file = TileFile(Path(text)) if text.endswith(MBTILES) else _Pmtiles(Path(text))
-        named = attribution if attribution is not None else str(file.metadata.get("attribution") or "")
+        named = (
+            attribution if attribution is not None else str(file.metadata.get("attribution") or "")
+        )
         return BaseMap(OWN, file.zooms, file, _TAG.sub("", named).strip())
-    whole = all(f"{{{name}}}" in text for name in "zxy") and not any(mark in text for mark in " ;,'\"")
+    whole = all(f"{{{name}}}" in text for name in "zxy") and not any(
+        mark in text for mark in " ;,'\""
+    )
     if not whole or not text.startswith(("http://", "https://", "/")):
         raise _refused(f"{text[:60]!r} is no address of tiles")
     return BaseMap(text, attribution=attribution or "")

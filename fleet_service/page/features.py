@@ -112,7 +112,9 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
 def schema(base: str) -> dict[str, Any]:
     """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds knows `mu` is a
     number."""
-    columns = {f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS}
+    columns = {
+        f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"{base}/collections/{COLLECTION}/schema", "type": "object", "title": TITLE,
@@ -127,11 +129,20 @@ def api(base: str) -> dict[str, Any]:
     """Return the definition of the interface, OpenAPI 3.0."""
 
     def route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
-        answers = {"200": {"description": "the document"}, "400": {"description": "what was wrong, and how to mend it"}}
+        answers = {
+            "200": {"description": "the document"},
+            "400": {"description": "what was wrong, and how to mend it"},
+        }
         return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
 
     def parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
-        return {"name": name, "in": where, "required": where == "path", "description": about, "schema": form}
+        return {
+            "name": name,
+            "in": where,
+            "required": where == "path",
+            "description": about,
+            "schema": form,
+        }
 
     asked = (
         parameter("bbox", "query", "west, south, east, north [deg]", type="array", items={"type": "number"},
@@ -140,7 +151,10 @@ def api(base: str) -> dict[str, Any]:
         parameter("limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW),
         parameter("after", "query", "id after which to go on; links say it", type="string"),
     )  # fmt: skip
-    one, own = parameter("featureId", "path", "CELL-SECTOR", type="string"), f"/collections/{COLLECTION}"
+    one, own = (
+        parameter("featureId", "path", "CELL-SECTOR", type="string"),
+        f"/collections/{COLLECTION}",
+    )
     return {
         "openapi": "3.0.3", "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
         "servers": [{"url": base}],
@@ -153,7 +167,9 @@ def api(base: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def page_of(features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str) -> dict[str, Any]:
+def page_of(
+    features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str
+) -> dict[str, Any]:
     """Return features as one page of an answer.
 
     Args:
@@ -178,7 +194,11 @@ def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]
     names = {field.name for field in COLUMNS}
     for feature in features:
         properties = {name: value for name, value in feature["properties"].items() if name in names}
-        yield {**feature, "id": identity(properties["cell"], properties["sector"]), "properties": properties}
+        yield {
+            **feature,
+            "id": identity(properties["cell"], properties["sector"]),
+            "properties": properties,
+        }
 
 
 def extent_of(tiles: Iterable[int]) -> Box | None:

@@ -34,7 +34,11 @@ class Files:
 
     def __init__(self, folder: Path) -> None:
         plain = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-        modules = {name.removesuffix(".js"): text.decode() for name, text in plain.items() if name.endswith(".js")}
+        modules = {
+            name.removesuffix(".js"): text.decode()
+            for name, text in plain.items()
+            if name.endswith(".js")
+        }
         plain[SCRIPT] = bundle_modules(modules, "main").encode()
         self._files = {name: _packed(name, text) for name, text in plain.items()}
 
@@ -58,7 +62,9 @@ class Files:
             return Response(status_code=304, headers=headers)
         if "gzip" not in request.headers.get("accept-encoding", ""):
             return Response(file.plain, media_type=file.kind, headers=headers)
-        return Response(file.packed, media_type=file.kind, headers={**headers, "Content-Encoding": "gzip"})
+        return Response(
+            file.packed, media_type=file.kind, headers={**headers, "Content-Encoding": "gzip"}
+        )
 
 
 def _packed(name: str, plain: bytes) -> _File:

@@ -49,10 +49,20 @@ class ServiceHealth:
         now = time.monotonic()
         before = self._before.get(address)
         self._before[address] = (now, rows)
-        rate = None if before is None or now <= before[0] else max(rows - before[1], 0.0) / (now - before[0])
+        rate = (
+            None
+            if before is None or now <= before[0]
+            else max(rows - before[1], 0.0) / (now - before[0])
+        )
         single = {
             name: found.get(name, {}).get("")
-            for name in ("report_lag_seconds", "cells", "alerts", "queue_messages", "clock_lag_seconds")
+            for name in (
+                "report_lag_seconds",
+                "cells",
+                "alerts",
+                "queue_messages",
+                "clock_lag_seconds",
+            )
         }
         return {
             "address": address, "answers": True, "observations": rows, "per_second": rate,

@@ -42,7 +42,9 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
         for names, module in found:
             wanted[module] |= {one.split(" as ")[0] for one in names.split(", ")}
     return "".join(
-        _plain(modules[name]) if name == main else _called(name, _plain(modules[name]), sorted(wanted[name]))
+        _plain(modules[name])
+        if name == main
+        else _called(name, _plain(modules[name]), sorted(wanted[name]))
         for name in TopologicalSorter(needs).static_order()
     )
 
@@ -53,7 +55,9 @@ def _called(name: str, body: str, exported: list[str]) -> str:
 
 def _plain(text: str) -> str:
     """Return a module's text without imports and exports."""
-    text = _IMPORT.sub(lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text))
+    text = _IMPORT.sub(
+        lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text)
+    )
     if other := _OTHER.search(text):
         raise ValueError(f"{other[0]!r} cannot be joined")
     return text

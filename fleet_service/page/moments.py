@@ -28,7 +28,17 @@ from schemas.thresholds import NS
 KEPT: Final = 8  # snapshots in memory
 MOST: Final = 3000  # moments that the slider is told of: four months of hours
 HISTORY: Final = 200  # snapshots that a history looks at, the newest
-_COLUMNS: Final = ("cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "last_time")
+_COLUMNS: Final = (
+    "cell",
+    "sector",
+    "mu",
+    "mu_lower",
+    "mu_upper",
+    "p_slippery",
+    "basis",
+    "vehicles",
+    "last_time",
+)
 _OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles")
 
 
@@ -73,7 +83,9 @@ class Moments:
                 continue
             wanted = (pc.field("cell") == cell) & (pc.field("sector") == sector)
             try:
-                table = pq.read_table(files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None)
+                table = pq.read_table(
+                    files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None
+                )
             except FileNotFoundError:  # retention was quicker
                 continue
             for row in table.to_pylist()[:1]:
@@ -94,7 +106,11 @@ class Moments:
         if self._root is None:
             return {}
         folders = layout.days(self._root, snapshots.TABLE)
-        return {snapshots.time_of(path) // NS: path for folder in folders for path in folder.glob("*.parquet")}
+        return {
+            snapshots.time_of(path) // NS: path
+            for folder in folders
+            for path in folder.glob("*.parquet")
+        }
 
     def _at(self, moment: int) -> dict[int, Records]:
         recent = self._recent.at(moment)
@@ -113,7 +129,9 @@ class Moments:
             path = self._files()[moment]
             table = pq.read_table(path, columns=list(_COLUMNS), partitioning=None)
         except (KeyError, OSError, pa.ArrowException) as error:
-            raise InputError("at", f"there is no snapshot of {moment}", "take one of /moments") from error
+            raise InputError(
+                "at", f"there is no snapshot of {moment}", "take one of /moments"
+            ) from error
         last = table["last_time"].cast(pa.timestamp("ns", "UTC"), safe=False)
         table = table.set_column(table.schema.get_field_index("last_time"), "last_time", last)
         tile: IntArray = np.asarray(grid.tile_of(table["cell"].to_numpy()))

@@ -86,7 +86,11 @@ class FeatureRoutes:
         if table.num_rows:
             last = features.identity(table["cell"][-1].as_py(), table["sector"][-1].as_py())
         given = {name: value for name, value in request.query_params.items() if name != "after"}
-        stamp = datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC).isoformat().replace("+00:00", "Z")
+        stamp = (
+            datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC)
+            .isoformat()
+            .replace("+00:00", "Z")
+        )
         answer = features.page_of(
             features.with_identity(extract.features(geo.with_cells(table))), more, str(request.url),
             f"{address}?{urlencode(given | {'after': last})}", stamp,
@@ -96,11 +100,17 @@ class FeatureRoutes:
     async def item(self, request: Request) -> Response:
         """Return one feature as it is now."""
         place = asked.feature(request.path_params["feature"])
-        table = await run_in_threadpool(self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1))
+        table = await run_in_threadpool(
+            self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1)
+        )
         cell, sector = divmod(place, grid.SECTORS)
-        table = table.filter((pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector))
+        table = table.filter(
+            (pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector)
+        )
         for found in features.with_identity(extract.features(geo.with_cells(table))):
-            links = [{"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}]
+            links = [
+                {"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}
+            ]
             return JSONResponse({**found, "links": links}, media_type=GEOJSON)
         return PlainTextResponse("nobody was there: nothing is known\n", 404)
 

@@ -25,7 +25,9 @@ def cells(path: Path | None) -> dict[str, list[Any]] | None:
     try:
         table = pq.read_table(path, columns=["cell", "sector", "mu"], partitioning=None)
     except (OSError, pa.ArrowException) as error:
-        raise InputError("overlay", f"{path.name} has no cell, sector and mu", "give a file that has") from error
+        raise InputError(
+            "overlay", f"{path.name} has no cell, sector and mu", "give a file that has"
+        ) from error
     found = table.group_by(["cell", "sector"]).aggregate([("mu", "mean")])
     return {
         "cell": [str(cell) for cell in found["cell"].to_pylist()], "sector": found["sector"].to_pylist(),

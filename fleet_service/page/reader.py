@@ -28,8 +28,12 @@ from schemas.wire.tile import decode_tile
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
 AGAIN_S: Final = 5.0  # between two questions to a service of which nothing is known
-REFRESH_S: Final = 60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
-REFRESHED: Final = 20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
+REFRESH_S: Final = (
+    60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
+)
+REFRESHED: Final = (
+    20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
+)
 REGIONS: Final = 256  # that are watched for a service
 
 
@@ -48,7 +52,9 @@ class Reader:
         self._away_since: dict[int, float] = {}
         self._names: dict[str, set[str]] = {"alive": set(), "shard": set()}
         self._anything: Any = None
-        self._fallen: dict[str, float] = {}  # regions whose service said that it serves them, and went: since when
+        self._fallen: dict[
+            str, float
+        ] = {}  # regions whose service said that it serves them, and went: since when
         self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
@@ -61,10 +67,14 @@ class Reader:
             session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
             for kind in self._names:
-                session.liveliness().declare_subscriber(f"{keys.ROOT}/{kind}/*", self._token, history=True)
+                session.liveliness().declare_subscriber(
+                    f"{keys.ROOT}/{kind}/*", self._token, history=True
+                )
             while not stop.is_set():
                 served = bool(self._sees_services())
-                if served and not self._served:  # at the start, and when a service came back: what was missed
+                if (
+                    served and not self._served
+                ):  # at the start, and when a service came back: what was missed
                     self._ask_all(session)
                 elif served and time.monotonic() >= self._stood + REFRESH_S:
                     self._ask_standing(session)
@@ -160,10 +170,14 @@ class Reader:
     def _ask_standing(self, session: zenoh.Session) -> None:
         self._stood = time.monotonic()
         standing = standing_alerts(session)
-        self._world.take_standing(standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time())
+        self._world.take_standing(
+            standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time()
+        )
 
     def _refresh(self, session: zenoh.Session) -> None:
-        for region in {int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)) for tile in self._world.tiles()}:
+        for region in {
+            int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)) for tile in self._world.tiles()
+        }:
             if region not in self._queriers and len(self._queriers) < REGIONS:
                 expression = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*"
                 self._queriers[region] = session.declare_querier(expression)
@@ -184,7 +198,9 @@ class Reader:
             if found:
                 continue
             if self._answers(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
-                self._world.take_tile(tile, tables.MAP_SCHEMA.empty_table(), now)  # fewer vehicles than are shown
+                self._world.take_tile(
+                    tile, tables.MAP_SCHEMA.empty_table(), now
+                )  # fewer vehicles than are shown
             else:
                 self._world.touch(tile, now)
 

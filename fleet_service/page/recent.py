@@ -25,7 +25,9 @@ class RecentMoments:
         """Keep the tiles of a moment, unless the last one is too near or nothing has changed since."""
         moment = int(now)
         last = next(reversed(self._kept), None)
-        if not tiles or (last is not None and (moment < last + STEP_S or _same(self._kept[last], tiles))):
+        if not tiles or (
+            last is not None and (moment < last + STEP_S or _same(self._kept[last], tiles))
+        ):
             return
         self._kept[moment] = dict(tiles)
         old = list(self._kept)[:-THIN]

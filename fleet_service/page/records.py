@@ -27,7 +27,9 @@ RECORD: Final = np.dtype([
     ("basis", "u1"), ("vehicles", "u1"), ("unknown", "u1"),
 ])  # fmt: skip
 Records = NDArray[np.void]
-HEAD: Final = struct.Struct("<4IB7xd")  # tile, version, the version that this changes (0: none), cells, level, moment
+HEAD: Final = struct.Struct(
+    "<4IB7xd"
+)  # tile, version, the version that this changes (0: none), cells, level, moment
 MU_STEPS: Final = 200
 SHARE_STEPS: Final = 254
 NO_NUMBER: Final = 255
@@ -57,7 +59,9 @@ class TileBlock(NamedTuple):
 
     def encoded(self) -> bytes:
         """Return the block as bytes."""
-        head = HEAD.pack(self.tile, self.version, self.base, len(self.records), self.level, self.moment)
+        head = HEAD.pack(
+            self.tile, self.version, self.base, len(self.records), self.level, self.moment
+        )
         names: tuple[str, ...] = RECORD.names or ()
         body = b"".join(self.records[name].tobytes() for name in names)
         return head + body + b"\0" * (-len(body) % 4)
@@ -76,14 +80,20 @@ def of_table(table: pa.Table) -> Records:
     found["upper"] = _steps(np.ceil, table["mu_upper"], MU_STEPS)
     found["slippery"] = _steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
-    found["basis"] = np.select([basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND)
-    found["mu"][found["basis"] == BOUND] = NO_NUMBER  # whoever sent it: a bound has no number to colour by
+    found["basis"] = np.select(
+        [basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND
+    )
+    found["mu"][found["basis"] == BOUND] = (
+        NO_NUMBER  # whoever sent it: a bound has no number to colour by
+    )
     found["vehicles"] = np.minimum(table["vehicles"].to_numpy(), 255)
     found["unknown"] = np.where(found["basis"] == MEASURED, 0, SHARE_STEPS)
     return found[np.argsort(found["place"], kind="stable")]
 
 
-def _steps(rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray[Any], steps: int) -> NDArray[np.uint8]:
+def _steps(
+    rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray[Any], steps: int
+) -> NDArray[np.uint8]:
     value = column.to_numpy().astype(np.float64)
     whole = np.clip(rounding(np.nan_to_num(value) * steps), 0, NO_NUMBER - 1)
     return np.where(np.isfinite(value), whole, NO_NUMBER).astype(np.uint8)
@@ -115,7 +125,9 @@ def aggregate_worst(records: Records, level: int) -> Records:
     count = np.diff(np.append(first, len(records)))
     share = 1.0 - np.add.reduceat(known.astype(np.int64), first) / count
     some = np.repeat(share < 1.0, count)
-    spoken = known | ~some  # a place that was only passed speaks where nothing was measured beside it
+    spoken = (
+        known | ~some
+    )  # a place that was only passed speaks where nothing was measured beside it
     found = np.zeros(len(first), RECORD)
     found["place"] = place[first]
     for name in ("mu", "lower", "upper"):

@@ -18,7 +18,9 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
-AHEAD: Final = 3  # cells to the next one of a learned line: what nobody reported in between is bridged
+AHEAD: Final = (
+    3  # cells to the next one of a learned line: what nobody reported in between is bridged
+)
 SMOOTHED: Final = 5  # cells, centred: two lanes and a receiver's error make the raw line zigzag
 LEAST_CELLS: Final = 3  # of a learned line; fewer have no direction
 MOST_LINES: Final = 50_000
@@ -52,7 +54,10 @@ class RoadMap(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return the road map for the page."""
-        lines = [{"name": line.name, "points": line.points, "directions": line.directions} for line in self.lines]
+        lines = [
+            {"name": line.name, "points": line.points, "directions": line.directions}
+            for line in self.lines
+        ]
         return {"lines": lines, "places": [list(place) for place in self.places]}
 
 
@@ -69,9 +74,13 @@ def read_roads(path: Path) -> RoadMap:
             _add(found, feature["geometry"], feature.get("properties") or {})
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         problem = f"{path} cannot be read ({str(error)[:80]})"
-        raise InputError("roads", problem, "give GeoJSON of LineString features in degrees") from error
+        raise InputError(
+            "roads", problem, "give GeoJSON of LineString features in degrees"
+        ) from error
     if not found.lines or len(found.lines) > MOST_LINES:
-        raise InputError("roads", f"{path} holds {len(found.lines)} lines", f"give 1 to {MOST_LINES}")
+        raise InputError(
+            "roads", f"{path} holds {len(found.lines)} lines", f"give 1 to {MOST_LINES}"
+        )
     return found
 
 
@@ -81,7 +90,9 @@ def _add(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]) -> Non
         found.places.append((name, float(points[0]), float(points[1])))
     lines = [points] if kind == "LineString" else points if kind == "MultiLineString" else []
     oneway = str(about.get("oneway") or "").lower()
-    directions = 1 if oneway in ("yes", "true", "1", "forward") else 2 if oneway in ("-1", "backward") else 3
+    directions = (
+        1 if oneway in ("yes", "true", "1", "forward") else 2 if oneway in ("-1", "backward") else 3
+    )
     for line in lines:
         kept = [[round(float(x), 7), round(float(y), 7)] for x, y, *_ in line]
         if len(kept) > 1:
@@ -109,7 +120,12 @@ def _chains(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[i
     here = set(cells)
     dx, dy = _STEP[heading]
     offsets = sorted(
-        ((along, side) for along in range(AHEAD + 1) for side in range(-AHEAD, AHEAD + 1) if (along, side) != (0, 0)),
+        (
+            (along, side)
+            for along in range(AHEAD + 1)
+            for side in range(-AHEAD, AHEAD + 1)
+            if (along, side) != (0, 0)
+        ),
         key=lambda one: (math.hypot(*one), abs(one[1])),
     )
     offsets = [(along, side) for along, side in offsets if along >= abs(side)]
@@ -132,8 +148,12 @@ def _chains(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[i
 def _smooth_chain(chain: FloatArray) -> list[list[float]]:
     """Return longitude and latitude [deg] of a chain of cells (n, 2), each the mean of its neighbours."""
     half = SMOOTHED // 2
-    padded = np.concatenate([np.repeat(chain[:1], half, 0), chain, np.repeat(chain[-1:], half, 0)]) + 0.5
-    mean = np.stack([np.convolve(padded[:, k], np.full(SMOOTHED, 1 / SMOOTHED), "valid") for k in (0, 1)], 1)
+    padded = (
+        np.concatenate([np.repeat(chain[:1], half, 0), chain, np.repeat(chain[-1:], half, 0)]) + 0.5
+    )
+    mean = np.stack(
+        [np.convolve(padded[:, k], np.full(SMOOTHED, 1 / SMOOTHED), "valid") for k in (0, 1)], 1
+    )
     size = float(2**grid.CELL_ZOOM)
     longitude = mean[:, 0] / size * 360.0 - 180.0
     latitude = np.degrees(np.arctan(np.sinh(np.pi * (1.0 - 2.0 * mean[:, 1] / size))))

@@ -39,10 +39,14 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
     keys = grid.cell_of(latitude, longitude) * grid.SECTORS + sector
     known = {
         int(cell) * grid.SECTORS + int(heading): row
-        for row, (cell, heading) in enumerate(zip(table["cell"].to_numpy(), table["sector"].to_numpy(), strict=True))
+        for row, (cell, heading) in enumerate(
+            zip(table["cell"].to_numpy(), table["sector"].to_numpy(), strict=True)
+        )
     }
     rows = np.array([known.get(key, -1) for key in keys.tolist()])
-    runs = np.flatnonzero(np.append(True, (keys[1:] != keys[:-1]) & ~((rows[1:] < 0) & (rows[:-1] < 0))))
+    runs = np.flatnonzero(
+        np.append(True, (keys[1:] != keys[:-1]) & ~((rows[1:] < 0) & (rows[:-1] < 0)))
+    )
     ends = np.append(runs[1:], len(keys) - 1)
     cells = table.to_pylist()
     stretches: list[dict[str, Any]] = []
@@ -54,7 +58,9 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
         middle = (first + last) // 2
         place = {"from_m": round(float(along[first]), 1), "to_m": round(float(along[last]), 1),
                  "longitude": float(longitude[middle]), "latitude": float(latitude[middle])}  # fmt: skip
-        stretches.append(place | (_described(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN}))
+        stretches.append(
+            place | (_described(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN})
+        )
         share[stretches[-1]["basis"]] += float(along[last] - along[first]) / length
     measured = [k for k, one in enumerate(stretches) if one["basis"] == "measured"]
     worst = min(measured, key=lambda k: stretches[k]["mu_lower"], default=None)
@@ -84,7 +90,11 @@ def _samples(points: Points) -> tuple[Any, Any, Any, Any]:
     legs = np.diff(corners, axis=0) * [scale, METRES_PER_DEGREE]
     lengths = np.hypot(*legs.T)
     if not 0.0 < lengths.sum() <= MOST_M:
-        raise InputError("route", f"is {lengths.sum() / 1e3:.1f} km long", f"show up to {MOST_M / 1e3:.0f} km at once")
+        raise InputError(
+            "route",
+            f"is {lengths.sum() / 1e3:.1f} km long",
+            f"show up to {MOST_M / 1e3:.0f} km at once",
+        )
     counts = np.maximum(np.ceil(lengths / STEP_M), 1).astype(np.int64)
     leg = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)
     begun = np.cumsum(counts) - counts

@@ -103,7 +103,10 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     listener.start()
     if settings.datex is not None:
         threading.Thread(
-            target=update_publication, args=(settings.datex, world, reader, stop), name="datex", daemon=True
+            target=update_publication,
+            args=(settings.datex, world, reader, stop),
+            name="datex",
+            daemon=True,
         ).start()
     try:
         asyncio.run(_serve(app, listening, stop, watchers, say))
@@ -112,7 +115,9 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         listener.join(LEAVE_S)
 
 
-def update_publication(file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event) -> None:
+def update_publication(
+    file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event
+) -> None:
     """Keep a publication current with the received alerts until `stop` is set."""
     seen = -1
     while not stop.wait(GATHER_S):
@@ -126,7 +131,11 @@ def update_publication(file: DatexFile, world: MapMirror, reader: Reader, stop: 
 
 
 async def _serve(
-    app: ASGIApp, listening: socket.socket, stop: threading.Event, watchers: Watchers, say: Callable[[str], None]
+    app: ASGIApp,
+    listening: socket.socket,
+    stop: threading.Event,
+    watchers: Watchers,
+    say: Callable[[str], None],
 ) -> None:
     config = uvicorn.Config(
         app, log_level="warning", access_log=False, server_header=False, lifespan="on", ws="none",
@@ -162,5 +171,7 @@ def _listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:  # the latter: no port has so high a number
         found.close()
         fix = "give another with --port, or 0 for a free one"
-        raise InputError("port", f"cannot listen on {host}:{port} ({error.args[-1]})", fix) from error
+        raise InputError(
+            "port", f"cannot listen on {host}:{port} ({error.args[-1]})", fix
+        ) from error
     return found

@@ -36,7 +36,9 @@ class TileShape(NamedTuple):
 
 def encode_tile(layers: Mapping[str, Iterable[TileShape]]) -> bytes:
     """Return a tile of these layers; a layer without shapes is left out."""
-    return b"".join(_field(3, _layer(name, list(shapes))) for name, shapes in layers.items() if shapes)
+    return b"".join(
+        _field(3, _layer(name, list(shapes))) for name, shapes in layers.items() if shapes
+    )
 
 
 def _layer(name: str, shapes: list[TileShape]) -> bytes:
@@ -45,13 +47,16 @@ def _layer(name: str, shapes: list[TileShape]) -> bytes:
     found = [_number(15, 2), _field(1, name.encode())]
     for shape in shapes:
         tags = b"".join(
-            _varint(keys.setdefault(key, len(keys))) + _varint(values.setdefault(value, len(values)))
+            _varint(keys.setdefault(key, len(keys)))
+            + _varint(values.setdefault(value, len(values)))
             for key, value in shape.tags.items()
         )
         body = _field(2, tags) + _number(3, shape.kind) + _field(4, _commands(shape))
         found.append(_field(2, body))
     found += [_field(3, key.encode()) for key in keys]
-    found += [_field(4, _field(1, v.encode()) if isinstance(v, str) else _number(5, v)) for v in values]
+    found += [
+        _field(4, _field(1, v.encode()) if isinstance(v, str) else _number(5, v)) for v in values
+    ]
     return b"".join([*found, _number(5, EXTENT)])
 
 
@@ -123,7 +128,9 @@ class PmtilesFile:
         if len(head) < 127 or not head.startswith(_MAGIC):
             raise _refusal_of(f"{path} is no PMTiles of version 3")
         fields = _HEAD.unpack(head[: _HEAD.size])
-        (self._root, self._root_size, about, about_size, self._leaves, _, self._data, *_) = fields[2:]
+        (self._root, self._root_size, about, about_size, self._leaves, _, self._data, *_) = fields[
+            2:
+        ]
         _, self._packing, tile_packing, kind, least, most = fields[-6:]
         if kind != _MVT:
             raise _refusal_of(f"{path} holds images; give an .mbtiles of them")
@@ -204,4 +211,6 @@ def _hilbert(zoom: int, x: int, y: int) -> int:
 
 
 def _refusal_of(problem: str) -> InputError:
-    return InputError("base_map", problem, "make one with `pmtiles extract`, see the how-to of the live page")
+    return InputError(
+        "base_map", problem, "make one with `pmtiles extract`, see the how-to of the live page"
+    )

@@ -51,7 +51,9 @@ class Watchers:
         most: maximum number of watchers.
     """
 
-    def __init__(self, world: MapMirror, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
+    def __init__(
+        self, world: MapMirror, state: Callable[[], dict[str, Any]], most: int = MOST
+    ) -> None:
         self._world, self._state, self._most = world, state, most
         self._watchers: set[_OpenPage] = set()
         self.reloads = 0
@@ -110,7 +112,9 @@ class Watchers:
                 if grid.touches(watcher.view.box, _area(block.tile)):
                     place = (block.tile, watcher.view.level)
                     if place not in lines:
-                        lines[place] = b"data: " + base64.b64encode(self._made(block, place[1])) + b"\n"
+                        lines[place] = (
+                            b"data: " + base64.b64encode(self._made(block, place[1])) + b"\n"
+                        )
                     found.append(lines[place])
             if found:
                 self._put(watcher, b"event: tiles\n" + b"".join(found) + b"\n")

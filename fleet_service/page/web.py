@@ -52,7 +52,9 @@ class Sources(NamedTuple):
     roads: RoadMap | None = None
 
 
-def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]) -> ASGIApp:
+def application(
+    sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]
+) -> ASGIApp:
     """Return the web application, with compression and the headers of every answer.
 
     Args:
@@ -75,7 +77,9 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         lifespan=lifespan,
     )
     return Guarded(
-        GZipMiddleware(app, minimum_size=2000, compresslevel=3), frozenset(hosts), base.address if base else None
+        GZipMiddleware(app, minimum_size=2000, compresslevel=3),
+        frozenset(hosts),
+        base.address if base else None,
     )
 
 
@@ -136,21 +140,31 @@ class Routes:
         file = self._of.base_map and self._of.base_map.file
         if not file:
             return PlainTextResponse("this page has no tiles of its own; see --base-map\n", 404)
-        found = await run_in_threadpool(file.picture, *(request.path_params[name] for name in "zxy"))
+        found = await run_in_threadpool(
+            file.picture, *(request.path_params[name] for name in "zxy")
+        )
         headers = {"Cache-Control": "max-age=3600"}
-        return Response(found, 200 if found else 204, headers, media_type=file.kind if found else None)
+        return Response(
+            found, 200 if found else 204, headers, media_type=file.kind if found else None
+        )
 
     async def tiles(self, request: Request) -> Response:
         """Return the tiles with cells, now or `at` a moment."""
         at = asked.moment(request)
-        found = self._of.world.tiles() if at is None else await run_in_threadpool(self._of.moments.tiles, at)
+        found = (
+            self._of.world.tiles()
+            if at is None
+            else await run_in_threadpool(self._of.moments.tiles, at)
+        )
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
         """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed cells too."""
         wanted, level, at = asked.tiles(request), asked.level(request), asked.moment(request)
         if at is not None:
-            made = await run_in_threadpool(lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted])
+            made = await run_in_threadpool(
+                lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted]
+            )
         elif "borrowed" in request.query_params:
             made = await run_in_threadpool(lambda: [self._borrowed(tile) for tile in wanted])
         else:
@@ -158,10 +172,14 @@ class Routes:
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
     def _borrowed(self, tile: int) -> bytes:
-        version = self._of.world.version(tile)  # a page passes over what is older than what it holds
+        version = self._of.world.version(
+            tile
+        )  # a page passes over what is older than what it holds
         found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
         return b"".join(
-            records.TileBlock(key, records.CELL_LEVEL, version, 0, 0.0, records.of_table(table)).encoded()
+            records.TileBlock(
+                key, records.CELL_LEVEL, version, 0, 0.0, records.of_table(table)
+            ).encoded()
             for key, table in found
         )
 
@@ -192,7 +210,9 @@ class Routes:
 
     async def history(self, request: Request) -> Response:
         """Return the belief about a cell at the stored moments."""
-        return JSONResponse(await run_in_threadpool(self._of.moments.history, *asked.place(request)))
+        return JSONResponse(
+            await run_in_threadpool(self._of.moments.history, *asked.place(request))
+        )
 
     async def times(self, _: Request) -> Response:
         """Return the stored moments."""
@@ -208,8 +228,12 @@ class Routes:
 
         from schemas.tables import MAP_SCHEMA
 
-        replies = [table for _, table in self._of.reader.ask(f"{keys.ROOT}/map/**", {"route": text})]
-        return route.profile(points, pa.concat_tables(replies) if replies else MAP_SCHEMA.empty_table())
+        replies = [
+            table for _, table in self._of.reader.ask(f"{keys.ROOT}/map/**", {"route": text})
+        ]
+        return route.profile(
+            points, pa.concat_tables(replies) if replies else MAP_SCHEMA.empty_table()
+        )
 
     async def health(self, _: Request) -> Response:
         """Return the health of services and of this page."""
@@ -228,14 +252,20 @@ class Routes:
         if self._of.datex.document is None:
             message = "no service has answered yet; that is no dry road\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
-        return Response(self._of.datex.document, media_type="application/xml", headers={"Cache-Control": "no-store"})
+        return Response(
+            self._of.datex.document,
+            media_type="application/xml",
+            headers={"Cache-Control": "no-store"},
+        )
 
     async def overlay(self, _: Request) -> Response:
         """Return the overlay map, or null."""
         return JSONResponse(await run_in_threadpool(overlay.cells, self._of.overlay))
 
 
-def with_errors(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+def with_errors(
+    answer: Callable[[Request], Awaitable[Response]],
+) -> Callable[[Request], Awaitable[Response]]:
     """Wrap a handler so that a bad request gets an answer with the problem and the fix."""
 
     async def wrapped(request: Request) -> Response:
@@ -272,14 +302,18 @@ class Guarded:
             await send(message)
 
         if scope["type"] == "http" and self._hosts and _host(scope) not in self._hosts:
-            refusal = PlainTextResponse("this page is not served under that name; see --name\n", 421)
+            refusal = PlainTextResponse(
+                "this page is not served under that name; see --name\n", 421
+            )
             await refusal(scope, receive, sent)
         else:
             await self._app(scope, receive, sent)
 
 
 def _host(scope: Scope) -> str:
-    named = next((value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), "")
+    named = next(
+        (value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), ""
+    )
     with contextlib.suppress(ValueError):
         return urlsplit(f"//{named}").hostname or ""
     return ""

@@ -68,7 +68,9 @@ class MapMirror:
             self.alerts_heard += 1
             self._stretches.take(alert)
 
-    def take_standing(self, standing: Iterable[Alert], served: Callable[[int], bool], now: float) -> None:
+    def take_standing(
+        self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
+    ) -> None:
         """Replace the standing alerts of all served cells."""
         with self._lock:
             self.heard = now
@@ -78,12 +80,16 @@ class MapMirror:
     def remember(self, now: float) -> None:
         """Keep the map of this moment for the slider."""
         with self._lock:
-            self.recent.keep(now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)})
+            self.recent.keep(
+                now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)}
+            )
 
     def places(self) -> tuple[IntArray, IntArray]:
         """Return cell and sector of all records, (n,) each."""
         with self._lock:
-            held = [(tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()]
+            held = [
+                (tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()
+            ]
         if not held:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         place = np.concatenate([tile * (1 << 14) * grid.SECTORS + place for tile, place in held])
@@ -97,14 +103,19 @@ class MapMirror:
             for tile, (cells, version) in before.items():
                 held = self._tiles[tile]
                 delta = records.changed_records(cells, held.cells)
-                block = TileBlock(tile, records.CELL_LEVEL, held.version, version, held.heard, delta)
+                block = TileBlock(
+                    tile, records.CELL_LEVEL, held.version, version, held.heard, delta
+                )
                 found.append(block)
             return found
 
     def alerts_changed(self) -> bool:
         """Return True if stretches changed since the last call."""
         with self._lock:
-            found, self._alerts_changed = bool(self._stretches.changes()) or self._alerts_changed, False
+            found, self._alerts_changed = (
+                bool(self._stretches.changes()) or self._alerts_changed,
+                False,
+            )
             return found
 
     def stretches(self) -> list[StretchAlert]:
@@ -116,7 +127,9 @@ class MapMirror:
     def standing(self) -> list[dict[str, Any]]:
         """Return the standing stretches, newest first."""
         with self._lock:
-            return [one.values() for one in sorted(self._stretches.standing, key=lambda one: -one.since)]
+            return [
+                one.values() for one in sorted(self._stretches.standing, key=lambda one: -one.since)
+            ]
 
     def tiles(self) -> list[int]:
         """Return all tiles that have cells."""
@@ -126,7 +139,11 @@ class MapMirror:
     def oldest(self, before: float, most: int) -> list[int]:
         """Return tiles not received since `before` [s since 1970], oldest first."""
         with self._lock:
-            late = [(held.heard, tile) for tile, held in self._tiles.items() if held.heard < before and len(held.cells)]
+            late = [
+                (held.heard, tile)
+                for tile, held in self._tiles.items()
+                if held.heard < before and len(held.cells)
+            ]
         return [tile for _, tile in sorted(late)[:most]]
 
     def touch(self, tile: int, now: float) -> None:

@@ -37,7 +37,9 @@ def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
 
 def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
     """Return the column that a list holds; a view if Arrow's own conversion would import another library."""
-    whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()  # which copies what is one piece
+    whole = (
+        column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+    )  # which copies what is one piece
     values = cast("pa.LargeListArray[Any]", whole).flatten()
     if pa.types.is_boolean(values.type):
         return np.asarray(values)
@@ -54,8 +56,13 @@ def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
     versions = {(table.schema.metadata or {}).get(_KEY, b"").decode() for table in tables.values()}
     if versions != {VERSION}:
         raise InputError("checkpoint", f"is not of version {VERSION}", "replay the archive instead")
-    image = {name: {key: _from_list(table[key]) for key in table.column_names} for name, table in tables.items()}
+    image = {
+        name: {key: _from_list(table[key]) for key in table.column_names}
+        for name, table in tables.items()
+    }
     try:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:
-        raise InputError("checkpoint", f"is not whole ({error})", "replay the archive instead") from error
+        raise InputError(
+            "checkpoint", f"is not whole ({error})", "replay the archive instead"
+        ) from error

@@ -27,7 +27,9 @@ from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
-TRIES: Final = 4  # a service that is killed again and again, by whatever, begins from the log at last
+TRIES: Final = (
+    4  # a service that is killed again and again, by whatever, begins from the log at last
+)
 _DRAFT: Final = ".draft"
 _MANIFEST: Final = "manifest.json"
 _TRIED: Final = "tried"
@@ -63,7 +65,10 @@ def save(root: Path, taken: Taken) -> Path:
             metadata = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
             with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
                 writer.write_table(table.replace_schema_metadata(metadata))
-    content = {"files": {file.name: digest(file) for file in sorted(draft.iterdir())}, "weather": list(taken.weather)}
+    content = {
+        "files": {file.name: digest(file) for file in sorted(draft.iterdir())},
+        "weather": list(taken.weather),
+    }
     with open_durably(draft / _MANIFEST, named=False) as file:
         file.write(json.dumps({"content": content, "digest": _digest_of(content)}).encode())
     sync_directory(draft)
@@ -139,7 +144,9 @@ def _digest_of(content: Sequence[Any] | dict[str, Any]) -> str:
 
 
 def _refused(path: Path, problem: str) -> InputError:
-    return InputError("checkpoint", f"{path.name} {problem}", "the one before it, or the log, is taken instead")
+    return InputError(
+        "checkpoint", f"{path.name} {problem}", "the one before it, or the log, is taken instead"
+    )
 
 
 def _folders(root: Path) -> list[Path]:

@@ -32,17 +32,33 @@ from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
 COLUMNS: Final = [
-    *("leave_time", "cell", "sector", "latitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
+    *(
+        "leave_time",
+        "cell",
+        "sector",
+        "latitude",
+        "position_std",
+        "yaw",
+        "mu",
+        "mu_lower",
+        "mu_upper",
+    ),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
     *("used_longitudinal", "used_lateral", "late_by"),
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
-PART_ROWS: Final = 4_000_000  # of a day that are held at once, 200 MB; twice, while the next are read
-CHUNK_ROWS: Final = 100_000  # that are fused at once: what is made of them on the way takes four times their memory
+PART_ROWS: Final = (
+    4_000_000  # of a day that are held at once, 200 MB; twice, while the next are read
+)
+CHUNK_ROWS: Final = (
+    100_000  # that are fused at once: what is made of them on the way takes four times their memory
+)
 _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
 SEGMENT_ROW_BYTES: Final = 60  # in the inbox, at the least
-MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
+MARGIN_DEG: Final = (
+    0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
+)
 
 
 class Begin(NamedTuple):
@@ -66,16 +82,22 @@ def restore_streams(
     """
     for kind, first in layout.FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
-        wanted = reading.Wanted(columns, days=(begin.day, None), after=begin.after, until=begin.until)
+        wanted = reading.Wanted(
+            columns, days=(begin.day, None), after=begin.after, until=begin.until
+        )
         for table in reading.read_wanted(root, kind, wanted, damaged):
-            boot, region, seq, first_held = (table[name].to_numpy() for name in (*IDENTITY[1:], "first_held"))
+            boot, region, seq, first_held = (
+                table[name].to_numpy() for name in (*IDENTITY[1:], "first_held")
+            )
             time = segments.nanoseconds(table[first])
             streams.restore(kind, numbers(table["vehicle"]), boot, region, seq, first_held, time)
 
 
 def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
     """Return pseudonyms (n,) as numbers."""
-    chunked = pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
+    chunked = (
+        pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
+    )
     coded = chunked.combine_chunks().dictionary_encode()
     if not len(coded):
         return np.zeros(0, np.int64)
@@ -102,11 +124,18 @@ class Since(NamedTuple):
         if self.box is None:
             return None
         west, south, east, north = self.box
-        return west - 2 * MARGIN_DEG, south - 2 * MARGIN_DEG, east + 2 * MARGIN_DEG, north + 2 * MARGIN_DEG
+        return (
+            west - 2 * MARGIN_DEG,
+            south - 2 * MARGIN_DEG,
+            east + 2 * MARGIN_DEG,
+            north + 2 * MARGIN_DEG,
+        )
 
     def where(self) -> list[ValueRange] | None:
         """Return the row filters; None for all rows."""
-        found = [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
+        found = (
+            [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
+        )
         if self.box is not None:
             west, south, east, north = self.box
             found.append(ValueRange("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
@@ -151,7 +180,10 @@ def past_fusion(
     """
     fusion = fusion_with_weather(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
-    wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
+    wanted, heard = (
+        Since(begin, until=until, box=box, most=most),
+        nobody if listener is None else listener(fusion),
+    )
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history
     return fusion
@@ -162,7 +194,9 @@ def first_day(root: Path) -> int | None:
 
     Older batches are not sent again (ServiceConfig.oldest_s), and they do not show in the map.
     """
-    found = [layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])]
+    found = [
+        layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])
+    ]
     return max(found) - layout.MAP_DAYS if found else None
 
 
@@ -188,8 +222,12 @@ def replay(
     where = since.where()
     columns = COLUMNS if where is None else [*COLUMNS, *FILTERED]
     days = (since.begin.day, last)
-    wanted = reading.Wanted(columns, where, days, since.begin.after, since.begin.until, since.near())
-    waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
+    wanted = reading.Wanted(
+        columns, where, days, since.begin.after, since.begin.until, since.near()
+    )
+    waiting: list[
+        tuple[Observations, Before]
+    ] = []  # late rows that were fused after the end of their table
     known = vehicle_ids.read(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
         rows = segments.rows_of(table)
@@ -198,7 +236,10 @@ def replay(
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
             rows = {name: column[new] for name, column in rows.items()}
-        o, before = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"])), _before(rows)
+        o, before = (
+            observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"])),
+            _before(rows),
+        )
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
         o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
@@ -225,12 +266,16 @@ def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations,
     )  # fmt: skip
 
 
-def _select_rows(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
+def _select_rows(
+    o: Observations, before: Before, rows: BoolArray | IntArray | slice
+) -> tuple[Observations, Before]:
     """Return a selection of rows."""
     return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows])
 
 
-def _fuse_epochs(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
+def _fuse_epochs(
+    fusion: Fusion, o: Observations, before: Before, heard: Heard
+) -> Iterator[Updated]:
     """Fuse rows epoch by epoch, by the time at which they were fused originally."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
@@ -275,7 +320,11 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
     fresh = [table for table in listing.inbox() if table.num_rows]
     inbox = pa.concat_tables(fresh).sort_by(name) if fresh else None
     seen = 0
-    inbox_days = np.zeros(0, np.int64) if inbox is None else segments.nanoseconds(inbox[name]) // layout.DAY_NS
+    inbox_days = (
+        np.zeros(0, np.int64)
+        if inbox is None
+        else segments.nanoseconds(inbox[name]) // layout.DAY_NS
+    )
     files: dict[int, list[Path]] = {day: [] for day in np.unique(inbox_days).tolist()}
     for path in listing.files:
         files.setdefault(layout.partition_of(path).day, []).append(path)
@@ -283,8 +332,14 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
         begin, end = np.searchsorted(inbox_days, [day, day + 1]).tolist()
         mine = None if inbox is None else inbox.slice(begin, end - begin)
         rows = end - begin + sum(_rows_of(path) for path in files[day])
-        for low, high in pairwise(_borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)):
-            within = [ValueRange(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
+        for low, high in pairwise(
+            _borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)
+        ):
+            within = (
+                [ValueRange(name, low // US_STEP, high // US_STEP - 1)]
+                if high - low < layout.DAY_NS
+                else []
+            )
             borders = _borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
             held = _Held(name, borders)
             if mine is not None:
@@ -319,7 +374,10 @@ class _Held:
         """Add rows to those that `keep` or `forget` decides on."""
         time = segments.nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
-        table, places = _with_numbers(table).take(order), np.searchsorted(time[order], self._borders).tolist()
+        table, places = (
+            _with_numbers(table).take(order),
+            np.searchsorted(time[order], self._borders).tolist(),
+        )
         for k, (start, stop) in enumerate(pairwise(places)):
             if stop > start:
                 sink = pa.BufferOutputStream()
@@ -367,7 +425,10 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
         OSError: the archive cannot be read.
     """
     last = until // layout.DAY_NS + 1
-    found = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION)) // SEGMENT_ROW_BYTES
+    found = (
+        sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION))
+        // SEGMENT_ROW_BYTES
+    )
     for path in layout.compacted_files(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
         if found > most:
             break

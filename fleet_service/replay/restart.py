@@ -58,20 +58,29 @@ def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> R
             standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
             above = tables.pop(ABOVE)["seq"].to_numpy()
             columns = tables.pop(STREAMS)
-            streams = SequenceTrackers.of({name: columns[name].to_numpy() for name in columns.column_names}, above)
+            streams = SequenceTrackers.of(
+                {name: columns[name].to_numpy() for name in columns.column_names}, above
+            )
             extra = {name: tables.pop(name) for name in beside if name in tables}
-            others = {n: {column: t[column].to_numpy() for column in t.column_names} for n, t in extra.items()}
+            others = {
+                n: {column: t[column].to_numpy() for column in t.column_names}
+                for n, t in extra.items()
+            }
             fusion = fusion_from(tables, lateness_s)
         except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
             log.warning("checkpoint %s is not begun from: %s", path.name, error)
             refused += 1
             continue
         checkpoints.begin(path)
-        return Restart(fusion, streams, standing, taken.cut, frozenset(taken.weather), refused, others)
+        return Restart(
+            fusion, streams, standing, taken.cut, frozenset(taken.weather), refused, others
+        )
     return Restart(Fusion(lateness_s), SequenceTrackers(), [], None, frozenset(), refused, {})
 
 
-def image_of(fusion: Fusion, standing: list[Alert], streams: SequenceTrackers) -> dict[str, pa.Table]:
+def image_of(
+    fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
+) -> dict[str, pa.Table]:
     """Return the tables of a checkpoint from which `restart` restores the state."""
     columns, above = streams.columns()
     return tables_of(fusion) | {

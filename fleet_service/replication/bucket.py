@@ -19,7 +19,9 @@ from schemas.runtime.installing import install_command
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-SCHEMES: Final = re.compile(r"(s3|gs|az|abfss?)://[^/]+")  # a folder or memory would not be a second place
+SCHEMES: Final = re.compile(
+    r"(s3|gs|az|abfss?)://[^/]+"
+)  # a folder or memory would not be a second place
 CONNECT_S: Final = 2.0
 _ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _TOOK: Final = re.compile(r" in [\d.]+[^\s\d]*s\b")
@@ -44,27 +46,46 @@ class ObjectBucket:
 
     def __init__(self, url: str, options: Mapping[str, str], timeout_s: float) -> None:
         if SCHEMES.match(url) is None:
-            raise InputError("archive.copy", f"{url} is no bucket", "give a URL such as s3://bucket/folder")
+            raise InputError(
+                "archive.copy", f"{url} is no bucket", "give a URL such as s3://bucket/folder"
+            )
         try:
             import obstore
             from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
             from obstore.store import from_url
         except ImportError as error:
             fix = install_command("objects")
-            raise InputError("archive.copy", "a copy needs obstore, which is not installed", fix) from error
-        self._do, self._known, self._missing = obstore, AlreadyExistsError, (NotFoundError, FileNotFoundError)
+            raise InputError(
+                "archive.copy", "a copy needs obstore, which is not installed", fix
+            ) from error
+        self._do, self._known, self._missing = (
+            obstore,
+            AlreadyExistsError,
+            (NotFoundError, FileNotFoundError),
+        )
         self._failed: tuple[type[Exception], ...] = (BaseError, OSError)
-        places = (options.get("endpoint"), options.get("aws_endpoint"), *map(os.environ.get, _ENDPOINTS))
+        places = (
+            options.get("endpoint"),
+            options.get("aws_endpoint"),
+            *map(os.environ.get, _ENDPOINTS),
+        )
         plain = next((place for place in places if place), "").startswith("http://")
         seconds = {"timeout": f"{timeout_s:g}s", "connect_timeout": f"{CONNECT_S:g}s"}
-        client: Any = {**seconds, **({"allow_http": True} if plain else {})}  # else the environment decides
+        client: Any = {
+            **seconds,
+            **({"allow_http": True} if plain else {}),
+        }  # else the environment decides
         retry: Any = {"max_retries": 2, "retry_timeout": timedelta(seconds=timeout_s)}
         given: Any = dict(options)
         try:
-            self._store: ObjectStore = from_url(url, config=given, client_options=client, retry_config=retry)
+            self._store: ObjectStore = from_url(
+                url, config=given, client_options=client, retry_config=retry
+            )
         except (BaseError, ValueError, TypeError) as error:
             fix = "see `store` in the settings; credentials may come from the environment"
-            raise InputError("archive.store", f"is not as {url} wants it ({reason(error)})", fix) from error
+            raise InputError(
+                "archive.store", f"is not as {url} wants it ({reason(error)})", fix
+            ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Put an object; replace an existing one.
@@ -87,7 +108,9 @@ class ObjectBucket:
                 self._do.put(self._store, name, content, mode="create")
             except self._known:
                 if self.get(name) != content:
-                    raise CopyError(f"{name}: another service has put an object of this name") from None
+                    raise CopyError(
+                        f"{name}: another service has put an object of this name"
+                    ) from None
 
     def make(self, name: str, content: bytes) -> bool:
         """Create an object; return True if the existing object is this one.
@@ -109,7 +132,9 @@ class ObjectBucket:
             CopyError: they cannot be listed.
         """
         with self._telling(f"the list of {folder}"):
-            return [meta["path"] for page in self._do.list(self._store, prefix=folder) for meta in page]
+            return [
+                meta["path"] for page in self._do.list(self._store, prefix=folder) for meta in page
+            ]
 
     def get(self, name: str) -> bytes | None:
         """Return an object; None if it does not exist.
@@ -140,7 +165,9 @@ class ObjectBucket:
             CopyError: they cannot be listed.
         """
         with self._telling("the list of objects"):
-            return {meta["path"]: meta["size"] for page in self._do.list(self._store) for meta in page}
+            return {
+                meta["path"]: meta["size"] for page in self._do.list(self._store) for meta in page
+            }
 
     def delete(self, name: str) -> None:
         """Delete an object if it exists.

@@ -50,7 +50,9 @@ FOLDER: Final = "lease"
 HOLDER: Final = "holder.json"  # of an archive: who it is, over restarts
 TURNS: Final = 6  # in the time of a lease
 HINT: Final = 0.6  # of it, after which one whose token fell is followed: more than the half in which it acknowledges
-AHEAD_S: Final = 10.0  # between two times that a standby gets what is new, so that little is left when it must
+AHEAD_S: Final = (
+    10.0  # between two times that a standby gets what is new, so that little is left when it must
+)
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 LOOK_S: Final = 0.25  # between two looks of who waits
 
@@ -84,7 +86,9 @@ class LeaseRecord(NamedTuple):
     @property
     def content(self) -> bytes:
         """Return the object's content."""
-        return json.dumps({name: value for name, value in self._asdict().items() if name != "number"}).encode()
+        return json.dumps(
+            {name: value for name, value in self._asdict().items() if name != "number"}
+        ).encode()
 
 
 class Standby(NamedTuple):
@@ -133,7 +137,11 @@ class Lease:
     @property
     def left_s(self) -> float:
         """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0 or less: not now."""
-        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed_seconds() - self._renewed)
+        return (
+            0.0
+            if self.lost or self._mine is None
+            else self._lease_s / 2 - (elapsed_seconds() - self._renewed)
+        )
 
     @property
     def fresh(self) -> bool:
@@ -152,7 +160,11 @@ class Lease:
             raise CopyError("another service has the lease")
 
     def wait(
-        self, stop: threading.Event, say: Callable[[str], None], epoch: Callable[[], int], standby: Standby | None
+        self,
+        stop: threading.Event,
+        say: Callable[[str], None],
+        epoch: Callable[[], int],
+        standby: Standby | None,
     ) -> bool:
         """Wait until this service has the lease; False if stopped.
 
@@ -176,15 +188,20 @@ class Lease:
                 found = self._newest()
                 if found is not None and found != seen:
                     if standby is None and seen is not None and found.number == seen.number:
-                        problem = f"is served by {found.service} on another machine or in another folder"
-                        raise InputError("archive.copy", problem, "stop it, or start with --standby")
+                        problem = (
+                            f"is served by {found.service} on another machine or in another folder"
+                        )
+                        raise InputError(
+                            "archive.copy", problem, "stop it, or start with --standby"
+                        )
                     stood = stood and seen is not None and found.number == seen.number
                     seen, since = found, time.monotonic()
                 stands = standby is not None and found is not None and standby.stands(found.service)
                 stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
                 stood = stood or stands
                 free = found is None or (
-                    found.to in ("", self.service) and (found.released or self._was_held_here(found))
+                    found.to in ("", self.service)
+                    and (found.released or self._was_held_here(found))
                 )
                 if free or time.monotonic() - since >= stale_s:
                     if (standby is None or standby.may()) and self._take(found, epoch, stop):
@@ -218,7 +235,9 @@ class Lease:
         mine, self._mine = self._mine, None
         if mine is not None and not self.lost:
             try:
-                self._bucket.put(mine.name, mine._replace(released=True, turn=mine.turn + 1, to=to).content)
+                self._bucket.put(
+                    mine.name, mine._replace(released=True, turn=mine.turn + 1, to=to).content
+                )
             except CopyError as error:
                 log.warning("the lease runs out by itself: %s", error)
 
@@ -260,19 +279,25 @@ class Lease:
         content = self._bucket.get(max(names)) if names else None
         return None if content is None else _read(max(names), content)
 
-    def _take(self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event) -> bool:
+    def _take(
+        self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
+    ) -> bool:
         """Create the next number; False if another service was faster."""
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
-        mine = LeaseRecord(number, self._holder, self.service, epoch, 0, released=False, before=before)
+        mine = LeaseRecord(
+            number, self._holder, self.service, epoch, 0, released=False, before=before
+        )
         began = elapsed_seconds()
         if not self._bucket.make(mine.name, mine.content):
             return False
         self._mine, self._renewed = mine, began
         self.succeeds = found is not None and found.holder != self._holder
         if found is not None and self._bucket.get(found.name) != found.content:
-            stop.wait(self._lease_s / 2)  # it was renewed in between, and may acknowledge for so long
+            stop.wait(
+                self._lease_s / 2
+            )  # it was renewed in between, and may acknowledge for so long
         return True
 
 
@@ -287,7 +312,10 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
     Raises:
         OSError: the folder cannot be read or written.
     """
-    path, place = root / HOLDER, {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino}
+    path, place = (
+        root / HOLDER,
+        {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino},
+    )
     identity: dict[str, Any] = {}
     if path.exists():
         with suppress(ValueError):
@@ -313,4 +341,6 @@ def forget_holder(root: Path) -> None:
 
 def _read(name: str, content: bytes) -> LeaseRecord:
     record: dict[str, Any] = json.loads(content)
-    return LeaseRecord(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})
+    return LeaseRecord(
+        int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))}
+    )

@@ -33,7 +33,9 @@ class Ownership:
         leaves: True once everything is ready for the hand-over.
     """
 
-    def __init__(self, lock_file: BinaryIO, copy: BucketReplica | None, lease: Lease | None = None) -> None:
+    def __init__(
+        self, lock_file: BinaryIO, copy: BucketReplica | None, lease: Lease | None = None
+    ) -> None:
         self._lock_file, self.copy, self.lease = lock_file, copy, lease
         self.to, self.leaves = "", False
 
@@ -96,11 +98,17 @@ def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
         raise
 
 
-Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standby_signs`
+Signs = tuple[
+    Callable[[], bool], Callable[[str], bool], Callable[[], None]
+]  # as of `serving.standby_signs`
 
 
 def acquire(
-    config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None = None
+    config: ServiceConfig,
+    root: Path,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    signs: Signs | None = None,
 ) -> Ownership | None:
     """Open an archive with the lease of its copy, if it has one; None if stopped.
 
@@ -120,7 +128,11 @@ def acquire(
     url = config.archive.second
     if url is None:
         if signs is not None:
-            raise InputError("standby", "needs archive.copy", "name the bucket of the service that it is to follow")
+            raise InputError(
+                "standby",
+                "needs archive.copy",
+                "name the bucket of the service that it is to follow",
+            )
         return open_exclusive(config, root)
     lock_file = lock_archive(root)
     try:
@@ -140,7 +152,9 @@ def _leased(
     url, options = str(config.archive.second), config.archive.options
     empty = not any((root / folder).exists() for folder in FOLDERS)
     holder, known = holder_of(root, url)
-    lease = Lease(holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s)
+    lease = Lease(
+        holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s
+    )
     copy = BucketReplica(root, url, options)
     mirrors = empty or known
     standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
@@ -148,7 +162,11 @@ def _leased(
         while lease.wait(stop, say, copy.epoch, standby):
             lease.keep()
             if lease.succeeds and not mirrors:
-                raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
+                raise InputError(
+                    "archive.path",
+                    f"{root} is no archive of {url}",
+                    "give the service an empty folder",
+                )
             copy.attach_lease(partial(_fresh, lease), lease.assert_not_superseded)
             if _sync_folder(config, root, copy, lease, stop, say):
                 layout.write_epoch(root, lease.term.epoch)
@@ -191,7 +209,9 @@ def _sync_folder(
     while not stop.is_set():
         try:
             with _wait_for_compaction(root) if lease.succeeds else nullcontext():
-                copy.join(None if config.standby else config.name, lease.term, succeeds=lease.succeeds)
+                copy.join(
+                    None if config.standby else config.name, lease.term, succeeds=lease.succeeds
+                )
         except (CopyError, _BusyError) as error:
             if lease.lost:
                 return False

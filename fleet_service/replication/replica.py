@@ -32,11 +32,22 @@ LOG: Final = "inbox/"
 KEYS: Final = "keys/"
 # In this order they are looked through: compaction adds to the later ones before it takes from the log, and retention
 # rolls up before it takes from the observations, so that what has gone from one is found in the next.
-FOLDERS: Final = ("inbox", "observations", "states", "rollup", "map", "weather", CHECKPOINTS, "keys")
+FOLDERS: Final = (
+    "inbox",
+    "observations",
+    "states",
+    "rollup",
+    "map",
+    "weather",
+    CHECKPOINTS,
+    "keys",
+)
 OWNER: Final = "service.json"
 _LAST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
 _PRIVATE: Final = ("tried",)  # notes of this disk
-QUICK_S: Final = 5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
+QUICK_S: Final = (
+    5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
+)
 SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
 TURN_S: Final = 20.0  # of `upload_segments`, which then says that it has come so far
 BACK_OFF_S: Final = 0.5  # after the first failure; doubles
@@ -62,7 +73,10 @@ class BucketReplica:
 
     def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
         self._root, self._url = root, url
-        self._quick, self._slow = ObjectBucket(url, options, QUICK_S), ObjectBucket(url, options, SLOW_S)
+        self._quick, self._slow = (
+            ObjectBucket(url, options, QUICK_S),
+            ObjectBucket(url, options, SLOW_S),
+        )
         self._copied = UploadJournal(root, url)
         self._following = Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
@@ -112,7 +126,9 @@ class BucketReplica:
             return self.join(service)
         except CopyError as error:
             fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
-            raise InputError("archive.copy", f"{self._url} cannot be used ({error})", fix) from error
+            raise InputError(
+                "archive.copy", f"{self._url} cannot be used ({error})", fix
+            ) from error
 
     def join(self, service: str | None, term: Term | None = None, *, succeeds: bool = False) -> int:
         """Synchronise like `begin`, under a lease's `term`: later uploads of a former holder do not count.
@@ -156,7 +172,11 @@ class BucketReplica:
     def _raise_fence(self, term: Term) -> None:
         """Write a fence for this term: later objects count only if they have its epoch. Remove objects that do not
         count."""
-        names = [name for name in self._files(FOLDERS) if (layout.term_of(name) or term.epoch) < term.epoch]
+        names = [
+            name
+            for name in self._files(FOLDERS)
+            if (layout.term_of(name) or term.epoch) < term.epoch
+        ]
         fence = Fence(term.epoch, frozenset(names))
         self._put_fence(term, fence)
         self._insist()
@@ -198,12 +218,18 @@ class BucketReplica:
         try:
             missing = [path for path in segments if self._copied.stamp(self._name(path)) is None]
             own = self._files(("keys",))
-            keys = [self._root / name for name, stamp in own.items() if self._copied.stamp(name) != stamp]
+            keys = [
+                self._root / name
+                for name, stamp in own.items()
+                if self._copied.stamp(name) != stamp
+            ]
             self._put_soon([*keys, *missing])
         except CopyError as error:
             self.failures += 1
             self._error, self._since = str(error), self._since or time.monotonic()
-            self._not_before = time.monotonic() + min(BACK_OFF_S * 2.0**self._in_a_row, MOST_BACK_OFF_S)
+            self._not_before = time.monotonic() + min(
+                BACK_OFF_S * 2.0**self._in_a_row, MOST_BACK_OFF_S
+            )
             self._in_a_row = min(self._in_a_row + 1, 10)
             raise
         self._in_a_row, self._since = 0, None
@@ -240,7 +266,9 @@ class BucketReplica:
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being put")
         try:
-            known = self._copied.stamps()  # before the files: what comes meanwhile is not taken for gone
+            known = (
+                self._copied.stamps()
+            )  # before the files: what comes meanwhile is not taken for gone
             local = self._files(FOLDERS)
             new = [
                 name for name, stamp in local.items()
@@ -248,10 +276,18 @@ class BucketReplica:
             ]  # fmt: skip
             new.sort(key=lambda name: name.endswith(_LAST))
             vanished = [name for name in new if not self._put_there(name)]
-            removed = [name for name in known if not (vanished or name in local or self._aside(name).exists())]
+            removed = [
+                name
+                for name in known
+                if not (vanished or name in local or self._aside(name).exists())
+            ]
             removed.sort(key=lambda name: not name.endswith(_LAST))
-            if strays := [name for name in new if not self._fence.passes(name)]:  # compacted by who began before
-                self._put_fence(self._term, self._fence._replace(names=self._fence.names.union(strays)))
+            if strays := [
+                name for name in new if not self._fence.passes(name)
+            ]:  # compacted by who began before
+                self._put_fence(
+                    self._term, self._fence._replace(names=self._fence.names.union(strays))
+                )
             if removed:
                 self._insist()  # then whoever comes next finds all that was put until now, and misses none of what goes
             for name in removed:
@@ -275,7 +311,9 @@ class BucketReplica:
         if self._copied.stamp(name) is None and (name.startswith(LOG) or name.endswith(".key")):
             self._put_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
-            bucket.put(name, path.read_bytes())  # who the vehicles are grows meanwhile, and is then put again
+            bucket.put(
+                name, path.read_bytes()
+            )  # who the vehicles are grows meanwhile, and is then put again
         else:
             bucket.put(name, path)
         self._copied.add(name, stamp)
@@ -301,8 +339,12 @@ class BucketReplica:
         elif there != mine:
             with suppress(ValueError, KeyError, TypeError):
                 there = str(json.loads(there)["service"]).encode()
-            problem = f"{self._url} is the copy of another service, {there.decode(errors='replace')[:60]}"
-            raise InputError("archive.copy", problem, "give each service a folder of its own in the bucket")
+            problem = (
+                f"{self._url} is the copy of another service, {there.decode(errors='replace')[:60]}"
+            )
+            raise InputError(
+                "archive.copy", problem, "give each service a folder of its own in the bucket"
+            )
 
     def _fetch(self, there: Mapping[str, int]) -> int:
         """Download what only the bucket has, and record which files of the folder it lacks."""
@@ -321,7 +363,9 @@ class BucketReplica:
         list(self._pool.map(self._get, wanted))
         paths = [self._root / name for name in wanted]
         sync_tree(self._root, {path.parent for path in paths})
-        for name, path in zip(wanted, paths, strict=True):  # only now: power loss would else make them look deleted
+        for name, path in zip(
+            wanted, paths, strict=True
+        ):  # only now: power loss would else make them look deleted
             self._copied.add(name, stamp_of(path))
             self._aside(name).unlink(missing_ok=True)
         return len(wanted)
@@ -356,7 +400,13 @@ def _ours(name: str) -> bool:
     """Return True for the name of a file that belongs into the copy; drafts and files set aside do not."""
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
-    return folder in FOLDERS and bool(rest) and not hidden and not name.endswith(BAD) and rest[-1] not in _PRIVATE
+    return (
+        folder in FOLDERS
+        and bool(rest)
+        and not hidden
+        and not name.endswith(BAD)
+        and rest[-1] not in _PRIVATE
+    )
 
 
 def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:

@@ -22,8 +22,12 @@ RAISE_ABOVE: Final = 0.9  # P(slippery)
 # ... and by its own reports alone no less than without any: neighbours confirm, they do not accuse.
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error
-FADE_BELOW: Final = 0.5  # an alert without confirmation ends as soon as ice is less likely than grip
-LEAST_SOURCES: Final = 2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
+FADE_BELOW: Final = (
+    0.5  # an alert without confirmation ends as soon as ice is less likely than grip
+)
+LEAST_SOURCES: Final = (
+    2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
+)
 # ... and one more for each opposite source that is not older than they are by this: a road changes, so that earlier
 # visits do not contradict it. With one minute instead of ten, three trusted vehicles that flood a dry cell raised an
 # alert in two of six tuning towns; with ten in none.
@@ -59,9 +63,12 @@ class Alerts:
     def resume(self, standing: Sequence[Alert]) -> None:
         """Continue with alerts that stood before a restart."""
         slots = self._fusion.slots_of(
-            np.array([a.cell for a in standing], np.int64), np.array([a.sector for a in standing], np.int64)
+            np.array([a.cell for a in standing], np.int64),
+            np.array([a.sector for a in standing], np.int64),
         )
-        self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
+        self._standing |= {
+            slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0
+        }
 
     def renumber(self, place: IntArray) -> None:
         """Update slots after the fusion renumbered them; `place` is the new number of each. No slot under alert is
@@ -94,7 +101,9 @@ class Alerts:
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
             return True
         witnesses = self._fusion.witnesses(slot, ICE, time - SOURCE_NS)
-        return self._idle_roads.admit(int(live.key[slot]) // grid.SECTORS, witnesses, time, LEAST_SOURCES)
+        return self._idle_roads.admit(
+            int(live.key[slot]) // grid.SECTORS, witnesses, time, LEAST_SOURCES
+        )
 
     def _have_witnesses(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
         """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,) [ns].

@@ -39,7 +39,9 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
         "safe_deceleration": GRAVITY * lower,
     }  # fmt: skip
     found = ((columns[f.name], f.type) for f in tables.MAP_SCHEMA)
-    arrays = [(c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False) for c, kind in found]
+    arrays = [
+        (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False) for c, kind in found
+    ]
     return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
 
@@ -55,9 +57,15 @@ def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
     rows = _plain(cells)
     if form is Format.JSON:
         return f'{{"tile": "{grid.quadkey(tile, grid.TILE_ZOOM)}", "cells": [{_joined(rows)}]}}'.encode()
-    outlines = np.stack(grid.outline(cells["cell"].to_numpy(), cells["sector"].to_numpy()), axis=-1).tolist()
+    outlines = np.stack(
+        grid.outline(cells["cell"].to_numpy(), cells["sector"].to_numpy()), axis=-1
+    ).tolist()
     features = (
-        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}, "properties": cell}
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]},
+            "properties": cell,
+        }
         for ring, cell in zip(outlines, rows, strict=True)
     )
     return f'{{"type": "FeatureCollection", "features": [{_joined(features)}]}}'.encode()
@@ -79,7 +87,9 @@ def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
     for f in table.schema:
         if pa.types.is_timestamp(f.type):
             ns = table[f.name].cast(pa.int64()).to_numpy()
-            columns[f.name] = np.datetime_as_string(ns.astype("datetime64[ns]"), "ms", "UTC").tolist()
+            columns[f.name] = np.datetime_as_string(
+                ns.astype("datetime64[ns]"), "ms", "UTC"
+            ).tolist()
         elif f.type == pa.float32():
             numbers = table[f.name].to_numpy(zero_copy_only=False).astype(np.float64).round(6)
             columns[f.name] = [number if number == number else None for number in numbers.tolist()]

@@ -79,7 +79,9 @@ class MapState:
         tiles = tile_of(self.fusion, new)
         order = np.argsort(tiles, kind="stable")
         names, begin = np.unique(tiles[order], return_index=True)
-        for tile, part in zip(names.tolist(), np.split(new[order].astype(np.int32), begin[1:]), strict=True):
+        for tile, part in zip(
+            names.tolist(), np.split(new[order].astype(np.int32), begin[1:]), strict=True
+        ):
             parts = self._slots[tile]
             parts.append(part)
             if len(parts) > PARTS:

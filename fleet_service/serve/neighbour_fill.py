@@ -23,7 +23,9 @@ REACH: Final = 10  # cells, some 130 m
 KEPT: Final = 0.8
 
 
-def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int) -> CellView:
+def impute(
+    fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int
+) -> CellView:
     """Return the unvisited cells of a tile next to its visited `slots`, same sector; along a route, the cells of its
     keys.
 
@@ -35,7 +37,11 @@ def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, n
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
     visited = np.repeat(slots, 8)
     sector = live.key[visited] % grid.SECTORS
-    free = (near >= 0) & (grid.tile_of(near) == tile) & (fusion.slots_of(np.maximum(near, 0), sector) < 0)
+    free = (
+        (near >= 0)
+        & (grid.tile_of(near) == tile)
+        & (fusion.slots_of(np.maximum(near, 0), sector) < 0)
+    )
     keys, visited = (near * grid.SECTORS + sector)[free], visited[free]
     share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
@@ -45,7 +51,11 @@ def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, n
             np.concatenate([a[ahead], b]) for a, b in zip((keys, visited, share), along, strict=True)
         )  # fmt: skip
     wanted, group = np.unique(keys, return_inverse=True)
-    belief, whole, most = np.zeros((len(wanted), mugrid.BINS)), np.zeros(len(wanted)), np.zeros(len(wanted))
+    belief, whole, most = (
+        np.zeros((len(wanted), mugrid.BINS)),
+        np.zeros(len(wanted)),
+        np.zeros(len(wanted)),
+    )
     np.add.at(belief, group, share[:, None] * fusion.beliefs(visited, now))
     np.add.at(whole, group, share)
     np.maximum.at(most, group, share)
@@ -77,6 +87,8 @@ def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArr
     for nearest, there in ((before, before >= 0), (behind, behind < len(route))):
         away = np.abs(nearest - place)
         take = np.flatnonzero(free & there & (away > 1) & (away <= REACH))
-        parts.append((route[take], slots[nearest[take]], (1.0 - PRIOR_SHARE) * KEPT ** (away[take] - 1.0)))
+        parts.append(
+            (route[take], slots[nearest[take]], (1.0 - PRIOR_SHARE) * KEPT ** (away[take] - 1.0))
+        )
     keys, visited, share = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return keys, visited, share

@@ -19,7 +19,11 @@ from schemas.regions import keys_along
 
 
 def answer(
-    cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+    cache: TileCache,
+    query: MapQuery,
+    wanted: Callable[[int], bool],
+    now: int,
+    only: int | None = None,
 ) -> Iterator[tuple[int, bytes]]:
     """Yield tile and payload of every reply, computed on demand.
 
@@ -52,7 +56,9 @@ class AnswerSize(NamedTuple):
     tiles: int
 
 
-def size_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
+def size_asked(
+    cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
+) -> AnswerSize:
     """Return the size of all tiles that an answer reads; arguments and errors as for `answer`."""
     route = keys_along(query.route) if query.route else None
     tiles = [tile for tile in _tiles(cache, query, route, only) if only is not None or wanted(tile)]
@@ -60,7 +66,9 @@ def size_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool],
         return AnswerSize(sum(cache.state.count(tile) for tile in tiles), len(tiles))
 
 
-def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None) -> list[int]:
+def _tiles(
+    cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None
+) -> list[int]:
     """Select the tiles that may contain something."""
     if route is not None:
         tiles = np.unique(grid.tile_of(route // grid.SECTORS))
@@ -74,7 +82,9 @@ def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int 
     return [int(tile) for tile in tiles]
 
 
-def _view_tile(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int) -> ShownTile:
+def _view_tile(
+    cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int
+) -> ShownTile:
     """View and impute the cells of one tile that may match; along a route in its order."""
     with cache.guard:
         fusion, slots = cache.state.fusion, cache.state.slots(tile)
@@ -99,17 +109,24 @@ def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     if query.bbox is not None and shown.payload:
         _, south, _, north = query.bbox
         run = slice(
-            int(columns["north"].searchsorted(south, "right")), int(columns["south"].searchsorted(north, "left"))
+            int(columns["north"].searchsorted(south, "right")),
+            int(columns["south"].searchsorted(north, "left")),
         )
-    if query.min_vehicles <= shown.least and (query.bbox is None or grid.touches(query.bbox, shown.common)):
+    if query.min_vehicles <= shown.least and (
+        query.bbox is None or grid.touches(query.bbox, shown.common)
+    ):
         return run
     keep = columns["vehicles"] >= query.min_vehicles
     if query.bbox is not None:
-        keep &= grid.touches(query.bbox, (columns["west"], columns["south"], columns["east"], columns["north"]))
+        keep &= grid.touches(
+            query.bbox, (columns["west"], columns["south"], columns["east"], columns["north"])
+        )
     return np.asarray(keep)
 
 
-def _encode_tile(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int) -> bytes | None:
+def _encode_tile(
+    shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int
+) -> bytes | None:
     """Encode the selected cells of a tile; None if there are none."""
     if isinstance(rows, slice):
         count = max(rows.stop - rows.start, 0)

@@ -38,9 +38,13 @@ TILE_COST: Final = 750  # cells: half a millisecond, that a tile takes however f
 LIGHT: Final = 30_000  # 20 ms of an Arrow answer
 MOST: Final = 10_000_000  # ten million cells of Arrow, 700 MB; half a million as text, 250 MB
 PER_S: Final = 1_500_000  # cost that is answered in a second
-LIGHT_PER_S: Final = PER_S / 2  # ... by Zenoh's thread, which answers one light question after the other
+LIGHT_PER_S: Final = (
+    PER_S / 2
+)  # ... by Zenoh's thread, which answers one light question after the other
 WAITING: Final = 64  # questions; more are told to come again
-REST: Final = 1.0  # after a tile of a heavy answer, by the time it took: light ones find the interpreter free
+REST: Final = (
+    1.0  # after a tile of a heavy answer, by the time it took: light ones find the interpreter free
+)
 LONGEST_REST_S: Final = 0.05
 
 
@@ -126,12 +130,18 @@ class MapQueryable:
         self._counts["queries"] += 1
         try:
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
-            wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})  # Zenoh's own
+            wanted = query.parse(
+                {name: value for name, value in pairs if not name.startswith("_")}
+            )  # Zenoh's own
             if wanted.at is None:
                 asked = self._answering.size(wanted, *_wanted(request))
                 cost = asked.cells * COST[wanted.format]
                 if cost > MOST:
-                    fix = "narrow bbox, or take format=arrow" if COST[wanted.format] > 1 else "narrow bbox"
+                    fix = (
+                        "narrow bbox, or take format=arrow"
+                        if COST[wanted.format] > 1
+                        else "narrow bbox"
+                    )
                     raise InputError("bbox", "the answer would be too large", fix)
                 cost += asked.tiles * TILE_COST
         except InputError as error:
@@ -146,27 +156,36 @@ class MapQueryable:
 
     def _ask_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
         if self._past.acquire(blocking=False):
-            threading.Thread(target=self._answer_past, args=(request, wanted), name="past", daemon=True).start()
+            threading.Thread(
+                target=self._answer_past, args=(request, wanted), name="past", daemon=True
+            ).start()
         else:
-            self._refuse(request, InputError("at", "another past is being rebuilt", "ask again later"))
+            self._refuse(
+                request, InputError("at", "another past is being rebuilt", "ask again later")
+            )
 
     def _queue(self, request: zenoh.Query, wanted: MapQuery, cost: float) -> None:
         self._counts["heavy_queries"] += 1
         with self._some:
             rank = time.monotonic() + cost / PER_S
-            heapq.heappush(self._heavy, _QueuedQuery(rank, self._counts["heavy_queries"], request, wanted))
+            heapq.heappush(
+                self._heavy, _QueuedQuery(rank, self._counts["heavy_queries"], request, wanted)
+            )
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
                 self._heavy.remove(dropped)
                 heapq.heapify(self._heavy)
             self._some.notify()
             if self._worker is None or not self._worker.is_alive():
-                self._worker = threading.Thread(target=self._work, name="heavy answers", daemon=True)
+                self._worker = threading.Thread(
+                    target=self._work, name="heavy answers", daemon=True
+                )
                 self._worker.start()
         if dropped is not None:
             self._counts["refused_queries"] += 1
             self._refuse(
-                dropped.request, InputError("query", "too many ask for as much", "ask again later, or for less")
+                dropped.request,
+                InputError("query", "too many ask for as much", "ask again later, or for less"),
             )
 
     def _work(self) -> None:
@@ -216,19 +235,24 @@ class MapQueryable:
             self._refuse(request, error)
         except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
             answered.whole = True
-        except Exception as error:  # whatever it is: a query that ends without a reply says that there is no data
+        except (
+            Exception
+        ) as error:  # whatever it is: a query that ends without a reply says that there is no data
             answered.whole = True
             self._counts["answer_failures"] += 1
             log.exception("a query could not be answered")
             with suppress(zenoh.ZError):
                 request.reply_err(
-                    f"query: could not be answered ({type(error).__name__}); ask again later", encoding=TEXT
+                    f"query: could not be answered ({type(error).__name__}); ask again later",
+                    encoding=TEXT,
                 )
         if answered.whole:
             request.drop()
 
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
-        field = error.field if error.field in MapQuery.model_fields else "query"  # else the asker's own word
+        field = (
+            error.field if error.field in MapQuery.model_fields else "query"
+        )  # else the asker's own word
         self._counts[f"bad_queries.{field}"] += 1
         with request:
             request.reply_err(str(error), encoding=TEXT)
@@ -239,7 +263,9 @@ def _wanted(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
     it."""
     expression = request.key_expr
     only = _tile(str(expression))
-    return (lambda tile: tile == only or expression.intersects(zenoh.KeyExpr(keys.map_key(tile)))), only
+    return (
+        lambda tile: tile == only or expression.intersects(zenoh.KeyExpr(keys.map_key(tile)))
+    ), only
 
 
 @lru_cache(1 << 12)

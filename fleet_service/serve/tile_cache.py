@@ -25,7 +25,13 @@ from schemas.thresholds import NS
 
 SHOWN_NS: Final = NS  # as old as a tile that is put once a second may be
 KEPT_BYTES: Final = 32 << 20
-SELECTED_BY: Final = ("vehicles", "west", "south", "east", "north")  # columns by which a query selects cells
+SELECTED_BY: Final = (
+    "vehicles",
+    "west",
+    "south",
+    "east",
+    "north",
+)  # columns by which a query selects cells
 
 NOTHING: Final = (math.inf, math.inf, -math.inf, -math.inf)  # an area that no box touches
 
@@ -64,7 +70,11 @@ class TileCache:
     """
 
     def __init__(
-        self, state: MapState, guard: AbstractContextManager[Any], least: int, visitors: Visitors | None = None
+        self,
+        state: MapState,
+        guard: AbstractContextManager[Any],
+        least: int,
+        visitors: Visitors | None = None,
     ) -> None:
         self.state, self.guard, self._least, self._visitors = state, guard, least, visitors
         self._kept: dict[int, ShownTile] = {}
@@ -103,7 +113,11 @@ class TileCache:
     def public(self, slots: IntArray, now: int) -> IntArray:
         """Return the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
-        return slots if self._visitors is None else slots[self._visitors.count(slots, now) >= self._least]
+        return (
+            slots
+            if self._visitors is None
+            else slots[self._visitors.count(slots, now) >= self._least]
+        )
 
     def _from_south(self, slots: IntArray) -> IntArray:
         _, row = grid.deinterleave(self.state.fusion.live.key[slots] // grid.SECTORS)

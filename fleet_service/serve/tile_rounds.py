@@ -12,7 +12,9 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
-SHARE_S: Final = 0.02  # of a turn of the worker; with what comes in meanwhile, a segment is late by as much
+SHARE_S: Final = (
+    0.02  # of a turn of the worker; with what comes in meanwhile, a segment is late by as much
+)
 
 
 class TileRounds:
@@ -34,7 +36,13 @@ class TileRounds:
         counts: Counter[str],
         clock: Callable[[], float],
     ) -> None:
-        self._every_s, self._changed, self._put, self._counts, self._clock = every_s, changed, put, counts, clock
+        self._every_s, self._changed, self._put, self._counts, self._clock = (
+            every_s,
+            changed,
+            put,
+            counts,
+            clock,
+        )
         self._due, self._left = clock() + every_s, deque[int]()
 
     @property

@@ -64,7 +64,10 @@ def coarsen(cells: CellView) -> CellView:
     steps = COUNT_STEPS
     counts = [
         steps[np.maximum(np.searchsorted(steps, column, "right") - 1, 0)]
-        for column in (np.asarray(cells.vehicles, np.int64), np.asarray(cells.observations, np.int64))
+        for column in (
+            np.asarray(cells.vehicles, np.int64),
+            np.asarray(cells.observations, np.int64),
+        )
     ]
     first, last = (time // TIME_STEP_NS * TIME_STEP_NS for time in (cells.first, cells.last))
     return cells._replace(vehicles=counts[0], observations=counts[1], first=first, last=last)
@@ -75,7 +78,9 @@ def joined(*views: CellView) -> CellView:
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 
-def is_measured(lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray) -> BoolArray:
+def is_measured(
+    lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray
+) -> BoolArray:
     """Return True for beliefs that say more than a lower bound, (k,).
 
     A belief that calls the road slippery always does, wherever it came from: values of the other headings lower it

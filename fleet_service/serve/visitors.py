@@ -15,9 +15,13 @@ from fleet_service.fusion import Fusion, Observations
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
-PART_NS: Final = 12 * 3600 * NS  # the window is the part of a day that runs, and the one before: 12 to 24 hours
+PART_NS: Final = (
+    12 * 3600 * NS
+)  # the window is the part of a day that runs, and the one before: 12 to 24 hours
 PARTS: Final = 2
-_FIBONACCI: Final = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+_FIBONACCI: Final = np.uint64(
+    0x9E3779B97F4A7C15
+)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 _SHIFT: Final = np.uint64(58)
 
 
@@ -62,7 +66,10 @@ class Visitors:
     def columns(self) -> dict[str, IntArray]:
         """Return the columns from which `of` restores this object."""
         self._grow()
-        return {"bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64), "part": np.array([self._part])}
+        return {
+            "bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64),
+            "part": np.array([self._part]),
+        }
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:

@@ -43,16 +43,26 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
     """
     with query:
         to = str(query.parameters).removeprefix("to=")
-        waiting = {token.region for token in tokens.active_tokens(session, keys.WAITS) if token.service == to}
+        waiting = {
+            token.region
+            for token in tokens.active_tokens(session, keys.WAITS)
+            if token.service == to
+        }
         if re.fullmatch(NAME_PATTERN, to) is None or waiting != set(served):
-            other = f"stands by for {', '.join(sorted(waiting))}" if waiting else f"no {to[:63]!r} stands by"
+            other = (
+                f"stands by for {', '.join(sorted(waiting))}"
+                if waiting
+                else f"no {to[:63]!r} stands by"
+            )
             query.reply_err(f"to: {other}, not for {', '.join(served)}; {FIX}".encode())
             return None
         query.reply(query.key_expr, ",".join(served).encode())
         return to
 
 
-def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> HandoverResult | None:
+def hand_over(
+    session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
+) -> HandoverResult | None:
     """Make a region's service hand over; None if the target serves the region already.
 
     Args:
@@ -75,13 +85,19 @@ def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str],
         while (now := _server(there, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
-                raise InputError("to", f"{to} does not serve {region}, but {now or 'nobody'} does", "see their logs")
+                raise InputError(
+                    "to",
+                    f"{to} does not serve {region}, but {now or 'nobody'} does",
+                    "see their logs",
+                )
             time.sleep(LOOK_S)
         return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
 def _server(there: tokens.PresenceTracker, region: str) -> str | None:
-    return next((token.service for token in there.active if regions.covers(token.region, region)), None)
+    return next(
+        (token.service for token in there.active if regions.covers(token.region, region)), None
+    )
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:

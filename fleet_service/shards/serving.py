@@ -16,14 +16,20 @@ from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import tokens, zenoh_session
 
-GONE_S: Final = 5.0  # in which the token of a service that froze or lost its host falls: its lease is 3 s
+GONE_S: Final = (
+    5.0  # in which the token of a service that froze or lost its host falls: its lease is 3 s
+)
 LOOK_S: Final = 0.1
 _TRIES: Final = 5  # of services that start at the same moment
 
 
 @contextmanager
 def claim_regions(
-    session: zenoh.Session, name: str, regions: Sequence[str], stop: threading.Event, former: Collection[str] = ()
+    session: zenoh.Session,
+    name: str,
+    regions: Sequence[str],
+    stop: threading.Event,
+    former: Collection[str] = (),
 ) -> Iterator[frozenset[ServiceToken]]:
     """Claim regions exclusively until the block ends.
 
@@ -60,7 +66,9 @@ def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 
 
 @contextmanager
-def watch_successors(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[Callable[[], bool]]:
+def watch_successors(
+    session: zenoh.Session, mine: frozenset[ServiceToken]
+) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True if another service took these regions since the block began. A service that is
     cut off from its bucket learns so that it was replaced, and stops serving outdated data."""
     with tokens.track_tokens(session) as there:
@@ -80,7 +88,9 @@ def _claimed(
     session: zenoh.Session, mine: frozenset[ServiceToken], stop: threading.Event, former: Collection[str]
 ) -> list[zenoh.LivelinessToken]:  # fmt: skip
     def others_there() -> list[ServiceToken]:
-        return rival_tokens(mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former)
+        return rival_tokens(
+            mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former
+        )
 
     for _ in range(_TRIES):
         waited = 0.0
@@ -97,10 +107,14 @@ def _claimed(
         for token in held:  # both began at once: the one that comes back first has it
             token.undeclare()
         stop.wait(secrets.randbelow(1000) * 1e-3)
-    raise InputError("regions", "others start for them at the same time", "start one service for each region")
+    raise InputError(
+        "regions", "others start for them at the same time", "start one service for each region"
+    )
 
 
-def _declared(session: zenoh.Session, mine: frozenset[ServiceToken], root: str) -> list[zenoh.LivelinessToken]:
+def _declared(
+    session: zenoh.Session, mine: frozenset[ServiceToken], root: str
+) -> list[zenoh.LivelinessToken]:
     return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(mine)]
 
 
@@ -110,12 +124,20 @@ def standby_signs(
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
     """Yield the signs of a standby: whether it reaches a router, whether a service's token is active, and `alive`. None
     if it is no standby or was stopped before it reached a router."""
-    session = zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
+    session = (
+        zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
+    )
     if session is None:
         yield None
         return
-    waits = frozenset(ServiceToken(region, config.name, secrets.token_hex(4)) for region in config.regions)
-    with session, tokens.track_tokens(session) as there, _standing(_declared(session, waits, WAITS)):
+    waits = frozenset(
+        ServiceToken(region, config.name, secrets.token_hex(4)) for region in config.regions
+    )
+    with (
+        session,
+        tokens.track_tokens(session) as there,
+        _standing(_declared(session, waits, WAITS)),
+    ):
         yield (
             lambda: bool(list(session.info.routers_zid())),
             lambda name: any(one.service == name for one in there.active),

@@ -19,14 +19,25 @@ from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, ScannedFields, gather, walk
 from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
-from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, PresentColumns, complete, message_of
+from schemas.wire.batches import (
+    ABSENT,
+    LIKELIHOOD,
+    Decoded,
+    Heads,
+    PresentColumns,
+    complete,
+    message_of,
+)
 
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     """Read batches of one kind from payloads and their encodings."""
     errors: list[tuple[int, WireError]] = []
     usual = {ENCODING[kind], *PLAIN}
-    plain = [payload if encoding in usual and len(payload) <= MAX_BYTES else b"" for payload, encoding in payloads]
+    plain = [
+        payload if encoding in usual and len(payload) <= MAX_BYTES else b""
+        for payload, encoding in payloads
+    ]
     data, walked = _walked(kind, plain, True)
     indices = list(range(len(plain)))
     if not walked.understood.all():
@@ -43,9 +54,13 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     return complete(Decoded(indices, fields.heads(), *fields.columns(), errors), fields.sent())
 
 
-def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], ScannedFields]:
+def _walked(
+    kind: Kind, messages: list[bytes], strict: bool
+) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
-    return data, walk(kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict)
+    return data, walk(
+        kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict
+    )
 
 
 def _reencode(kind: Kind, payload: bytes, encoding: str) -> bytes:
@@ -76,7 +91,9 @@ class _Fields(NamedTuple):
         """Return which messages contain which column."""
         given = self.walked.counts > 0
         return PresentColumns(
-            self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))}
+            self.kind,
+            self.sizes,
+            {name: given[:, at] for at, name in enumerate(column_types(self.kind))},
         )
 
     def heads(self) -> Heads:
@@ -84,11 +101,14 @@ class _Fields(NamedTuple):
         data = self.data.tobytes()
         texts = {
             name: [
-                str(data[begin:end], "utf-8") for begin, end in zip(*self.walked.texts[:, at].T.tolist(), strict=True)
+                str(data[begin:end], "utf-8")
+                for begin, end in zip(*self.walked.texts[:, at].T.tolist(), strict=True)
             ]
             for at, name in enumerate(TEXTS)
         }
-        boot, region, seq, first_held = (self.walked.numbers[:, at].copy() for at in range(len(NUMBERS)))
+        boot, region, seq, first_held = (
+            self.walked.numbers[:, at].copy() for at in range(len(NUMBERS))
+        )
         first_held[first_held == 0] = 1
         return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 

@@ -41,7 +41,9 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"error: {message}; see {self.prog} --help\n")
 
 
-def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen: str | None) -> argparse.ArgumentParser:
+def parser_of(
+    prog: str, description: str, commands: Iterable[Command], *chosen: str | None
+) -> argparse.ArgumentParser:
     """Return a parser with all commands by name and the options of the chosen ones; other modules are not imported."""
     parser = OneLineParser(prog=prog, description=description)
     parser.add_argument("--version", action=VersionAction)
@@ -87,7 +89,13 @@ class VersionAction(argparse.Action):
     """`--version`: print the version of the installed distribution."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: object) -> None:
-        super().__init__(option_strings, dest, nargs=0, help="show the version and leave", default=argparse.SUPPRESS)
+        super().__init__(
+            option_strings,
+            dest,
+            nargs=0,
+            help="show the version and leave",
+            default=argparse.SUPPRESS,
+        )
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         """Print the version and exit."""
@@ -134,7 +142,9 @@ def out_folder(field: str, path: Path) -> Path:
         raise InputError(field, f"{path} is a folder", "name a file")
     if not path.absolute().parent.is_dir():
         raise InputError(
-            field, f"cannot write {path} (No such file or directory)", "name a file in a folder that is there"
+            field,
+            f"cannot write {path} (No such file or directory)",
+            "name a file in a folder that is there",
         )
     return path
 
@@ -149,7 +159,9 @@ def report_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
+        raise InputError(
+            "out", f"cannot write {path} ({error.strerror})", "name a file you may write"
+        ) from error
 
 
 def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
@@ -160,7 +172,9 @@ def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
     """
     fits = [one for one in known if path.name.endswith(one)]
     if not fits:
-        raise InputError(field, f"{path.name} has no known ending", f"use one of {', '.join(known)}")
+        raise InputError(
+            field, f"{path.name} has no known ending", f"use one of {', '.join(known)}"
+        )
     return max(fits, key=len)
 
 

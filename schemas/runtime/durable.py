@@ -21,7 +21,9 @@ def draft_of(path: Path) -> Path:
 
 
 @contextmanager
-def open_durably(path: Path, mode: int | None = None, *, named: bool = True) -> Iterator[BufferedWriter]:
+def open_durably(
+    path: Path, mode: int | None = None, *, named: bool = True
+) -> Iterator[BufferedWriter]:
     """Open a file that appears under its name, complete and durable, when the block ends. If the block fails, nothing
     changes.
 

@@ -63,7 +63,9 @@ def commit(source: Path) -> str:
     git = ["git", "-C", str(source.parent)]
     describe = [*git, "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty"]
     try:
-        subprocess.run([*git, "ls-files", "--error-unmatch", source.name], capture_output=True, check=True)
+        subprocess.run(
+            [*git, "ls-files", "--error-unmatch", source.name], capture_output=True, check=True
+        )
         return subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
@@ -92,5 +94,7 @@ def row(figure: Figure) -> list[str]:
     value = f"{figure.value:.4g} {figure.unit}"
     if bar is None:
         return [figure.name, value, "", ""]
-    text = f"{bar[0]:g} – {bar[1]:g}" if isinstance(bar, tuple) else f"{signs[figure.better]}{bar:g}"
+    text = (
+        f"{bar[0]:g} – {bar[1]:g}" if isinstance(bar, tuple) else f"{signs[figure.better]}{bar:g}"
+    )
     return [figure.name, value, text, "holds" if figure.holds else "DOES NOT HOLD"]

@@ -19,7 +19,9 @@ def install_command(extra: str) -> str:
     address = str(origin.get("url", ""))
     if "dir_info" in origin:
         editable = "--editable " if origin["dir_info"].get("editable") else ""
-        return f"pip install {editable}{shlex.quote(address.removeprefix('file://') + f'[{extra}]')}"
+        return (
+            f"pip install {editable}{shlex.quote(address.removeprefix('file://') + f'[{extra}]')}"
+        )
     if address:
         return f"pip install {shlex.quote(f'{NAME}[{extra}] @ {address}')}"
     return f"pip install {shlex.quote(f'.[{extra}]')} in a checkout, or the wheel with [{extra}]"

@@ -84,10 +84,14 @@ def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: AN
         data = target.make_array(kind)(target, builder, values[0])
         place = [values[1], *[long(0)] * (kind.ndim - 1)]
         begin = builder.ptrtoint(cgutils.get_item_pointer(target, builder, kind, data, place), long)  # type: ignore[no-untyped-call]
-        address = builder.inttoptr(builder.add(begin, builder.mul(values[2], long(LINE))), cgutils.voidptr_t)
+        address = builder.inttoptr(
+            builder.add(begin, builder.mul(values[2], long(LINE))), cgutils.voidptr_t
+        )
         hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
         function = cgutils.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")  # type: ignore[no-untyped-call]
-        builder.call(function, [address, whole(0), whole(3), whole(1)])  # to read, into every cache, data
+        builder.call(
+            function, [address, whole(0), whole(3), whole(1)]
+        )  # to read, into every cache, data
         return target.get_dummy_value()
 
     return types.void(array, types.int64, types.int64), generate
@@ -129,7 +133,9 @@ class _Cache(FunctionCache):
         if cells is None:
             return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
         held = (cell.cell_contents for cell in cells)
-        names = tuple(f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held)
+        names = tuple(
+            f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held
+        )
         return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
     def save_overload(self, sig: object, data: object) -> None:
@@ -164,7 +170,11 @@ def cache_root() -> Path | None:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             own = folder.stat()
             # what lies there is executed: nobody else may be able to put it there
-            if os.access(folder, os.W_OK | os.X_OK) and own.st_uid == os.getuid() and not own.st_mode & 0o002:
+            if (
+                os.access(folder, os.W_OK | os.X_OK)
+                and own.st_uid == os.getuid()
+                and not own.st_mode & 0o002
+            ):
                 return folder
     return None
 

@@ -16,7 +16,11 @@ import zenoh
 
 from schemas.runtime.metrics import Metric
 
-PROTOCOLS: Final = ("quic", "tls", "tcp")  # shown even where nothing uses them, so that an alarm can name them
+PROTOCOLS: Final = (
+    "quic",
+    "tls",
+    "tcp",
+)  # shown even where nothing uses them, so that an alarm can name them
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +38,9 @@ class LinkWatch:
         on_change: called after each change, on a thread of Zenoh.
     """
 
-    def __init__(self, session: zenoh.Session, name: str, on_change: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, session: zenoh.Session, name: str, on_change: Callable[[], None] = lambda: None
+    ) -> None:
         self._name, self._on_change = name, on_change
         self._lock = threading.Lock()
         self._routers = set[str]()
@@ -74,7 +80,9 @@ class LinkWatch:
             log.warning("%s lost the router at %s (%s)", self._name, address, protocol)
         else:
             level = logging.WARNING if self.lost else logging.INFO
-            log.log(level, "%s is connected to the router at %s over %s", self._name, address, protocol)
+            log.log(
+                level, "%s is connected to the router at %s over %s", self._name, address, protocol
+            )
 
     def _record_transport(self, event: zenoh.TransportEvent) -> None:
         transport = event.transport
@@ -96,8 +104,18 @@ def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
     found = Counter(protocol for watch in watches for protocol in watch.protocols)
     return [
         Metric("links", "gauge", "links to routers, by transport", _by_protocol(found), "protocol"),
-        Metric("links_opened", "counter", "connections to a router", {"": sum(watch.epoch for watch in watches)}),
-        Metric("links_lost", "counter", "losses of a router", {"": sum(watch.lost for watch in watches)}),
+        Metric(
+            "links_opened",
+            "counter",
+            "connections to a router",
+            {"": sum(watch.epoch for watch in watches)},
+        ),
+        Metric(
+            "links_lost",
+            "counter",
+            "losses of a router",
+            {"": sum(watch.lost for watch in watches)},
+        ),
     ]
 
 
@@ -107,10 +125,14 @@ def _by_protocol(found: Mapping[str, int]) -> dict[str, float]:
 
 def router_metrics(session: zenoh.Session) -> list[Metric]:
     """Return the sessions and links of a router as metrics, read from the router itself."""
-    kinds = Counter(str(transport.whatami).rpartition(".")[2].lower() for transport in session.info.transports())
+    kinds = Counter(
+        str(transport.whatami).rpartition(".")[2].lower() for transport in session.info.transports()
+    )
     protocols = Counter(link.dst.partition("/")[0] for link in session.info.links())
     sessions = {kind: float(kinds.get(kind, 0)) for kind in ("client", "router", "peer")}
     return [
         Metric("router_sessions", "gauge", "open sessions, by kind of partner", sessions, "kind"),
-        Metric("router_links", "gauge", "open links, by transport", _by_protocol(protocols), "protocol"),
+        Metric(
+            "router_links", "gauge", "open links, by transport", _by_protocol(protocols), "protocol"
+        ),
     ]

@@ -42,7 +42,9 @@ Troubles = Callable[[], Sequence[str]]
 
 
 @contextmanager
-def serve_metrics(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
+def serve_metrics(
+    host: str, port: int | None, read: Read, troubles: Troubles
+) -> Iterator[str | None]:
     """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a free port.
 
     Args:
@@ -57,7 +59,9 @@ def serve_metrics(host: str, port: int | None, read: Read, troubles: Troubles) -
         yield None
         return
     handler = type(
-        "Handler", (_Handler,), {"exposition": staticmethod(_exposition(read)), "troubles": staticmethod(troubles)}
+        "Handler",
+        (_Handler,),
+        {"exposition": staticmethod(_exposition(read)), "troubles": staticmethod(troubles)},
     )
     try:
         server = ThreadingHTTPServer((host, port), handler)
@@ -89,7 +93,9 @@ def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
         def collect(self) -> Iterator[CounterMetricFamily | GaugeMetricFamily]:
             for metric in read():
                 family = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
-                found = family(PREFIX + metric.name, metric.help, labels=[metric.label] if metric.label else [])
+                found = family(
+                    PREFIX + metric.name, metric.help, labels=[metric.label] if metric.label else []
+                )
                 for label, value in sorted(metric.values.items()):
                     found.add_metric([label] if metric.label else [], value)
                 yield found

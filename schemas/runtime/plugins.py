@@ -41,4 +41,6 @@ def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever sta
     except (ImportError, AttributeError) as error:
         field = group.rpartition(".")[2].removesuffix("s")
         where = entry_points_of(group)[name].value
-        raise InputError(field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it") from error
+        raise InputError(
+            field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it"
+        ) from error

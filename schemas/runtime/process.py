@@ -107,7 +107,9 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
     def as_json(line: str) -> None:
         event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
         values = line.values if isinstance(line, LogLine) else {}
-        print_line(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
+        print_line(
+            _record("info", **{"event": event, "message": str(line), **who, **values}), stream
+        )
 
     return text if form == "text" else as_json
 
@@ -115,7 +117,9 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
     """Send warnings of the program and its libraries to `stream` in this form."""
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(_Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(
+        _Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s")
+    )
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
 
 

@@ -106,13 +106,21 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
     return out
 
 
-def gather(data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]) -> None:
+def gather(
+    data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]
+) -> None:
     """Copy a column of all messages, one after the other, into an array (n, …) that is filled with the default
     value."""
     width, each = int(_layout(kind).widths[column]), int(_layout(kind).per_record[column])
     begins, counts = walked.begins[:, column], walked.counts[:, column]
     if width:
-        _copy(data, begins, counts * width, walked.sizes * (each * width), into.reshape(-1).view(np.uint8))
+        _copy(
+            data,
+            begins,
+            counts * width,
+            walked.sizes * (each * width),
+            into.reshape(-1).view(np.uint8),
+        )
     else:
         _unpack(data, begins, counts, walked.sizes, into)
 
@@ -143,7 +151,12 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
         while fine and at < end:
             tag, at = _varint(data, at, min(end, at + 2))
             number, wire = tag >> 3, tag & 7
-            fine = at >= 0 and 0 < number < _FIELDS and layout.roles[number] != _UNKNOWN and not (seen >> number) & 1
+            fine = (
+                at >= 0
+                and 0 < number < _FIELDS
+                and layout.roles[number] != _UNKNOWN
+                and not (seen >> number) & 1
+            )
             if fine:
                 seen |= 1 << number
                 at = _field(scan, k, at, end, layout.roles[number], wire)
@@ -152,7 +165,9 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
         fine = fine and 1 <= n <= MAX_ROWS
         for column in range(len(layout.widths)):
             count = out.counts[k, column]
-            fine = fine and (count == n * layout.per_record[column] or (count == 0 and not layout.needed[column]))
+            fine = fine and (
+                count == n * layout.per_record[column] or (count == 0 and not layout.needed[column])
+            )
         out.understood[k], out.sizes[k], at = fine, n, end
 
 
@@ -198,7 +213,9 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
 
 
 @refcount_free
-def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: IntArray, into: ByteArray) -> None:
+def _copy(
+    data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: IntArray, into: ByteArray
+) -> None:
     to = 0
     for k in range(len(begins)):
         sent, written = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
@@ -208,7 +225,9 @@ def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: Int
 
 
 @refcount_free
-def _unpack(data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray) -> None:
+def _unpack(
+    data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray
+) -> None:
     to = 0
     for k in range(len(begins)):
         at = begins[k]

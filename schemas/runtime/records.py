@@ -11,7 +11,16 @@ them. The data of one vehicle is contiguous, and sizes are constants, so short l
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, Any, Protocol, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +67,13 @@ def record_type(kind: type) -> np.dtype[np.void]:
     fields = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         held, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        fields.append((name, KINDS[held] if held in KINDS else record_type(held), tuple(int(size) for size in sizes)))
+        fields.append(
+            (
+                name,
+                KINDS[held] if held in KINDS else record_type(held),
+                tuple(int(size) for size in sizes),
+            )
+        )
     return np.dtype(fields, align=True)
 
 

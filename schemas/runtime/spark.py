@@ -40,7 +40,9 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
         from pyspark.sql import SparkSession
     except ImportError as error:
         raise InputError("engine", "Spark is not installed", install_command("spark")) from error
-    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # that of this environment, which has the package
+    os.environ.setdefault(
+        "PYSPARK_PYTHON", sys.executable
+    )  # that of this environment, which has the package
     builder = SparkSession.builder.appName("gripmap")
     for key, value in (*SETTINGS.items(), ("spark.ui.showConsoleProgress", str(progress).lower())):
         builder = builder.config(key, value)
@@ -52,7 +54,11 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
         ) from error
 
 
-def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcome]) -> list[_Outcome]:  # noqa: ANN401
+def spread(
+    session: Any,  # noqa: ANN401 pyspark is an extra
+    tasks: Sequence[_Task],
+    work: Callable[[_Task], _Outcome],
+) -> list[_Outcome]:
     """Run all tasks, each as one Spark task; return outcomes in the order of the tasks.
 
     A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt is ignored, so an
@@ -80,16 +86,22 @@ def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcom
                     outcome: object = work(task)
                 except InputError as error:
                     outcome = error
-                yield pa.record_batch([pa.array([pickle.dumps((number, outcome))], pa.binary())], schema=_TASK)
+                yield pa.record_batch(
+                    [pa.array([pickle.dumps((number, outcome))], pa.binary())], schema=_TASK
+                )
 
     packed = [pickle.dumps(numbered) for numbered in enumerate(tasks)]
     frame = session.createDataFrame(pa.table([pa.array(packed, pa.binary())], schema=_TASK))
-    each = frame.coalesce(1).repartition(len(tasks))  # out of one partition they go around: one in each
+    each = frame.coalesce(1).repartition(
+        len(tasks)
+    )  # out of one partition they go around: one in each
     try:
         answers: pa.Table = each.mapInArrow(done, from_arrow_schema(_TASK)).toArrow()
     except (PySparkException, Py4JError) as error:
         problem = str(error).strip().partition("\n")[0][:200]
-        raise InputError("engine", f"Spark gave up: {problem}", "its log says why; what is done is done") from error
+        raise InputError(
+            "engine", f"Spark gave up: {problem}", "its log says why; what is done is done"
+        ) from error
     outcomes = dict(_unpacked(answers["task"]))
     for outcome in outcomes.values():
         if isinstance(outcome, InputError):

@@ -76,11 +76,17 @@ def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
 
     def hear(sample: zenoh.Sample) -> None:
         with suppress(InputError):
-            tokens.record(parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT)
+            tokens.record(
+                parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT
+            )
 
     # at once, on the thread that receives: what fell is known before the answer to any later question is
-    subscriber = session.liveliness().declare_subscriber(_ALL, zenoh.handlers.Callback(hear, indirect=False))
-    for token in active_tokens(session):  # a get ends when all were told, which a subscription's history does not
+    subscriber = session.liveliness().declare_subscriber(
+        _ALL, zenoh.handlers.Callback(hear, indirect=False)
+    )
+    for token in active_tokens(
+        session
+    ):  # a get ends when all were told, which a subscription's history does not
         if token not in tokens.lost:
             tokens.record(token, stands=True)
     try:

@@ -50,5 +50,10 @@ def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
 def _tell() -> None:
     address = os.environ.get(_ADDRESS)
     if address:
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-            sender.sendto(b"READY=1\nWATCHDOG=1", f"\0{address[1:]}" if address.startswith("@") else address)
+        with (
+            suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender,
+        ):
+            sender.sendto(
+                b"READY=1\nWATCHDOG=1", f"\0{address[1:]}" if address.startswith("@") else address
+            )

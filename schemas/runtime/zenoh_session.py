@@ -56,7 +56,9 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
     """
     if len(settings.connect) > 1 and settings.config.get(_TIMEOUT, 0) != 0:
         problem = "with a limit Zenoh tries the first endpoint only"
-        raise InputError(f"zenoh.config.{_TIMEOUT}", problem, "leave it out; open_session waits for a router")
+        raise InputError(
+            f"zenoh.config.{_TIMEOUT}", problem, "leave it out; open_session waits for a router"
+        )
     config = zenoh.Config()
     chosen = {**CLIENT, ENDPOINTS: settings.connect, **settings.config}
     for key, value in chosen.items():
@@ -66,10 +68,18 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
         except zenoh.ZError as error:
             problem = f"Zenoh refuses {text[:60]}"
             if key == ENDPOINTS:
-                raise InputError("connect", f"{', '.join(settings.connect)[:60]} is no endpoint", _FIX) from error
-            raise InputError(f"zenoh.config.{key}", problem, "see Zenoh's configuration reference") from error
+                raise InputError(
+                    "connect", f"{', '.join(settings.connect)[:60]} is no endpoint", _FIX
+                ) from error
+            raise InputError(
+                f"zenoh.config.{key}", problem, "see Zenoh's configuration reference"
+            ) from error
     for key, value in json.loads(config.get_json(_TLS)).items():
-        if key.endswith(("certificate", "private_key")) and value is not None and not Path(value).is_file():
+        if (
+            key.endswith(("certificate", "private_key"))
+            and value is not None
+            and not Path(value).is_file()
+        ):
             fix = "make it with `fleet-service certs`, or correct the path"
             raise InputError(f"zenoh.config.{_TLS}/{key}", f"there is no file {value}", fix)
     return config
@@ -82,7 +92,9 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
     return {"priority": priority, "congestion_control": congestion, "express": topic.express}
 
 
-def open_session(settings: ZenohSettings, stop: threading.Event | None = None, name: str = "") -> zenoh.Session | None:
+def open_session(
+    settings: ZenohSettings, stop: threading.Event | None = None, name: str = ""
+) -> zenoh.Session | None:
     """Open a session; wait for the router until one answers or `stop` is set (then return None).
 
     A session that lost its router reconnects by itself. The reason for waiting is logged once. Where nothing answers in
@@ -95,7 +107,9 @@ def open_session(settings: ZenohSettings, stop: threading.Event | None = None, n
         try:
             return zenoh.open(configuration(patient, name))
         except zenoh.ZError as error:
-            reason = str(error).partition(" at /")[0].strip()  # where Zenoh was built is nobody's business
+            reason = (
+                str(error).partition(" at /")[0].strip()
+            )  # where Zenoh was built is nobody's business
             if reason not in logged:
                 logged.add(reason)
                 log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)

@@ -81,9 +81,13 @@ class Outlook(NamedTuple):
 
 def encode_ahead(outlook: Outlook) -> bytes:
     """Protobuf bytes of what lies ahead."""
-    columns: dict[str, Any] = {name: column.tolist() for name, column in outlook.runs._asdict().items()}
+    columns: dict[str, Any] = {
+        name: column.tolist() for name, column in outlook.runs._asdict().items()
+    }
     here: dict[str, Any] = dict(zip(_HERE, outlook.here, strict=True))
-    message = pb.Ahead(vehicle=outlook.vehicle, time=outlook.time, way=outlook.way, **here, **columns)
+    message = pb.Ahead(
+        vehicle=outlook.vehicle, time=outlook.time, way=outlook.way, **here, **columns
+    )
     message.warnings.extend(pb.Warning(**vars(warning)) for warning in outlook.warnings)
     return message.SerializeToString()
 
@@ -97,7 +101,8 @@ def decode_ahead(payload: bytes) -> Outlook:
     message = parse(payload, AHEAD_ENCODING, pb.Ahead, AHEAD_ENCODING)
     whole = ("cell", "sector", "basis")
     runs = Runs._make(
-        np.array(getattr(message, name), np.int64 if name in whole else np.float64) for name in Runs._fields
+        np.array(getattr(message, name), np.int64 if name in whole else np.float64)
+        for name in Runs._fields
     )
     if len({len(column) for column in runs}) > 1:
         raise WireError("ahead", "has columns of different lengths", "send all of a run")

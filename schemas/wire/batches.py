@@ -16,7 +16,17 @@ from schemas import grid, mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
 from schemas.signals import FLAGS
-from schemas.wire.codec import ENCODING, MAX_ROWS, MESSAGES, NEEDED, Batch, Columns, Kind, column_types, parse
+from schemas.wire.codec import (
+    ENCODING,
+    MAX_ROWS,
+    MESSAGES,
+    NEEDED,
+    Batch,
+    Columns,
+    Kind,
+    column_types,
+    parse,
+)
 
 ABSENT: Final = dict.fromkeys(FLAGS, -1)  # what an absent integer reads as, where it is not 0
 LIKELIHOOD: Final = "log_likelihood"
@@ -130,10 +140,19 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     given = {name: np.array([len(getattr(message, name)) > 0]) for name in column_types(kind)}
     sent = PresentColumns(kind, np.array([n]), given)
     columns = {name: _column(message, name, dtype, n) for name, dtype in column_types(kind).items()}
-    numbers = (np.array([getattr(message, name)], np.int64) for name in ("boot", "region", "seq", "first_held"))
+    numbers = (
+        np.array([getattr(message, name)], np.int64)
+        for name in ("boot", "region", "seq", "first_held")
+    )
     boot, region, seq, first_held = numbers
     heads = Heads(
-        kind, [message.vehicle], boot, region, seq, np.where(first_held == 0, 1, first_held), [message.estimator]
+        kind,
+        [message.vehicle],
+        boot,
+        region,
+        seq,
+        np.where(first_held == 0, 1, first_held),
+        [message.estimator],
     )
     likelihood = sent.records(LIKELIHOOD) if kind is Kind.OBSERVATION else np.zeros(n, bool)
     found = complete(Decoded([0], heads, sent.sizes, columns, likelihood, []), sent)
@@ -168,9 +187,13 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
         given = len(getattr(message, name))
         if name == LIKELIHOOD:
             if given not in (0, n * mugrid.BINS):
-                raise WireError(name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none")
+                raise WireError(
+                    name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none"
+                )
         elif given != n and (given or name in NEEDED[kind]):
-            raise WireError(name, f"has {given} records, {first} has {n}", "give every column the same length")
+            raise WireError(
+                name, f"has {given} records, {first} has {n}", "give every column the same length"
+            )
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
@@ -187,7 +210,10 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
         if dtype.kind == "i" and dtype.itemsize < 8:
             limits = np.iinfo(dtype)
             outside = (columns[name] < limits.min) | (columns[name] > limits.max)
-            refuse(outside, WireError(name, f"does not fit {dtype}", "use the values that the .proto names"))
+            refuse(
+                outside,
+                WireError(name, f"does not fit {dtype}", "use the values that the .proto names"),
+            )
             columns[name] = np.where(outside, 0, columns[name]).astype(dtype)
     placed = sent.records("cell") if kind is Kind.OBSERVATION else np.zeros(len(owner), bool)
     region_missing = np.repeat(found.heads.region == 0, found.sizes)
@@ -235,7 +261,9 @@ def _with_regions(found: Decoded, columns: Columns) -> Heads:
     if "cell" in columns:
         cell = columns["cell"][rows]
     else:
-        cell = grid.cell_of(*(np.nan_to_num(columns[name][rows]) for name in ("latitude", "longitude")))
+        cell = grid.cell_of(
+            *(np.nan_to_num(columns[name][rows]) for name in ("latitude", "longitude"))
+        )
     region = heads.region.copy()
     region[region_missing] = grid.region_of(cell)
     return heads._replace(region=region)

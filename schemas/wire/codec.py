@@ -22,12 +22,20 @@ from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
 JSON: Final = "application/json"
-PLAIN: Final = ("application/protobuf", "zenoh/bytes", "")  # protobuf of which the key says what it is
+PLAIN: Final = (
+    "application/protobuf",
+    "zenoh/bytes",
+    "",
+)  # protobuf of which the key says what it is
 ARROW: Final = "application/vnd.apache.arrow.stream"
 GEOJSON: Final = "application/geo+json"
 MAX_ROWS: Final = 50
-MAX_STANDING_BYTES: Final = 8 << 20  # every cell and sector of a z14 tile under an alert: 65 536 of them
-MESSAGES_PER_S: Final = 100.0  # of one kind from one session over QUIC; a router drops what follows sooner
+MAX_STANDING_BYTES: Final = (
+    8 << 20
+)  # every cell and sector of a z14 tile under an alert: 65 536 of them
+MESSAGES_PER_S: Final = (
+    100.0  # of one kind from one session over QUIC; a router drops what follows sooner
+)
 MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JSON
 
 
@@ -37,12 +45,17 @@ class Kind(StrEnum):
     OBSERVATION = "obs"
     STATE = "state"
 
-    __hash__ = str.__hash__  # the enumeration's own is Python, and a kind is part of every stream's name
+    __hash__ = (
+        str.__hash__
+    )  # the enumeration's own is Python, and a kind is part of every stream's name
 
 
 Columns = dict[str, NDArray[Any]]
 
-MESSAGES: Final[dict[Kind, type[Any]]] = {Kind.OBSERVATION: pb.ObservationBatch, Kind.STATE: pb.StateBatch}
+MESSAGES: Final[dict[Kind, type[Any]]] = {
+    Kind.OBSERVATION: pb.ObservationBatch,
+    Kind.STATE: pb.StateBatch,
+}
 NEEDED: Final = {  # columns without which a batch is none; the first one's length is the number of records
     Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
     Kind.STATE: ("time", "latitude", "longitude"),
@@ -68,7 +81,9 @@ WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
     """Name and numpy type of every column of a batch; times are int64 ns, the likelihood is uint8 (n, 32)."""
     special: dict[Any, type] = {tables.NS: np.int64, tables.LIKELIHOOD: np.uint8}
-    return {f.name: np.dtype(special.get(f.type) or f.type.to_pandas_dtype()) for f in _FIELDS[kind]}
+    return {
+        f.name: np.dtype(special.get(f.type) or f.type.to_pandas_dtype()) for f in _FIELDS[kind]
+    }
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,11 @@ def encode(batch: Batch) -> bytes:
     )  # fmt: skip
     for name, column in batch.columns.items():
         if len(column) != n:
-            raise WireError(name, f"has {len(column)} records, latitude has {n}", "give every column the same length")
+            raise WireError(
+                name,
+                f"has {len(column)} records, latitude has {n}",
+                "give every column the same length",
+            )
         if name == "log_likelihood":
             message.log_likelihood = np.ascontiguousarray(column, dtype=np.uint8).tobytes()
         else:
@@ -132,7 +151,13 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
             return message.FromString(payload)
         if encoding == JSON:
             return json_format.Parse(payload, message(), max_recursion_depth=8)
-    except (DecodeError, json_format.ParseError, UnicodeDecodeError, RecursionError, OverflowError) as error:
+    except (
+        DecodeError,
+        json_format.ParseError,
+        UnicodeDecodeError,
+        RecursionError,
+        OverflowError,
+    ) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         problem = f"is no {message.DESCRIPTOR.name} ({reason})"
         raise WireError("payload", problem, "encode it as its .proto says") from error
@@ -224,7 +249,9 @@ def decode_alert(payload: bytes) -> Alert:
 
 def encode_standing(alerts: Sequence[Alert]) -> bytes:
     """Protobuf bytes of the alerts that stand in a tile."""
-    return pb.StandingAlerts(alerts=[pb.Alert(**vars(alert)) for alert in alerts]).SerializeToString()
+    return pb.StandingAlerts(
+        alerts=[pb.Alert(**vars(alert)) for alert in alerts]
+    ).SerializeToString()
 
 
 def decode_standing(payload: bytes) -> list[Alert]:
@@ -239,7 +266,9 @@ def decode_standing(payload: bytes) -> list[Alert]:
     try:
         message.ParseFromString(payload)
     except DecodeError as error:
-        raise WireError("payload", "is no StandingAlerts", "encode it as its .proto says") from error
+        raise WireError(
+            "payload", "is no StandingAlerts", "encode it as its .proto says"
+        ) from error
     return [_alert(alert) for alert in message.alerts]
 
 

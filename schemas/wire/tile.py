@@ -32,11 +32,17 @@ def decode_tile(payload: bytes) -> pa.Table:
         _refuse_compressed(payload)
         with pa.ipc.open_stream(payload) as stream:
             if not stream.schema.equals(MAP_SCHEMA):
-                raise WireError("tile", "has other columns than the map", "use the schema of `tables.MAP_SCHEMA`")
+                raise WireError(
+                    "tile",
+                    "has other columns than the map",
+                    "use the schema of `tables.MAP_SCHEMA`",
+                )
             table = _rows(stream)
         table.validate(full=True)
     except (pa.ArrowException, OSError, struct.error, IndexError, UnicodeDecodeError) as error:
-        raise WireError("tile", f"is no Arrow stream ({type(error).__name__})", "write it with Arrow") from error
+        raise WireError(
+            "tile", f"is no Arrow stream ({type(error).__name__})", "write it with Arrow"
+        ) from error
     return table
 
 
@@ -57,7 +63,11 @@ def _refuse_compressed(payload: bytes) -> None:
         if kind and body and head[kind] == _BATCH:
             batch = body + struct.unpack_from("<I", head, body)[0]
             if _field(head, batch, _COMPRESSION):
-                raise WireError("tile", "is compressed", "send it as it is; a small message may not become a large one")
+                raise WireError(
+                    "tile",
+                    "is compressed",
+                    "send it as it is; a small message may not become a large one",
+                )
 
 
 def _field(data: bytes, table: int, index: int) -> int:

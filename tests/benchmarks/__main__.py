@@ -28,21 +28,42 @@ from tests.benchmarks.step import bank, step
 from tests.benchmarks.tiles import tiles
 
 FOLDER = Path(".bench")
-_ALL = (step, bank, estimators, agent, contract, fusion, ingest, growth, service, tiles, shards, state, cluster)
+_ALL = (
+    step,
+    bank,
+    estimators,
+    agent,
+    contract,
+    fusion,
+    ingest,
+    growth,
+    service,
+    tiles,
+    shards,
+    state,
+    cluster,
+)
 PARTS: dict[str, Callable[[], list[Figure]]] = {part.__name__: part for part in _ALL}
 
 
 def main() -> int:
     """Run the parts asked for, all without names, with progress."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("parts", nargs="*", metavar="NAME", help=f"one of {', '.join(PARTS)}; default: all")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "parts", nargs="*", metavar="NAME", help=f"one of {', '.join(PARTS)}; default: all"
+    )
     chosen = parser.parse_args().parts or list(PARTS)
     if unknown := set(chosen) - set(PARTS):
         parser.error(f"{', '.join(sorted(unknown))}: unknown; choose from {', '.join(PARTS)}")
     found: list[Figure] = []
     began = time.monotonic()
     for number, name in enumerate(chosen, 1):
-        print(f"{number}/{len(chosen)} {name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
+        print(
+            f"{number}/{len(chosen)} {name}: {(PARTS[name].__doc__ or '').splitlines()[0]}",
+            flush=True,
+        )
         part = time.monotonic()
         found += PARTS[name]()
         print(f"    {time.monotonic() - part:.0f} s", flush=True)

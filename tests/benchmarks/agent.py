@@ -50,7 +50,16 @@ def agent() -> list[Figure]:
 def drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
     """A simulated log and its vehicle file."""
     log, vehicle = folder / f"{name}.parquet", folder / f"{name}.json"
-    files = ["--out", str(log), "--vehicle-out", str(vehicle), "--duration", str(seconds), "--seed", str(seed)]
+    files = [
+        "--out",
+        str(log),
+        "--vehicle-out",
+        str(vehicle),
+        "--duration",
+        str(seconds),
+        "--seed",
+        str(seed),
+    ]
     edge(["simulate", "slalom", *files])
     return log, vehicle
 
@@ -65,7 +74,10 @@ def start(folder: Path) -> list[Figure]:
     return [
         Figure("bench.start.help_s", median_s(lambda: process(*EDGE, "--help")), "s", 0.4),
         Figure(
-            "bench.start.first_estimate_s", median_s(lambda: process(sys.executable, "-c", FIRST, *files)), "s", 1.5
+            "bench.start.first_estimate_s",
+            median_s(lambda: process(sys.executable, "-c", FIRST, *files)),
+            "s",
+            1.5,
         ),
     ]
 
@@ -77,9 +89,13 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
         ArithmeticError: it left something unacknowledged, so that its figures would flatter.
     """
     config = folder / "agent.json"
-    config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}, "spool": str(folder / "spool.sqlite")}))
+    config.write_text(
+        json.dumps({"zenoh": {"connect": [endpoint]}, "spool": str(folder / "spool.sqlite")})
+    )
     with (folder / "out").open("w+") as out:
-        process = subprocess.Popen([*EDGE, *words, "--config", str(config)], stdout=out, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [*EDGE, *words, "--config", str(config)], stdout=out, stderr=subprocess.DEVNULL
+        )
         peak, cost = watched(process.pid)
         out.seek(0)
         counted = json.loads(out.read().splitlines()[-1])
@@ -95,7 +111,11 @@ def watched(pid: int) -> tuple[float, resource.struct_rusage]:
     """
     peak, gone, status = 0.0, 0, Path(f"/proc/{pid}/status")
     while not gone:
-        found = [int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        found = [
+            int(line.split()[1])
+            for line in status.read_text().splitlines()
+            if line.startswith("VmHWM")
+        ]
         peak = max([peak, *(kilobytes * 1024 / 1e6 for kilobytes in found)])
         time.sleep(LOOK_S)
         gone, _, cost = os.wait4(pid, os.WNOHANG)
@@ -105,7 +125,17 @@ def watched(pid: int) -> tuple[float, resource.struct_rusage]:
 def live(folder: Path, endpoint: str) -> list[Figure]:
     """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not count."""
     log, vehicle = drive(folder, "live", 0, START_S + LIVE_S + 1.0)
-    words = ("run", "--source", str(log), "--vehicle", str(vehicle), "--trust", "--name", "bench-car", "--duration")
+    words = (
+        "run",
+        "--source",
+        str(log),
+        "--vehicle",
+        str(vehicle),
+        "--trust",
+        "--name",
+        "bench-car",
+        "--duration",
+    )
     used(folder, endpoint, *words, str(WARM_S))
     short, _ = used(folder, endpoint, *words, str(START_S))
     long, memory = used(folder, endpoint, *words, str(START_S + LIVE_S))
@@ -123,7 +153,13 @@ def fleet(folder: Path, endpoint: str) -> list[Figure]:
     short, _ = used(folder, endpoint, *words, str(START_S))
     long, _ = used(folder, endpoint, *words, str(START_S + FLEET_S))
     return [
-        Figure("bench.fleet.vehicles", FLEET * FLEET_S / (long - short), "vehicles at 50 Hz on a core", 200, "more")
+        Figure(
+            "bench.fleet.vehicles",
+            FLEET * FLEET_S / (long - short),
+            "vehicles at 50 Hz on a core",
+            200,
+            "more",
+        )
     ]
 
 
@@ -132,7 +168,17 @@ def replay(folder: Path) -> list[Figure]:
     logs = [drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log, vehicle = read_log(logs[0][0]), load_vehicle(logs[0][1])
     block = next(log.blocks(0))
-    kernel = LOGS * median_s(lambda: bank_of("aco-fckf", [vehicle]).advance(block.t, block.signals), 3)
+    kernel = LOGS * median_s(
+        lambda: bank_of("aco-fckf", [vehicle]).advance(block.t, block.signals), 3
+    )
     tasks = tasks_of([log for log, _ in logs], None, folder / "estimates")
     whole = median_s(lambda: list(backfill(tasks, "aco-fckf", 2)), 3)
-    return [Figure("bench.replay.efficiency", kernel / (2 * whole), "of two cores at the kernel's speed", 0.5, "more")]
+    return [
+        Figure(
+            "bench.replay.efficiency",
+            kernel / (2 * whole),
+            "of two cores at the kernel's speed",
+            0.5,
+            "more",
+        )
+    ]

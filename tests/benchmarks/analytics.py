@@ -93,7 +93,13 @@ def archive(root: Path, rows: int) -> list[Figure]:
     tell(f"compacted into {done.files} files")
     size = size_of((root / "observations").rglob("*.parquet"))
     return [
-        Figure("archive.compaction_rows_per_s", done.rows / spent, "rows per CPU second", 400_000, "more"),
+        Figure(
+            "archive.compaction_rows_per_s",
+            done.rows / spent,
+            "rows per CPU second",
+            400_000,
+            "more",
+        ),
         Figure("archive.bytes_per_observation", size / done.rows, "bytes", 60),
         Figure("archive.bytes_per_observation.inbox", inbox / done.rows, "bytes"),
     ]
@@ -113,7 +119,10 @@ def questions(root: Path, readings: Path) -> list[Figure]:
         spent = median_s(partial(_ask, name, root, options))
         busy = (time.process_time() - began) / ROUNDS
         tell(f"{name}: {spent:.2f} s, {busy:.2f} s of CPU")
-        found += [Figure(f"analytics.{name}_s", spent, "s", 5), Figure(f"analytics.{name}_cpu_s", busy, "s of CPU")]
+        found += [
+            Figure(f"analytics.{name}_s", spent, "s", 5),
+            Figure(f"analytics.{name}_cpu_s", busy, "s of CPU"),
+        ]
     t = QueryEngine("duckdb", root, PART).observations()
     cells = np.unique(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy())
     chosen = np.random.default_rng(SEED).choice(cells, CELLS_ASKED)
@@ -162,14 +171,19 @@ def _geo_files(root: Path) -> Iterator[Path]:
     yield from (root / "map").rglob("*.parquet")
     for name in ("worst", "spells", "grip"):
         path = root.parent / f"{name}.geo.parquet"
-        answer = QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), Options(report=lambda _: None))
+        answer = QUESTIONS[name].ask(
+            QueryEngine("duckdb", root, PART), Options(report=lambda _: None)
+        )
         output.write(answer, QUESTIONS[name], path)
         yield path
 
 
 def _refused(path: Path) -> list[str]:
     report = geoparquet_validator.check(str(path))
-    return [*geoparquet_validator.failed(report, "core"), *geoparquet_validator.failed(report, "covering")]
+    return [
+        *geoparquet_validator.failed(report, "core"),
+        *geoparquet_validator.failed(report, "covering"),
+    ]
 
 
 def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: int) -> bool:
@@ -182,14 +196,18 @@ def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: in
 
 def _different(root: Path, readings: Path) -> int:
     count, roads = 0, root.parent / "roads.parquet"
-    pq.write_table(roads_along(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()), roads)
+    pq.write_table(
+        roads_along(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()), roads
+    )
     for question in QUESTIONS.values():
         if question.name == "replay":  # asks no engine
             continue
         options = Options(
             at=HALF, stations=readings, report=lambda _: None, roads=roads, level=0.35, within_s=3600.0
         )  # fmt: skip
-        one, other = (question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark"))
+        one, other = (
+            question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark")
+        )
         said = differs(one, other, question)
         tell(f"{question.name}: {said or 'the engines agree'}")
         count += said is not None
@@ -211,7 +229,9 @@ def folder() -> Iterator[Path]:
 
 def main() -> int:
     """Measure everything; exit code 1 where a bar does not hold."""
-    parser = argparse.ArgumentParser(prog="make analytics-bench", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="make analytics-bench", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--rows", type=int, default=ROWS, help="observations (default ten million)")
     rows = parser.parse_args().rows
     with folder() as work:

@@ -20,9 +20,16 @@ def measured(folder: Path) -> list[Figure]:
     logs = spread.drives(folder / "drives")
     return [
         Figure("iceberg.rows_different", iceberg.measured(folder / "iceberg"), "rows", 0.0),
-        Figure("spark.replay.difference", spread.replay_difference(logs, folder / "replay"), "files", 0.0),
+        Figure(
+            "spark.replay.difference",
+            spread.replay_difference(logs, folder / "replay"),
+            "files",
+            0.0,
+        ),
         Figure("spark.rebuild.difference", spread.rebuild_difference(folder / "rebuild"), "", 1e-6),
-        Figure("spark.replay.scaling", spread.replay_scaling(logs, folder / "scaling"), "", 1.6, "more"),
+        Figure(
+            "spark.replay.scaling", spread.replay_scaling(logs, folder / "scaling"), "", 1.6, "more"
+        ),
     ]
 
 

@@ -25,7 +25,9 @@ def contract() -> list[Figure]:
     """Cost and size of an observation on the wire, ten to a message, and in Parquet."""
     rows, columns = 10, visits(10, 1, 10)
     names = wire.column_types(Kind.OBSERVATION)
-    batch = Batch(Kind.OBSERVATION, "bench", 1, 1, 1, 1, {name: columns[name] for name in names}, "aco-fckf")
+    batch = Batch(
+        Kind.OBSERVATION, "bench", 1, 1, 1, 1, {name: columns[name] for name in names}, "aco-fckf"
+    )
     payload = wire.encode(batch)
     repeat = 300
     encoding = median_s(lambda: [wire.encode(batch) for _ in range(repeat)])
@@ -47,7 +49,9 @@ def parquet_bytes() -> list[Figure]:
         rows = compact(root).rows
         compacted = size_of((root / "observations").rglob("*.parquet"))
     return [
-        Figure("bench.bytes.parquet", compacted / rows, f"bytes per observation, {rows} compacted", 60),
+        Figure(
+            "bench.bytes.parquet", compacted / rows, f"bytes per observation, {rows} compacted", 60
+        ),
         Figure("bench.bytes.parquet_inbox", inbox / rows, "bytes per observation, before"),
     ]
 

@@ -15,12 +15,16 @@ from tests.benchmarks.measure import ROUNDS, SEED, median_s
 def estimators() -> list[Figure]:
     """Microseconds per vehicle and sample of the default estimator, for one vehicle and for a bank."""
     log, vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
-    signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[:, None, :]
+    signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[
+        :, None, :
+    ]
     t: FloatArray = log["t"].to_numpy()[:, None]
 
     def drive(n: int, samples: int) -> float:
         block, times = np.repeat(signals[:samples], n, axis=1), np.repeat(t[:samples], n, axis=1)
-        banks = [bank_of("aco-fckf", [vehicle] * n) for _ in range(ROUNDS + 1)]  # to make one is not to step it
+        banks = [
+            bank_of("aco-fckf", [vehicle] * n) for _ in range(ROUNDS + 1)
+        ]  # to make one is not to step it
         seconds = median_s(lambda: banks.pop().advance(times, block))
         return seconds / (n * samples) * 1e6
 

@@ -12,17 +12,34 @@ from tests.benchmarks.measure import SEED
 def visits(rows: int, vehicles: int, cells: int) -> Columns:
     """Columns of observations spread over cells."""
     rng = np.random.default_rng(SEED)
-    latitude, longitude = 57.0 + rng.integers(0, cells, rows) * 1e-4 / 100, 11.97 + rng.integers(0, 100, rows) * 2e-4
+    latitude, longitude = (
+        57.0 + rng.integers(0, cells, rows) * 1e-4 / 100,
+        11.97 + rng.integers(0, 100, rows) * 2e-4,
+    )
     columns: Columns = {}
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():
-        columns[name] = rng.uniform(0.2, 0.9, rows).astype(dtype) if dtype.kind == "f" else np.zeros(rows, dtype)
+        columns[name] = (
+            rng.uniform(0.2, 0.9, rows).astype(dtype)
+            if dtype.kind == "f"
+            else np.zeros(rows, dtype)
+        )
     columns["latitude"], columns["longitude"] = latitude, longitude
-    columns["cell"], columns["sector"] = grid.cell_of(latitude, longitude), grid.sector_of(columns["yaw"])
-    columns["enter_time"] = np.sort(rng.integers(0, 60_000_000_000, rows)) + 1_790_000_000_000_000_000
+    columns["cell"], columns["sector"] = (
+        grid.cell_of(latitude, longitude),
+        grid.sector_of(columns["yaw"]),
+    )
+    columns["enter_time"] = (
+        np.sort(rng.integers(0, 60_000_000_000, rows)) + 1_790_000_000_000_000_000
+    )
     columns["leave_time"] = columns["enter_time"] + 500_000_000
     shape = np.abs(np.arange(32) - rng.integers(4, 28, (rows, 1)))
-    columns["log_likelihood"] = np.minimum(shape * rng.integers(2, 12, (rows, 1)), 255).astype(np.uint8)
+    columns["log_likelihood"] = np.minimum(shape * rng.integers(2, 12, (rows, 1)), 255).astype(
+        np.uint8
+    )
     columns["boot"], columns["region"] = np.ones(rows, np.int64), grid.region_of(columns["cell"])
     columns["seq"], columns["row"] = np.arange(1, rows + 1), np.zeros(rows, np.int32)
-    columns["vehicle_number"], columns["with_likelihood"] = rng.integers(0, vehicles, rows), np.ones(rows, bool)
+    columns["vehicle_number"], columns["with_likelihood"] = (
+        rng.integers(0, vehicles, rows),
+        np.ones(rows, bool),
+    )
     return columns

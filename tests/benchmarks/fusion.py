@@ -36,7 +36,9 @@ resident()
 """
 
 
-def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float) -> Observations:
+def visits(
+    rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float
+) -> Observations:
     """Visits to cells of a square, anywhere in `seconds`, in order of time."""
     side = int(np.ceil(np.sqrt(cells)))
     x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
@@ -46,7 +48,9 @@ def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seco
     mu = rng.uniform(0.2, 0.9, rows)[:, None]
     value = -0.5 * np.square((mugrid.CENTRES - mu) / 0.06)
     bound = np.where(0.4 * mu > mugrid.CENTRES, -6.0, 0.0)
-    evidence = mugrid.encode_log_likelihood(np.where((rng.random(rows) < EXCITED)[:, None], value, bound))
+    evidence = mugrid.encode_log_likelihood(
+        np.where((rng.random(rows) < EXCITED)[:, None], value, bound)
+    )
     return Observations(
         time=time_ns, cell=cell, sector=np.zeros(rows, np.int8), second=np.full(rows, -1, np.int8),
         vehicle=vehicle, boot=vehicle + 1, region=grid.region_of(cell), sequence=np.arange(rows),
@@ -61,7 +65,9 @@ def filled(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random
     rng, fusion = np.random.default_rng(SEED), Fusion(120.0)
     parts = max(cells * per_cell // 100_000, 1)
     for part in range(parts):
-        for batch in batches(visits(rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts)):
+        for batch in batches(
+            visits(rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts)
+        ):
             fusion.update(batch)
     return fusion, rng
 
@@ -136,10 +142,25 @@ def fusion() -> list[Figure]:
     """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and their memory."""
     few, many = per_observation_s(10_000), per_observation_s(CELLS)
     command = [sys.executable, "-c", RESIDENT]
-    megabytes, _ = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    megabytes, _ = subprocess.run(
+        command, check=True, capture_output=True, text=True
+    ).stdout.split()
     return [
-        Figure("bench.fusion.per_s", 1.0 / many, "observations/s, commits included", 1_000_000, "more"),
-        Figure("bench.fusion.table_vs_dict", table_vs_dict(), "times the look-up of a typed dictionary", 1.5, "more"),
+        Figure(
+            "bench.fusion.per_s", 1.0 / many, "observations/s, commits included", 1_000_000, "more"
+        ),
+        Figure(
+            "bench.fusion.table_vs_dict",
+            table_vs_dict(),
+            "times the look-up of a typed dictionary",
+            1.5,
+            "more",
+        ),
         Figure("bench.growth.cells_ratio", many / few, "cost in 10^6 cells over that in 10^4", 1.3),
-        Figure("bench.state.resident_mb", float(megabytes), "MB, a service's process with 10^6 cells", 400),
+        Figure(
+            "bench.state.resident_mb",
+            float(megabytes),
+            "MB, a service's process with 10^6 cells",
+            400,
+        ),
     ]

@@ -23,10 +23,16 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.ingest import messages
 
-RATES: Final = {1_000: 24, 10_000: 12, 100_000: 6}  # observations/s, and seconds of each that are measured
+RATES: Final = {
+    1_000: 24,
+    10_000: 12,
+    100_000: 6,
+}  # observations/s, and seconds of each that are measured
 ROWS: Final = 10
 TURN: Final = 512  # messages, as the service's worker takes them
-LATENESS_S: Final = 4.0  # short, so that the window is full and settling is paid for from the beginning
+LATENESS_S: Final = (
+    4.0  # short, so that the window is full and settling is paid for from the beginning
+)
 WARM_S: Final = 4
 SECOND: Final = 10**9
 
@@ -36,7 +42,11 @@ def growth() -> list[Figure]:
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])
     told = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
-    return [Figure("bench.growth.rate_exponent", slope, f"of the rate; an observation costs {told}", 1.05)]
+    return [
+        Figure(
+            "bench.growth.rate_exponent", slope, f"of the rate; an observation costs {told}", 1.05
+        )
+    ]
 
 
 def second_s(rate: int, seconds: int) -> float:

@@ -24,14 +24,18 @@ def table_of(uri: str, kind: Kind) -> Table:
     """The table of a kind, as a reader opens it."""
     from pyiceberg.catalog import load_catalog
 
-    return load_catalog("gripmap", type="sql", uri=uri).load_table((iceberg.NAMESPACE, layout.TABLES[kind]))
+    return load_catalog("gripmap", type="sql", uri=uri).load_table(
+        (iceberg.NAMESPACE, layout.TABLES[kind])
+    )
 
 
 def rows_different(root: Path, uri: str) -> int:
     """Rows, with all their columns, that are in the compacted files or in the tables and not in both as often."""
     different = 0
     for kind in Kind:
-        files = [pq.read_table(path, partitioning=None) for path in layout.compacted_files(root, kind)]
+        files = [
+            pq.read_table(path, partitioning=None) for path in layout.compacted_files(root, kind)
+        ]
         there = pa.concat_tables(files)
         seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
         ours, theirs = _counted(there), _counted(seen)
@@ -40,7 +44,9 @@ def rows_different(root: Path, uri: str) -> int:
 
 
 def _counted(table: pa.Table) -> Counter[str]:
-    return Counter(repr(row) for row in zip(*(column.to_pylist() for column in table.columns), strict=True))
+    return Counter(
+        repr(row) for row in zip(*(column.to_pylist() for column in table.columns), strict=True)
+    )
 
 
 def measured(folder: Path) -> float:

@@ -48,8 +48,15 @@ def ingest() -> list[Figure]:
         Figure("bench.ingest.batch10_per_cpu_s", ten[1], "observations per CPU second"),
         Figure("bench.ingest.single_per_s", one[0], "observations/s", 60_000, "more"),
         Figure("bench.ingest.single_per_cpu_s", one[1], "observations per CPU second"),
-        Figure("bench.ingest.cpu_vs_bare", bare / ten[1], "times the CPU of decoding alone, protobuf's module", 4),
-        Figure("bench.ingest.cpu_vs_own_decoding", own / ten[1], "times the CPU of our decoding alone"),
+        Figure(
+            "bench.ingest.cpu_vs_bare",
+            bare / ten[1],
+            "times the CPU of decoding alone, protobuf's module",
+            4,
+        ),
+        Figure(
+            "bench.ingest.cpu_vs_own_decoding", own / ten[1], "times the CPU of our decoding alone"
+        ),
     ]
 
 
@@ -62,8 +69,13 @@ def rates(records: int) -> tuple[tuple[float, float], float, float]:
     taken = [_take(sent, records) for _ in range(ROUNDS + 1)][1:]
     rate = statistics.median(t[0] for t in taken), statistics.median(t[1] for t in taken)
     bare, own = (
-        len(sent) * records / statistics.median([_decoding_s(sent, decode) for _ in range(ROUNDS + 1)][1:])
-        for decode in (_bare, lambda part: decode_many(Kind.OBSERVATION, [(m.payload, m.encoding) for m in part]))
+        len(sent)
+        * records
+        / statistics.median([_decoding_s(sent, decode) for _ in range(ROUNDS + 1)][1:])
+        for decode in (
+            _bare,
+            lambda part: decode_many(Kind.OBSERVATION, [(m.payload, m.encoding) for m in part]),
+        )
     )
     return rate, bare, own
 
@@ -112,14 +124,26 @@ def messages(
         part = mine[number * records : (number + 1) * records]
         seq, place = divmod(begin + number, vehicles)
         taken = {name: column[part] for name, column in columns.items()}
-        batch = Batch(Kind.OBSERVATION, f"sim-{east}-{place:05}", 1, region, seq + 1, seq + 1, taken, "aco-fckf")
+        batch = Batch(
+            Kind.OBSERVATION,
+            f"sim-{east}-{place:05}",
+            1,
+            region,
+            seq + 1,
+            seq + 1,
+            taken,
+            "aco-fckf",
+        )
         key = keys.observation_key(region, batch.vehicle)
         out.append(Message(batch.kind, key, wire.encode(batch), wire.ENCODING[batch.kind]))
     return out
 
 
 def _take(sent: list[Message], records: int) -> tuple[float, float]:
-    with tempfile.TemporaryDirectory() as folder, closing(Engine(ServiceConfig(), Path(folder))) as engine:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Engine(ServiceConfig(), Path(folder))) as engine,
+    ):
         turn = turn_of(sent)
         gc.collect()
         gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for

@@ -13,7 +13,13 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.common.output import PRIOR_MU_STD
-from edge_agent.estimators.paper_aco_fckf import LARGEST_FACTOR, LEAST_FACTOR, STEP_S, WINDOW_S, Setting
+from edge_agent.estimators.paper_aco_fckf import (
+    LARGEST_FACTOR,
+    LEAST_FACTOR,
+    STEP_S,
+    WINDOW_S,
+    Setting,
+)
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 
@@ -32,7 +38,16 @@ def library(source: str, *options: str) -> ctypes.CDLL:
         OSError, subprocess.CalledProcessError: there is no gcc, or it refuses.
     """
     target = Path(tempfile.mkdtemp()) / "kernel.so"
-    words = ["gcc", "-O3", "-march=native", "-shared", "-fPIC", str(FOLDER / source), "-o", str(target)]
+    words = [
+        "gcc",
+        "-O3",
+        "-march=native",
+        "-shared",
+        "-fPIC",
+        str(FOLDER / source),
+        "-o",
+        str(target),
+    ]
     subprocess.run([*words, *options, "-lm"], check=True)
     return ctypes.CDLL(str(target))
 
@@ -69,9 +84,14 @@ def pointer(array: FloatArray) -> ctypes.c_void_p:
 class Limit:
     """N filters in C, one struct each, on as many threads as OpenMP has."""
 
-    def __init__(self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships) -> None:
+    def __init__(
+        self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
+    ) -> None:
         """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample; speed [m/s]."""
-        self._library, self._parameters = library("kernel.c", "-fopenmp"), np.ascontiguousarray(parameters)
+        self._library, self._parameters = (
+            library("kernel.c", "-fopenmp"),
+            np.ascontiguousarray(parameters),
+        )
         self._setting, self._memory = setting_row(memberships), first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
@@ -88,17 +108,24 @@ class Limit:
 class VectorLimit:
     """N filters in C, side by side in vectors, on one thread; N is a multiple of the lanes."""
 
-    def __init__(self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships) -> None:
+    def __init__(
+        self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
+    ) -> None:
         """Arguments as of `Limit`."""
         self._library = library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)
-        self._parameters, self._memory = self.side_by_side(parameters), self.side_by_side(first_memory(first, speed))
+        self._parameters, self._memory = (
+            self.side_by_side(parameters),
+            self.side_by_side(first_memory(first, speed)),
+        )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
         """(..., N, numbers) as (..., N/lanes, numbers, lanes), aligned to a vector."""
         *rest, vehicles, numbers = values.shape
-        turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(-1, -2)
+        turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(
+            -1, -2
+        )
         out = aligned(*turned.shape)
         out[...] = turned
         return out

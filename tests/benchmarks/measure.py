@@ -21,7 +21,9 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
     return statistics.median(spent)
 
 
-def paired(ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS) -> tuple[float, float]:
+def paired(
+    ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
+) -> tuple[float, float]:
     """Median durations [s] of two works in turn, after a warm-up of each, so that both see the same machine."""
     ours(), other()
     spent: tuple[list[float], list[float]] = ([], [])

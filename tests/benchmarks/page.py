@@ -139,7 +139,11 @@ def drawn(on: Stage) -> dict[str, float]:
                 seen.page.evaluate(_OURS)
                 ours.append((first, float(seen.page.evaluate(_MOVES))))
                 errors += seen.errors
-                foreign += [url for url in seen.requests if not url.startswith((on.address, "data:", "about:"))]
+                foreign += [
+                    url
+                    for url in seen.requests
+                    if not url.startswith((on.address, "data:", "about:"))
+                ]
             if other is not None:
                 with opened(other) as seen:
                     first = float(seen.page.evaluate("shown / 1000"))
@@ -150,7 +154,9 @@ def drawn(on: Stage) -> dict[str, float]:
     picture, frames = (float(np.median([one[k] for one in ours])) for k in (0, 1))
     found = {"first_picture_s": picture, "frames_hz": frames}
     found |= {"console_errors": float(len(errors)), "foreign_requests": float(len(foreign))}
-    their_picture, their_frames = (float(np.median([one[k] for one in theirs] or [math.nan])) for k in (0, 1))
+    their_picture, their_frames = (
+        float(np.median([one[k] for one in theirs] or [math.nan])) for k in (0, 1)
+    )
     return found | {
         "maplibre_first_picture_s": their_picture, "maplibre_frames_hz": their_frames, "fps": frames / their_frames,
     }  # fmt: skip
@@ -168,7 +174,9 @@ def maplibre(on: Stage) -> Iterator[str | None]:
         for file in files:
             assert file is not None
             (Path(folder) / file.name).write_bytes(file.read_bytes())
-        town = pa.Table.from_batches([on.town.table(tile) for tile in on.town.tiles]).select(["cell", "mu"])
+        town = pa.Table.from_batches([on.town.table(tile) for tile in on.town.tiles]).select(
+            ["cell", "mu"]
+        )
         extract.write(geo.with_cells(town), Path(folder) / "town.geojson")
         x, y = on.town.corner
         longitude = 360.0 * x / 2**14 - 180.0
@@ -191,7 +199,9 @@ def pushed_ms(on: Stage) -> float:
     """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed cells a second."""
     with opened(seen_town(on.address, on.town)) as seen:
         tiles, put = list(on.town.tiles), dict[int, float]()
-        seen.page.evaluate("all => { globalThis.markers = all }", [[tile, on.town.local(tile)] for tile in tiles])
+        seen.page.evaluate(
+            "all => { globalThis.markers = all }", [[tile, on.town.local(tile)] for tile in tiles]
+        )
         due = time.monotonic()
         for k in range(PUSHES):
             tile, number = tiles[k % len(tiles)], FIRST + k
@@ -200,12 +210,24 @@ def pushed_ms(on: Stage) -> float:
             on.session.put(keys.map_key(tile), payload)
             due += PUT_S
             time.sleep(max(due - time.monotonic(), 0.0))
-        with contextlib.suppress(TimeoutError):  # a put of the map may be dropped; what was not drawn is late for ever
-            until(lambda: seen.page.evaluate(f"numbers.some(one => one[0] === {FIRST + PUSHES - 1})"), DRAWN_S)
+        with contextlib.suppress(
+            TimeoutError
+        ):  # a put of the map may be dropped; what was not drawn is late for ever
+            until(
+                lambda: seen.page.evaluate(f"numbers.some(one => one[0] === {FIRST + PUSHES - 1})"),
+                DRAWN_S,
+            )
         drawn_at = {int(number): float(at) for number, at in seen.page.evaluate("numbers")}
     # a put that the next of its tile overtook is drawn with that
     late = [
-        min((at for number, at in drawn_at.items() if number >= k and (number - k) % len(tiles) == 0), default=math.inf)
+        min(
+            (
+                at
+                for number, at in drawn_at.items()
+                if number >= k and (number - k) % len(tiles) == 0
+            ),
+            default=math.inf,
+        )
         - begun
         for k, begun in put.items()
     ]
@@ -278,7 +300,8 @@ def accessible(on: Stage) -> float:
     """Serious findings of axe-core in all panels; NaN where it is not there."""
     with opened(seen_town(on.address, on.town)) as seen:
         seen.page.evaluate(
-            "([tile, local]) => gripmap.choose(tile, local)", [on.town.marker, on.town.local(on.town.marker)]
+            "([tile, local]) => gripmap.choose(tile, local)",
+            [on.town.marker, on.town.local(on.town.marker)],
         )
         found = scan.findings(seen)
     for line in found or ():
@@ -310,7 +333,9 @@ def measured() -> list[Figure]:
         ("foreign_requests", "requests", 0, "less"), ("console_errors", "errors", 0, "less"),
         ("axe_serious", "findings", 0, "less"), ("colour_distance", "CIEDE2000, the least", 10.0, "more"),
     ]  # fmt: skip
-    own = [Figure(f"page.{name}", found[name], unit, bar, better) for name, unit, bar, better in rows]
+    own = [
+        Figure(f"page.{name}", found[name], unit, bar, better) for name, unit, bar, better in rows
+    ]
     return own + _said("what leaves the house", outside)
 
 

@@ -43,7 +43,9 @@ SCHEMA: Final = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
 OURS: Final = Supplier("se", "GripMap bench")
 STEPS, SEED, LEAST_ENDED = 40, 20_319, 20
 PATIENCE_S: Final = 120.0
-ICE_NS: Final = 1800 * NS  # age of the ice when it has melted: in seconds no road changes, and no alert would end
+ICE_NS: Final = (
+    1800 * NS
+)  # age of the ice when it has melted: in seconds no road changes, and no alert would end
 _SPACES: Final = {
     "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing",
     "com": "http://datex2.eu/schema/3/common",
@@ -52,7 +54,9 @@ READERS: Final = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
     "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
 }
-_COUNT: Final = "; print(len(found), int((found.basis == 'bound').sum()), int(found.mu.notna().sum()))"
+_COUNT: Final = (
+    "; print(len(found), int((found.basis == 'bound').sum()), int(found.mu.notna().sum()))"
+)
 
 
 def records(document: bytes) -> list[ET.Element]:
@@ -88,15 +92,36 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
     standing = dict[tuple[int, int], bool]()
     for step in range(STEPS):
         now = (1_800_000_000 + 30 * step) * NS
-        for x, sector in zip(rng.integers(0, 60, 8).tolist(), (2 * rng.integers(0, 2, 8)).tolist(), strict=True):
+        for x, sector in zip(
+            rng.integers(0, 60, 8).tolist(), (2 * rng.integers(0, 2, 8)).tolist(), strict=True
+        ):
             raised = bool(rng.random() < 0.4)
             if raised == standing.get((x, sector), False):
                 continue
             standing[x, sector] = raised
-            cell = int(grid.interleave(np.array([street.MIDDLE[0] + 5 * x]), np.array([street.MIDDLE[1]]))[0])
+            cell = int(
+                grid.interleave(np.array([street.MIDDLE[0] + 5 * x]), np.array([street.MIDDLE[1]]))[
+                    0
+                ]
+            )
             latitude, longitude = (float(v) for v in grid.centre(cell))
             mu = float(rng.uniform(0.1, 0.3))
-            stretches.take(Alert(cell, sector, raised, now, mu, mu / 2, mu + 0.1, 0.95, 3, latitude, longitude, "made"))
+            stretches.take(
+                Alert(
+                    cell,
+                    sector,
+                    raised,
+                    now,
+                    mu,
+                    mu / 2,
+                    mu + 0.1,
+                    0.95,
+                    3,
+                    latitude,
+                    longitude,
+                    "made",
+                )
+            )
         stretches.changes()
         before = publication(OURS, stretches.standing, now, before)
         told = records(before)
@@ -104,7 +129,9 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
         unended += abs(sum(not is_over(one) for one in told) - len(stretches.standing))
         invalid += valid is not None and not valid(before)
     enough = len(ended) >= LEAST_ENDED
-    return (float(invalid) if valid and enough else math.nan), (float(unended) if enough else math.nan)
+    return (float(invalid) if valid and enough else math.nan), (
+        float(unended) if enough else math.nan
+    )
 
 
 def driven() -> dict[str, float]:
@@ -116,10 +143,16 @@ def driven() -> dict[str, float]:
     street.PARTS["melted"] = street.PARTS["ice"]._replace(mu=0.85)
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
-    with tempfile.TemporaryDirectory() as folder, router, running(settings, Path(folder) / "archive"):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        router,
+        running(settings, Path(folder) / "archive"),
+    ):
         file = DatexFile(OURS, Path(folder) / "situations.xml", lambda _: None)
         stop, lines = threading.Event(), list[str]()
-        page = threading.Thread(target=run, args=(PageSettings(settings, port=0, datex=file), stop, lines.append))
+        page = threading.Thread(
+            target=run, args=(PageSettings(settings, port=0, datex=file), stop, lines.append)
+        )
         page.start()
         session = open_session(settings)
         assert session is not None
@@ -189,7 +222,9 @@ def measured_cells(table: pa.Table) -> set[int]:
 def opens(reader: str, address: str) -> bool:
     """Return True if a reader has all features, the bounds among them without a value."""
     script = READERS[reader].format(address=address) + _COUNT
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
+    )
     whole, bounds = street.known("ice", "passed", "wet"), street.known("passed")
     held = done.stdout.split() == [str(whole), str(bounds), str(whole - bounds)]
     if not held:
@@ -231,8 +266,20 @@ def outside() -> list[Figure]:
         found = dict.fromkeys(("leaked", "unended", "readers_failed"), math.nan)
     return [
         Figure("datex.invalid", invalid, f"of {STEPS} publications", 0),
-        Figure("datex.bound_leaked", found["leaked"], "cells of situations that are not measured", 0),
-        Figure("datex.unended", unended + found["unended"], "situations without an end, alert over", 0),
-        Figure("roads.join_right", join_right(), f"of fixes, {roads.NOISE_M:g} m noise, the worst seed", 0.95, "more"),
-        Figure("oapif.readers_failed", found["readers_failed"], "of GDAL, geopandas (and ogrinfo)", 0),
+        Figure(
+            "datex.bound_leaked", found["leaked"], "cells of situations that are not measured", 0
+        ),
+        Figure(
+            "datex.unended", unended + found["unended"], "situations without an end, alert over", 0
+        ),
+        Figure(
+            "roads.join_right",
+            join_right(),
+            f"of fixes, {roads.NOISE_M:g} m noise, the worst seed",
+            0.95,
+            "more",
+        ),
+        Figure(
+            "oapif.readers_failed", found["readers_failed"], "of GDAL, geopandas (and ogrinfo)", 0
+        ),
     ]

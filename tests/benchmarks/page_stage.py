@@ -41,7 +41,9 @@ class Town:
         self.tiles: dict[int, dict[str, Any]] = {}
         for k in range(SIDE * SIDE):
             tile = int(grid.interleave(np.array([x + k % SIDE]), np.array([y + k // SIDE]))[0])
-            cells = np.sort((tile << 14) + self.rng.choice(1 << 14, CELLS // SIDE**2, replace=False))
+            cells = np.sort(
+                (tile << 14) + self.rng.choice(1 << 14, CELLS // SIDE**2, replace=False)
+            )
             self.tiles[tile] = self._columns(cells)
         self.marker = next(iter(self.tiles))
 
@@ -69,7 +71,10 @@ class Town:
     def table(self, tile: int) -> pa.RecordBatch:
         """A tile in the schema of the map."""
         columns = ((self.tiles[tile][f.name], f.type) for f in tables.MAP_SCHEMA)
-        arrays = [(c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False) for c, kind in columns]
+        arrays = [
+            (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False)
+            for c, kind in columns
+        ]
         return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
     def change(self, tile: int, cells: int, number: int) -> bytes:

@@ -53,7 +53,9 @@ def _beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
     fusion = engine.state.fusion
     slots = np.arange(fusion.size)
     order = np.lexsort((fusion.sector[slots], fusion.cell[slots]))
-    return (fusion.cell[slots] * grid.SECTORS + fusion.sector[slots])[order], fusion.beliefs(slots, END)[order]
+    return (fusion.cell[slots] * grid.SECTORS + fusion.sector[slots])[order], fusion.beliefs(
+        slots, END
+    )[order]
 
 
 END = START_NS + WORLD.days * DAY_S * 10**9
@@ -73,7 +75,9 @@ def _service(root: Path) -> Iterator[zenoh.Session]:
     lines: list[str] = []
     stop = threading.Event()
     with router:
-        service = Service(ServiceConfig(zenoh=settings, compact_s=0.0, snapshot_s=0.0), root, lines.append)
+        service = Service(
+            ServiceConfig(zenoh=settings, compact_s=0.0, snapshot_s=0.0), root, lines.append
+        )
         thread = threading.Thread(target=service.run, args=(stop,))
         thread.start()
         try:
@@ -111,8 +115,15 @@ def _asked(root: Path) -> tuple[list[float], int]:
             row, column = int(rng.integers(0, 8)) * 2, int(rng.integers(0, 8))
             west = synthetic.LONGITUDE + column * 260 * step
             south = synthetic.LATITUDE + row * 260 * step * np.cos(np.radians(synthetic.LATITUDE))
-            box = (west, south, west + SIDE * step, south + SIDE * step * np.cos(np.radians(synthetic.LATITUDE)))
-            at = datetime.fromtimestamp(START_NS // 10**9 + int(rng.integers(DAY_S, WORLD.days * DAY_S)), UTC)
+            box = (
+                west,
+                south,
+                west + SIDE * step,
+                south + SIDE * step * np.cos(np.radians(synthetic.LATITUDE)),
+            )
+            at = datetime.fromtimestamp(
+                START_NS // 10**9 + int(rng.integers(DAY_S, WORLD.days * DAY_S)), UTC
+            )
             selector = f"{keys.ROOT}/map/**?bbox={','.join(f'{v:.6f}' for v in box)};at={at:%Y-%m-%dT%H:%M:%SZ}"
             seconds, tables = _answer(session, selector)
             spent.append(seconds)

@@ -65,7 +65,9 @@ def by_filterpy(problem: Problem) -> FloatArray:
     inputs: dict[str, FloatArray] = {}
 
     def f(x: FloatArray, gone: float) -> FloatArray:
-        return move(x.reshape(1, -1), problem.row, inputs["before"], inputs["now"], gone).reshape(x.shape)
+        return move(x.reshape(1, -1), problem.row, inputs["before"], inputs["now"], gone).reshape(
+            x.shape
+        )
 
     def h(x: FloatArray) -> FloatArray:
         return measured(x.reshape(1, -1)).reshape(3, *x.shape[1:])
@@ -124,4 +126,8 @@ def by_stonesoup(problem: Problem) -> FloatArray:
     return np.asarray(state.state_vector, dtype=float)
 
 
-PEERS = {"numpy": Peer(by_numpy, 100), "filterpy": Peer(by_filterpy, 500), "stonesoup": Peer(by_stonesoup, 500)}
+PEERS = {
+    "numpy": Peer(by_numpy, 100),
+    "filterpy": Peer(by_filterpy, 500),
+    "stonesoup": Peer(by_stonesoup, 500),
+}

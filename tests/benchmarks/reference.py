@@ -12,7 +12,9 @@ from schemas.thresholds import GRAVITY
 RATE, DELTA, OMEGA = 2, 3, 7
 
 
-def move(points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float) -> FloatArray:
+def move(
+    points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float
+) -> FloatArray:
     """f: states (P, 6) after `gone` [s] by Heun's rule; row (12,), before and now (11,)."""
     mu = np.clip(points[:, 5], LOWER, UPPER)
     vx, vy, ax, ay, rate = points[:, 0], points[:, 1], points[:, 2], points[:, 3], points[:, 4]
@@ -20,7 +22,10 @@ def move(points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArra
     slope_x, slope_y = ax + rate * vy, ay - rate * vx
     x, y, r = vx + gone * slope_x, vy + gone * slope_y, rate + gone * turn
     bx, by, again = respond(row, x, y, r, ax, ay, now, mu)
-    new_x, new_y = vx + 0.5 * gone * (slope_x + bx + r * y), vy + 0.5 * gone * (slope_y + by - r * x)
+    new_x, new_y = (
+        vx + 0.5 * gone * (slope_x + bx + r * y),
+        vy + 0.5 * gone * (slope_y + by - r * x),
+    )
     new_rate = rate + 0.5 * gone * (turn + again)
     felt_x, felt_y, _ = respond(row, new_x, new_y, new_rate, ax, ay, now, mu)
     return np.stack([new_x, new_y, felt_x, felt_y, new_rate, points[:, 5]], axis=1)
@@ -36,7 +41,9 @@ def respond(
     base, weight = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR], row[Parameter.MASS] * GRAVITY
     pitch = (row[Parameter.MASS] * ax * row[Parameter.CG_HEIGHT] / base)[:, None]
     axle = np.where(
-        front, weight * row[Parameter.TO_REAR] / base - pitch, weight * row[Parameter.TO_FRONT] / base + pitch
+        front,
+        weight * row[Parameter.TO_REAR] / base - pitch,
+        weight * row[Parameter.TO_FRONT] / base + pitch,
     )
     track = np.where(front, row[Parameter.TRACK_FRONT], row[Parameter.TRACK_REAR])
     roll = (ay * row[Parameter.CG_HEIGHT] / GRAVITY)[:, None]
@@ -46,7 +53,13 @@ def respond(
     ahead, aside = vx[:, None] - y * rate[:, None], vy[:, None] + x * rate[:, None]
     along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
     speed, grip = np.maximum(np.abs(along), 0.5), mu[:, None] * load
-    theta_x = row[Parameter.SLOPE_X] * load * (row[Parameter.RADIUS] * readings[OMEGA:] - along) / speed / grip
+    theta_x = (
+        row[Parameter.SLOPE_X]
+        * load
+        * (row[Parameter.RADIUS] * readings[OMEGA:] - along)
+        / speed
+        / grip
+    )
     theta_y = row[Parameter.SLOPE_Y] * load * -across / speed / grip
     theta = np.maximum(np.hypot(theta_x, theta_y), 1e-12)
     gain = grip * np.where(theta <= 0.5, theta, 1.0 - 0.25 / theta) / theta

@@ -46,9 +46,14 @@ def drive(sumo: Sumo, seed: int) -> Traffic:
 
 def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
     """Shares of fixes for which the join is right."""
-    rng, east = np.random.default_rng(seed), METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))
+    rng, east = (
+        np.random.default_rng(seed),
+        METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude)),
+    )
     error = rng.normal(0.0, NOISE_M, (2, len(east)))
-    cell = grid.cell_of(traffic.latitude + error[0] / METRES_PER_DEGREE, traffic.longitude + error[1] / east)
+    cell = grid.cell_of(
+        traffic.latitude + error[0] / METRES_PER_DEGREE, traffic.longitude + error[1] / east
+    )
     place = cell * grid.SECTORS + grid.sector_of(traffic.yaw).astype(np.int64)
     names = {link.id: link.name for link in network.links}
     fixes = pd.DataFrame({"place": place, "way": traffic.way, "fix": np.arange(len(place))})
@@ -78,9 +83,13 @@ def main() -> int:
     rows = [
         Figure("roads.fixes", least["fixes"], "fixes of a seed, the fewest", 50_000, "more"),
         Figure("roads.join_right", least["join_right"], "of fixes, the worst seed", 0.95, "more"),
-        Figure("roads.street_right", least["street_right"], "of fixes, the worst seed", None, "more"),
+        Figure(
+            "roads.street_right", least["street_right"], "of fixes, the worst seed", None, "more"
+        ),
         Figure("roads.best_single", most["best_single"], "of fixes, the best seed"),
-        Figure("roads.links_per_place", most["links_per_place"], "links of a fix's cell, the most", 1.5),
+        Figure(
+            "roads.links_per_place", most["links_per_place"], "links of a fix's cell, the most", 1.5
+        ),
     ]
     figures.write(FOLDER / "figures.json", "roads", SEEDS, rows)
     print(figures.markdown(rows))

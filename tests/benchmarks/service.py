@@ -29,14 +29,20 @@ from schemas.wire.tile import decode_tile
 RATE = 20_000  # observations/s of the load
 ROWS = 10  # of a message
 VEHICLES = 500
-COLUMNS, LINES = 40, 50  # of the tile's cells that the load visits; the box of a query holds half of them
+COLUMNS, LINES = (
+    40,
+    50,
+)  # of the tile's cells that the load visits; the box of a query holds half of them
 QUERIES, ALERTS, ACKS = 200, 60, 60
 APART = 4  # cells between two that freeze: further than a position's error reaches
 BARE, BARE_BOX = "gripmap-bare/tile", "gripmap-bare/box"
 LATITUDE, LONGITUDE = 57.7, 11.97
 SECOND = 10**9
 _TILE = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
-_X, _Y = (int(v) for v in grid.deinterleave(grid.from_quadkey(grid.quadkey(_TILE, grid.TILE_ZOOM) + "0" * 7)))
+_X, _Y = (
+    int(v)
+    for v in grid.deinterleave(grid.from_quadkey(grid.quadkey(_TILE, grid.TILE_ZOOM) + "0" * 7))
+)
 
 
 def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
@@ -44,7 +50,11 @@ def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
     n, now = len(cell), time.time_ns()
-    shape = -0.5 * np.square((mugrid.CENTRES - 0.15) / 0.04) if ice else np.where(mugrid.CENTRES < 0.2, -6.0, 0.0)
+    shape = (
+        -0.5 * np.square((mugrid.CENTRES - 0.15) / 0.04)
+        if ice
+        else np.where(mugrid.CENTRES < 0.2, -6.0, 0.0)
+    )
     columns = {
         "enter_time": np.full(n, now - SECOND), "leave_time": np.full(n, now), "cell": cell,
         "sector": np.zeros(n, np.int8), "latitude": latitude, "longitude": longitude,
@@ -52,12 +62,24 @@ def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool
         "mu_utilised": np.full(n, 0.15 if ice else 0.2, np.float32),
         "log_likelihood": np.tile(mugrid.encode_log_likelihood(shape), (n, 1)),
     }  # fmt: skip
-    return Batch(Kind.OBSERVATION, vehicle, 1 + sum(vehicle.encode()), int(grid.region_of(cell[0])), seq, seq, columns)
+    return Batch(
+        Kind.OBSERVATION,
+        vehicle,
+        1 + sum(vehicle.encode()),
+        int(grid.region_of(cell[0])),
+        seq,
+        seq,
+        columns,
+    )
 
 
 def publish(session: zenoh.Session, one: Batch) -> None:
     """Put a batch on its vehicle's key."""
-    session.put(keys.observation_key(one.region, one.vehicle), wire.encode(one), encoding=wire.ENCODING[one.kind])
+    session.put(
+        keys.observation_key(one.region, one.vehicle),
+        wire.encode(one),
+        encoding=wire.ENCODING[one.kind],
+    )
 
 
 def load(endpoint: str) -> None:
@@ -96,7 +118,9 @@ def bare(endpoint: str, folder: str) -> None:
 @contextmanager
 def process(*words: str) -> Iterator[None]:
     """A command that runs as long as the block."""
-    running = subprocess.Popen([sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    running = subprocess.Popen(
+        [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
     try:
         yield
     finally:
@@ -150,7 +174,9 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
         cell = int(second.columns["cell"][0])
         began = time.perf_counter()
         publish(session, second)
-        when = next(when for found, when in iter(lambda: heard.get(timeout=30.0), None) if found == cell)
+        when = next(
+            when for found, when in iter(lambda: heard.get(timeout=30.0), None) if found == cell
+        )
         assert when > began, "an alert before there was a second vehicle"
         out.append(1e3 * (when - began))
     return out
@@ -175,7 +201,10 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
     rng, sent = np.random.default_rng(0), {}
     for seq in range(1, ACKS + 1):
         sent[seq] = time.perf_counter()
-        publish(session, batch("acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False))
+        publish(
+            session,
+            batch("acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False),
+        )
         time.sleep(rng.uniform(0.0, 0.3))
     out = []
     for _ in sent:
@@ -198,23 +227,38 @@ def service() -> list[Figure]:
         stack.enter_context(router)
         config = folder / "service.json"
         config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
-        words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / "archive"), "--config", str(config))
+        words = (
+            "-m",
+            "fleet_service.cli",
+            "run",
+            "--archive",
+            str(folder / "archive"),
+            "--config",
+            str(config),
+        )
         stack.enter_context(process(*words))
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
-        stack.enter_context(process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})"))
+        stack.enter_context(
+            process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
+        )
         until(lambda: len(ask(client, f"{keys.ROOT}/map/**")))
         time.sleep(10.0)  # the window fills
         asked = (tile, f"{tile}?bbox={box}")
         for key, selector in zip((BARE, BARE_BOX), asked, strict=True):
             (folder / Path(key).name).write_bytes(ask(client, selector))
-        cells = [decode_tile((folder / Path(key).name).read_bytes()).num_rows for key in (BARE, BARE_BOX)]
+        cells = [
+            decode_tile((folder / Path(key).name).read_bytes()).num_rows for key in (BARE, BARE_BOX)
+        ]
         nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(folder)!r})"
         stack.enter_context(process("-c", nothing))
         until(lambda: len(ask(client, BARE)))
         ours, boxed, *least = durations_ms(
-            *(lambda selector=selector: ask(client, selector) for selector in (*asked, BARE, BARE_BOX))
+            *(
+                lambda selector=selector: ask(client, selector)
+                for selector in (*asked, BARE, BARE_BOX)
+            )
         )
         alerts, acks = alert_delays_ms(client), ack_delays_s(client)
     limits = [statistics.median(times) for times in least]
@@ -222,9 +266,24 @@ def service() -> list[Figure]:
     return [
         Figure("bench.query.tile_vs_bare", statistics.median(ours) / limits[0], vs[0], 2),
         Figure("bench.query.bbox_vs_bare", statistics.median(boxed) / limits[1], vs[1], 2),
-        Figure("bench.query.p99_ms", float(np.quantile(ours + boxed, 0.99)), "ms, under 20 000 observations/s", 25),
-        Figure("bench.alert.p50_ms", statistics.median(alerts), "ms, publish to subscriber, under load", 50),
+        Figure(
+            "bench.query.p99_ms",
+            float(np.quantile(ours + boxed, 0.99)),
+            "ms, under 20 000 observations/s",
+            25,
+        ),
+        Figure(
+            "bench.alert.p50_ms",
+            statistics.median(alerts),
+            "ms, publish to subscriber, under load",
+            50,
+        ),
         Figure("bench.alert.p99_ms", float(np.quantile(alerts, 0.99)), "ms", 250),
-        Figure("bench.ack.p50_s", statistics.median(acks), "s, publish to acknowledgement, under load", 1.2),
+        Figure(
+            "bench.ack.p50_s",
+            statistics.median(acks),
+            "s, publish to acknowledgement, under load",
+            1.2,
+        ),
         Figure("bench.ack.p99_s", float(np.quantile(acks, 0.99)), "s", 2.5),
     ]

@@ -47,9 +47,17 @@ def shards() -> list[Figure]:
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
     whole = [statistics.median(services_s(sent, split)) for split in (1, 2)]
     rates = [2 * BURST * ROWS / seconds for seconds in (alone[0], whole[0])]
-    told = f"times one, which took {rates[1]:.0f} observations/s; router and sender on the same cores"
+    told = (
+        f"times one, which took {rates[1]:.0f} observations/s; router and sender on the same cores"
+    )
     return [
-        Figure("bench.shards.speedup", alone[0] / alone[1], f"times one engine, {rates[0]:.0f}/s", 1.6, "more"),
+        Figure(
+            "bench.shards.speedup",
+            alone[0] / alone[1],
+            f"times one engine, {rates[0]:.0f}/s",
+            1.6,
+            "more",
+        ),
         Figure("bench.shards.over_zenoh", whole[0] / whole[1], told),
     ]
 
@@ -64,9 +72,17 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
             root.mkdir()
             shares = [[tuple(message) for message in burst[number::processes]] for burst in bursts]
             (root / "sent").write_bytes(pickle.dumps(shares))
-            command = [sys.executable, "-c", f"from tests.benchmarks.shards import engine; engine({str(root)!r})"]
+            command = [
+                sys.executable,
+                "-c",
+                f"from tests.benchmarks.shards import engine; engine({str(root)!r})",
+            ]
             running.append(
-                stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+                stack.enter_context(
+                    subprocess.Popen(
+                        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                    )
+                )
             )
         return [_round(running) for _ in range(len(bursts) + 1)][2:]
 
@@ -85,7 +101,10 @@ def _round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 def engine(root: str) -> None:
     """One engine, a burst at each line of standard input."""
-    bursts = [[Message(*fields) for fields in burst] for burst in pickle.loads((Path(root) / "sent").read_bytes())]
+    bursts = [
+        [Message(*fields) for fields in burst]
+        for burst in pickle.loads((Path(root) / "sent").read_bytes())
+    ]
     with closing(Engine(ServiceConfig(), Path(root) / "archive")) as there:
         gc.freeze()
         for burst in ([], *bursts):
@@ -115,7 +134,10 @@ def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
-        parts = [_part(folder, endpoint, number, regions(bursts[0])[number::services]) for number in range(services)]
+        parts = [
+            _part(folder, endpoint, number, regions(bursts[0])[number::services])
+            for number in range(services)
+        ]
         for part in parts:
             stack.callback(part.kill)
             part.start()
@@ -129,10 +151,20 @@ def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float
 
 def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
     name = f"shard-{number}"
-    config = ServiceConfig(name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(connect=[endpoint]))
+    config = ServiceConfig(
+        name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(connect=[endpoint])
+    )
     path = folder / f"{name}.json"
     path.write_text(config.model_dump_json(include={"name", "regions", "queue_batches", "zenoh"}))
-    words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / name), "--config", str(path))
+    words = (
+        "-m",
+        "fleet_service.cli",
+        "run",
+        "--archive",
+        str(folder / name),
+        "--config",
+        str(path),
+    )
     return Part(name, [sys.executable, *words], folder)
 
 
@@ -153,7 +185,9 @@ def _send(session: zenoh.Session, burst: Sequence[Message]) -> float:
         publisher.undeclare()
     began = time.perf_counter()
     for message in burst:
-        session.put(message.key, message.payload, encoding=message.encoding, congestion_control=_BLOCK)
+        session.put(
+            message.key, message.payload, encoding=message.encoding, congestion_control=_BLOCK
+        )
     if not done.wait(PATIENCE_S):
         raise TimeoutError(f"{len(burst) - settled} batches were not acknowledged")
     took = time.perf_counter() - began

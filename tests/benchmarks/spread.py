@@ -29,8 +29,18 @@ def drives(folder: Path) -> list[Path]:
     """Signal logs, each with its vehicle file, made with the seeds."""
     folder.mkdir()
     for seed in SEEDS:
-        files = ["--out", str(folder / f"d{seed}.parquet"), "--vehicle-out", str(folder / f"d{seed}.json")]
-        if edge_agent(["simulate", "slalom", "--duration", str(DRIVE_S), "--seed", str(seed), *files]) != 0:
+        files = [
+            "--out",
+            str(folder / f"d{seed}.parquet"),
+            "--vehicle-out",
+            str(folder / f"d{seed}.json"),
+        ]
+        if (
+            edge_agent(
+                ["simulate", "slalom", "--duration", str(DRIVE_S), "--seed", str(seed), *files]
+            )
+            != 0
+        ):
             raise RuntimeError("no drive was simulated")
     return sorted(folder.glob("*.parquet"))
 
@@ -61,11 +71,13 @@ def rebuild_difference(folder: Path) -> float:
         spark.spread(
             session,
             zones,
-            spark_sessions.killed_at_first(partial(rebuild_zone, Rebuild(archive, there, UNTIL)), str, tries),
+            spark_sessions.killed_at_first(
+                partial(rebuild_zone, Rebuild(archive, there, UNTIL)), str, tries
+            ),
         )
-    if sum(zone.cells for zone in rebuild(Rebuild(archive, here, UNTIL))) == 0 or len(list(tries.iterdir())) != len(
-        zones
-    ):
+    if sum(zone.cells for zone in rebuild(Rebuild(archive, here, UNTIL))) == 0 or len(
+        list(tries.iterdir())
+    ) != len(zones):
         raise RuntimeError("no cell was rebuilt, or a task was not killed")
     return difference(rebuilt_map(here), rebuilt_map(there))
 

@@ -52,7 +52,12 @@ def state() -> list[Figure]:
     told = f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} ms at the most"
     return [
         Figure("bench.state.snapshot_s", took, told, 1),
-        Figure("bench.state.restart_s", restart, f"s, process to ready, {10 * SINCE} observations since", 5),
+        Figure(
+            "bench.state.restart_s",
+            restart,
+            f"s, process to ready, {10 * SINCE} observations since",
+            5,
+        ),
     ]
 
 

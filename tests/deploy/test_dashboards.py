@@ -17,7 +17,9 @@ from tests.structure import ROOT
 
 FOLDER = ROOT / "deploy" / "dashboards"
 RULES: list[dict[str, Any]] = [
-    rule for group in yaml.safe_load((FOLDER / "gripmap.rules.yml").read_text())["groups"] for rule in group["rules"]
+    rule
+    for group in yaml.safe_load((FOLDER / "gripmap.rules.yml").read_text())["groups"]
+    for rule in group["rules"]
 ]
 EXPRESSIONS = [rule["expr"] for rule in RULES] + [
     target["expr"]
@@ -47,7 +49,11 @@ def test_every_metric_has_a_meaning_and_a_row_in_the_reference(shown: Shown) -> 
     assert len(metrics) > 40
     assert not [metric.name for metric in metrics if not metric.help]
     page = reference_pages.metrics_page(shown)
-    assert not [metric.name for metric in metrics if f"| `{reference_pages.stored_name(metric)}` |" not in page]
+    assert not [
+        metric.name
+        for metric in metrics
+        if f"| `{reference_pages.stored_name(metric)}` |" not in page
+    ]
 
 
 def test_the_handbook_says_what_to_do_about_every_rule() -> None:
@@ -60,6 +66,8 @@ def test_prometheus_accepts_the_rules() -> None:
     if promtool is None:
         pytest.skip("promtool is not installed (Debian's package prometheus has it)")
     done = subprocess.run(
-        [promtool, "check", "rules", str(FOLDER / "gripmap.rules.yml")], capture_output=True, text=True
+        [promtool, "check", "rules", str(FOLDER / "gripmap.rules.yml")],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -33,7 +33,11 @@ DEPLOY = ROOT / "deploy"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 BIN = Path(sys.executable).parent
 PORTS = ("7447", "7448", "9464")
-INSTANCES = {"gripmap-router@": ["router-a", "router-b"], "gripmap-service": [""], "gripmap-agent@": ["car-001"]}
+INSTANCES = {
+    "gripmap-router@": ["router-a", "router-b"],
+    "gripmap-service": [""],
+    "gripmap-agent@": ["car-001"],
+}
 MOST_EXPOSED = 3.0  # of systemd's ten
 START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
@@ -65,10 +69,14 @@ class Site:
         places = {"/etc/gripmap": "etc", "/var/lib/gripmap": "lib", "/var/cache/gripmap": "cache"}
         for place, folder in places.items():
             text = text.replace(place, str(self.root / folder))
-        text = text.replace("%S/gripmap", str(self.root / "lib")).replace("%C/gripmap", str(self.root / "cache"))
+        text = text.replace("%S/gripmap", str(self.root / "lib")).replace(
+            "%C/gripmap", str(self.root / "cache")
+        )
         for port, other in zip(PORTS, self._ports, strict=True):
             text = text.replace(port, other)
-        text = text.replace("${SOURCE}", "simulated").replace("$MORE", "")  # as EnvironmentFile would have it
+        text = text.replace("${SOURCE}", "simulated").replace(
+            "$MORE", ""
+        )  # as EnvironmentFile would have it
         return text.replace("/opt/gripmap/bin", str(BIN))
 
     def unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
@@ -100,7 +108,9 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
     folder.mkdir()
     for unit in UNITS:
         (folder / unit.name).write_text(site.placed(unit.read_text()))
-    names = [str(folder / unit.name.replace("@.", f"@{instance}.")) for unit, instance in instances()]
+    names = [
+        str(folder / unit.name.replace("@.", f"@{instance}.")) for unit, instance in instances()
+    ]
     done = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", *names],
         capture_output=True, text=True, check=False,
@@ -122,8 +132,12 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
         ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", str(folder / unit.name)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert not [line for line in done.stderr.splitlines() if "gripmap" in line or "standby" in line], done.stderr
-    *emptied, started = [line for line in standby.read_text().splitlines() if line.startswith("ExecStart=")]
+    assert not [
+        line for line in done.stderr.splitlines() if "gripmap" in line or "standby" in line
+    ], done.stderr
+    *emptied, started = [
+        line for line in standby.read_text().splitlines() if line.startswith("ExecStart=")
+    ]
     assert emptied == ["ExecStart="]
     assert started.removeprefix("ExecStart=") == f"{site.unit(unit, '')['ExecStart']} --standby"
 
@@ -154,13 +168,18 @@ def test_no_unit_gives_up_or_invents_or_has_another_roles_user() -> None:
         assert service["Restart"] == "always"
         assert {"MemoryMax", "UMask", "TasksMax"} <= set(service)
         assert "simulated" not in unit.read_text()
-        assert "edge-agent" not in service["ExecStart"] or "--source ${SOURCE}" in service["ExecStart"]
+        assert (
+            "edge-agent" not in service["ExecStart"] or "--source ${SOURCE}" in service["ExecStart"]
+        )
     assert len(users) == len(UNITS)
 
 
 def test_what_is_shipped_as_secure_keeps_persons_private() -> None:
     secure = DEPLOY / "secure"
-    agent, service = load(secure / "agent.json", AgentConfig), load(secure / "service.json", ServiceConfig)
+    agent, service = (
+        load(secure / "agent.json", AgentConfig),
+        load(secure / "service.json", ServiceConfig),
+    )
     assert agent.trip_end_m > 0.0
     assert agent.trip_end_s > 0.0
     assert service.public_vehicles > 1
@@ -169,14 +188,18 @@ def test_what_is_shipped_as_secure_keeps_persons_private() -> None:
 
 def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
     file = DEPLOY / "compose.yaml"
-    subprocess.run([BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", file], check=True)
+    subprocess.run(
+        [BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", file], check=True
+    )
     services = YAML(typ="safe").load(file)["services"]
     started = sorted(part["command"] for name, part in services.items() if name != "certs")
     plain = configparser.ConfigParser(strict=False, interpolation=None)
     commands = []
     for unit, instance in instances():
         plain.read_string(unit.read_text().replace("%i", instance))
-        started_by = plain["Service"]["ExecStart"].replace("${SOURCE}", "simulated").replace("$MORE", "")
+        started_by = (
+            plain["Service"]["ExecStart"].replace("${SOURCE}", "simulated").replace("$MORE", "")
+        )
         program, *rest = shlex.split(started_by)
         commands.append([Path(program).name, *rest])
     assert started == sorted(commands)
@@ -187,7 +210,11 @@ def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
 
 
 def test_the_image_copies_only_what_there_is() -> None:
-    words = [line.split() for line in (DEPLOY / "Dockerfile").read_text().splitlines() if line.startswith("COPY ")]
+    words = [
+        line.split()
+        for line in (DEPLOY / "Dockerfile").read_text().splitlines()
+        if line.startswith("COPY ")
+    ]
     sources = [source for line in words for source in line[1:-1]]
     assert sources
     assert [source for source in sources if not (ROOT / source).exists()] == []
@@ -199,9 +226,15 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
     service = load(secure / "service.json", ServiceConfig)
     endpoints = [endpoint for router in fleet.routers.values() for endpoint in router.endpoints]
     assert service.name in fleet.services
-    for config in (service, load(secure / "agent.json", AgentConfig), load(secure / "reader.json", ServiceConfig)):
+    for config in (
+        service,
+        load(secure / "agent.json", AgentConfig),
+        load(secure / "reader.json", ServiceConfig),
+    ):
         assert config.zenoh.connect == endpoints
-    assert f"certs/{fleet.readers[0]}.pem" in json.dumps(load(secure / "reader.json", ServiceConfig).zenoh.config)
+    assert f"certs/{fleet.readers[0]}.pem" in json.dumps(
+        load(secure / "reader.json", ServiceConfig).zenoh.config
+    )
 
 
 @pytest.mark.timeout(400)
@@ -209,30 +242,46 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
     """Certificates, two routers, service, agent, reader; then each is stopped as systemd would."""
     etc = site.root / "etc"
-    enrol = [str(BIN / "fleet-service"), "certs", "--fleet", str(etc / "fleet.json"), "--out", str(etc / "certs")]
+    enrol = [
+        str(BIN / "fleet-service"),
+        "certs",
+        "--fleet",
+        str(etc / "fleet.json"),
+        "--out",
+        str(etc / "certs"),
+    ]
     subprocess.run(enrol, check=True, stdout=subprocess.DEVNULL)
     running: list[subprocess.Popen[bytes]] = []
     with ExitStack() as stack:
-        for unit, instance in sorted(instances(), key=lambda one: list(INSTANCES).index(one[0].stem)):
+        for unit, instance in sorted(
+            instances(), key=lambda one: list(INSTANCES).index(one[0].stem)
+        ):
             section = site.unit(unit, instance)
             Path(section["WorkingDirectory"]).mkdir(parents=True)
             log = stack.enter_context((site.root / f"{unit.stem}{instance}.log").open("wb"))
             process = subprocess.Popen(
-                shlex.split(section["ExecStart"]), cwd=section["WorkingDirectory"], stdout=log, stderr=log
+                shlex.split(section["ExecStart"]),
+                cwd=section["WorkingDirectory"],
+                stdout=log,
+                stderr=log,
             )
             running.append(stack.enter_context(process))
             stack.callback(process.kill)
 
         def rows() -> float:
             lines = fetch(f"{site.address}/metrics")[2].splitlines() if listening() else []
-            return sum(float(line.split()[-1]) for line in lines if line.startswith("gripmap_rows_total"))
+            return sum(
+                float(line.split()[-1]) for line in lines if line.startswith("gripmap_rows_total")
+            )
 
         def cells() -> int:
             shown = ask(load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}).table
             return shown.num_rows if shown else 0
 
         def listening() -> bool:
-            assert all(process.poll() is None for process in running), "a part ended before its time"
+            assert all(process.poll() is None for process in running), (
+                "a part ended before its time"
+            )
             with socket.socket() as probe:
                 return probe.connect_ex(("127.0.0.1", int(site.address.rsplit(":", 1)[1]))) == 0
 
@@ -242,8 +291,12 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
         for process in reversed(running):
             began = time.monotonic()
             process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=10.0) == 0, f"{process.args!r} after {time.monotonic() - began:.1f} s"
-    said = [json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()]
+            assert process.wait(timeout=10.0) == 0, (
+                f"{process.args!r} after {time.monotonic() - began:.1f} s"
+            )
+    said = [
+        json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()
+    ]
     assert said[0]["event"] == "ready"
     # on a busy machine the last of it may be cut off; then it says so
     assert said[-1]["event"] in ("status", "shutdown incomplete")
@@ -252,5 +305,7 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
 
 def test_a_deployment_without_its_certificates_says_which_is_missing(site: Site) -> None:
     config = load(site.root / "etc" / "agent.json", AgentConfig)
-    with pytest.raises(ValueError, match=r"there is no file .*trust.pem; make it with `fleet-service certs`"):
+    with pytest.raises(
+        ValueError, match=r"there is no file .*trust.pem; make it with `fleet-service certs`"
+    ):
         configuration(config.zenoh, "car-001")

@@ -21,7 +21,9 @@ def test_the_examples_of_the_reference_run_in_their_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     examples = re.findall(
-        r"^```python\n(.*?)^```", (DOCS / "reference" / "api.md").read_text(), re.DOTALL | re.MULTILINE
+        r"^```python\n(.*?)^```",
+        (DOCS / "reference" / "api.md").read_text(),
+        re.DOTALL | re.MULTILINE,
     )
     assert len(examples) >= 4
     drive = ["simulate", "slalom", "--duration", "2", "--out", str(tmp_path / "drive.parquet")]
@@ -40,7 +42,9 @@ def test_the_examples_of_the_reference_run_in_their_order(
 def test_every_page_stands_in_the_contents_of_the_site() -> None:
     """One that does not is a warning of Sphinx, and a warning is an error of `make docs`."""
     tables = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
-    entries = [line for table in tables for line in table.splitlines() if line and not line.startswith(":")]
+    entries = [
+        line for table in tables for line in table.splitlines() if line and not line.startswith(":")
+    ]
     listed = [(DOCS / f"{entry}.md").resolve() for entry in entries]
     generated = DOCS / "reference" / "generated"
     assert not [path for path in listed if not path.exists() and path.parent != generated]

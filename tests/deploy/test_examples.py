@@ -33,7 +33,11 @@ Output = pytest.CaptureFixture[str]
 
 def test_every_example_stands_in_their_readme() -> None:
     text = (FOLDER / "README.md").read_text()
-    files = [path.name for path in FOLDER.iterdir() if path.suffix in (".py", ".ipynb", ".qml") and path.stem[0] != "_"]
+    files = [
+        path.name
+        for path in FOLDER.iterdir()
+        if path.suffix in (".py", ".ipynb", ".qml") and path.stem[0] != "_"
+    ]
     assert len(files) > 5
     assert not [name for name in files if f"`{name}`" not in text]
 
@@ -61,7 +65,9 @@ def served(folder: Path) -> Iterator[str]:
         assert heard is not None
         with heard:
             fleet = Fleet(heard).meet()
-            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
+            fleet.settle(
+                *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3))
+            )
             yield endpoints[0]
 
 
@@ -112,7 +118,13 @@ def test_qgis_style_has_the_map_colours_and_none_for_unknown() -> None:
     assert f"{ice[0]},{ice[1]},{ice[2]},255" in text
     assert text.count("b_diagonal") == 1
     edges = np.array(
-        [float(word) for rule in rules.values() if "AND" in rule for word in rule.split() if word[0] in "0123456789"]
+        [
+            float(word)
+            for rule in rules.values()
+            if "AND" in rule
+            for word in rule.split()
+            if word[0] in "0123456789"
+        ]
     )
     assert edges.min() == 0.0
     assert edges.max() >= 1.2

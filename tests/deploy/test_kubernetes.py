@@ -61,9 +61,13 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
     services = {one["metadata"]["name"]: one for one in of_kind(objects, "Service")}
     for one in of_kind(objects, "StatefulSet"):
         assert one["spec"]["serviceName"] in services
-        assert selects(one["spec"]["selector"]["matchLabels"], one["spec"]["template"]["metadata"]["labels"])
+        assert selects(
+            one["spec"]["selector"]["matchLabels"], one["spec"]["template"]["metadata"]["labels"]
+        )
         volumes = one["spec"]["template"]["spec"]["volumes"]
-        assert {volume["configMap"]["name"] for volume in volumes if "configMap" in volume} <= configs
+        assert {
+            volume["configMap"]["name"] for volume in volumes if "configMap" in volume
+        } <= configs
         secrets |= {volume["secret"]["secretName"] for volume in volumes if "secret" in volume}
         for container in one["spec"]["template"]["spec"]["containers"]:
             secrets |= {given["secretRef"]["name"] for given in container.get("envFrom", [])}
@@ -82,7 +86,9 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
     """As a cluster applies them: what a pod may do is what any policy that selects it lets it do."""
     objects = built(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]
-    (router,) = (one for one in labels_of(objects) if one["app.kubernetes.io/component"] == "router")
+    (router,) = (
+        one for one in labels_of(objects) if one["app.kubernetes.io/component"] == "router"
+    )
     for labels in labels_of(objects):
         own = [one for one in policies if selects(one["podSelector"]["matchLabels"], labels)]
         assert own, "whom no policy selects anybody reaches"
@@ -118,11 +124,15 @@ def test_every_container_is_shut_in_and_bounded(overlay: str) -> None:
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(overlay: str, tmp_path: Path) -> None:
+def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
+    overlay: str, tmp_path: Path
+) -> None:
     made = Cluster(overlay, tmp_path)
     listed = load(tmp_path / "fleet.json", Enrolment) if overlay != "one-node" else None
     configs = {
-        name: text for one in of_kind(made.objects, "ConfigMap") for name, text in one["data"].items()
+        name: text
+        for one in of_kind(made.objects, "ConfigMap")
+        for name, text in one["data"].items()
     }  # as they are shipped
     regions: dict[str, list[str]] = {}
     for pod in made.pods:
@@ -132,28 +142,38 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(overlay: str, 
             continue
         config = ServiceConfig.model_validate_json(configs[f"{pod.name}.json"])
         assert config.name == pod.name
-        assert (config.metrics_host, config.metrics_port) == ("0.0.0.0", 9464), "a kubelet asks from outside of the pod"
+        assert (config.metrics_host, config.metrics_port) == ("0.0.0.0", 9464), (
+            "a kubelet asks from outside of the pod"
+        )
         assert listed is None or pod.name in listed.services
-        regions.setdefault(pod.name.rpartition("-")[0], []).append(json.dumps([config.regions, config.archive.second]))
+        regions.setdefault(pod.name.rpartition("-")[0], []).append(
+            json.dumps([config.regions, config.archive.second])
+        )
     assert all(len(set(own)) == 1 for own in regions.values()), (
         "who follows has the regions and the bucket of who leads"
     )
     assert len({own[0] for own in regions.values()}) == len(regions)
     if listed is not None:
-        assert [name for name in listed.services if name not in {pod.name for pod in made.pods}] == []
+        assert [
+            name for name in listed.services if name not in {pod.name for pod in made.pods}
+        ] == []
 
 
 @pytest.mark.campaign
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_what_the_pods_start_works_together_and_leaves_in_time(overlay: str, tmp_path: Path) -> None:
+def test_what_the_pods_start_works_together_and_leaves_in_time(
+    overlay: str, tmp_path: Path
+) -> None:
     with kubernetes.cluster(overlay, tmp_path) as running:
         assert running.failed == []
         services = [pod for pod in running.pods if "router" not in pod.name]
 
         def serving() -> list[str]:
             found = [
-                pod for pod in services if re.search(r"^gripmap_serves\{.*\} 1", running.fetch(pod, "/metrics"), re.M)
+                pod
+                for pod in services
+                if re.search(r"^gripmap_serves\{.*\} 1", running.fetch(pod, "/metrics"), re.M)
             ]
             return [pod.name.rpartition("-")[0] for pod in found]
 
@@ -177,8 +197,12 @@ def reader(running: Cluster) -> zenoh.Session:
     shipped = ServiceConfig.model_validate_json(settings(running, name)).zenoh
     config = {"connect": shipped.connect}
     if running.overlay != "one-node":
-        tls = json.loads((ROOT / "deploy" / "secure" / "reader.json").read_text())["zenoh"]["config"]
-        config["config"] = json.loads(json.dumps(tls).replace("/etc/gripmap/certs", str(running.certificates)))
+        tls = json.loads((ROOT / "deploy" / "secure" / "reader.json").read_text())["zenoh"][
+            "config"
+        ]
+        config["config"] = json.loads(
+            json.dumps(tls).replace("/etc/gripmap/certs", str(running.certificates))
+        )
     session = open_session(ZenohSettings.model_validate(config), None, "reader-0")
     assert session is not None
     return session

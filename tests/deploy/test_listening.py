@@ -12,10 +12,14 @@ from deploy.listening import Drive, ListeningTown, measure
 from edge_agent.lab.simulation.listeners import WarnedDrivers
 
 
-def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Compare drivers who do not react, because different driving gives different measurements."""
     monkeypatch.setattr(listening, "ASKED_S", 4.0)
-    hearing, deaf = (ListeningTown("test", 12, 3, listening=hears, rough=0.0) for hears in (True, False))
+    hearing, deaf = (
+        ListeningTown("test", 12, 3, listening=hears, rough=0.0) for hears in (True, False)
+    )
     hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)
     with_, without = hearing.run(40.0), deaf.run(40.0)
     assert hearing.heard.alerts
@@ -30,8 +34,23 @@ def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(monkeypatc
 
 
 def test_the_figures_count_vehicles_that_slid_and_cells_that_are_covered() -> None:
-    with_ = [Drive({(1, 1)}, {(1, 1), (2, 1), (3, 1)}, 3.0, [True] * 90 + [False] * 10, 900, 2, 4, [(0.1, 0.2)])]
-    without = [Drive({(1, 1), (1, 2), (2, 1)}, {(1, 1), (1, 2), (2, 1)}, 4.0, [True] * 95 + [False] * 5, 800)]
+    with_ = [
+        Drive(
+            {(1, 1)},
+            {(1, 1), (2, 1), (3, 1)},
+            3.0,
+            [True] * 90 + [False] * 10,
+            900,
+            2,
+            4,
+            [(0.1, 0.2)],
+        )
+    ]
+    without = [
+        Drive(
+            {(1, 1), (1, 2), (2, 1)}, {(1, 1), (1, 2), (2, 1)}, 4.0, [True] * 95 + [False] * 5, 800
+        )
+    ]
     found = {figure.name: figure for figure in measure(with_, without)}
     assert found["ahead.lost_grip_ratio"].value == 0.5, "one vehicle of two, however often"
     assert found["ahead.lost_grip.without"].value == 3

@@ -44,12 +44,16 @@ def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
         assert process.wait(10) == 0
 
 
-def test_a_wrong_configuration_names_the_field_and_the_fix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_configuration_names_the_field_and_the_fix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "router.json5"
     path.write_text("{ mode: 'wanderer' }")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     assert router.main(["--config", str(path)]) == 2
-    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, "who called it hears signals as before"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, (
+        "who called it hears signals as before"
+    )
     assert capsys.readouterr().err.startswith("error: config: cannot use")
 
 
@@ -59,7 +63,9 @@ def test_a_taken_port_is_said() -> None:
         router.open_router(listen=endpoints[0])
 
 
-@pytest.mark.parametrize(("name", "model"), [("agent.json", AgentConfig), ("service.json", ServiceConfig)])
+@pytest.mark.parametrize(
+    ("name", "model"), [("agent.json", AgentConfig), ("service.json", ServiceConfig)]
+)
 def test_shipped_configurations_are_read(name: str, model: type[AgentConfig]) -> None:
     assert config.load(router.CONFIG.with_name(name), model).zenoh.connect == ["tcp/127.0.0.1:7447"]
 

@@ -52,7 +52,9 @@ class MadeUp:
         return replace(self, **cut)
 
 
-def estimates(samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1) -> MadeUp:
+def estimates(
+    samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
+) -> MadeUp:
     """Random, or of one mu with a narrow interval; evidence everywhere."""
     rng, shape = np.random.default_rng(seed), (samples, vehicles)
     middle = rng.uniform(0.1, 1.0, shape) if mu is None else np.full(shape, mu)
@@ -63,7 +65,9 @@ def estimates(samples: int, vehicles: int, seed: int = 0, mu: float | None = Non
     return MadeUp(vx, vy, yaw_rate, sideslip, middle, lower, upper, gripped, health, evidence)
 
 
-def ground(east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1) -> Block:
+def ground(
+    east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1
+) -> Block:
     """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every few samples."""
     shape = east.shape
     t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
@@ -81,7 +85,9 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
     step = rng.uniform(0.0, 3.0, (samples, vehicles))
-    block = ground(np.cumsum(step * np.cos(yaw), axis=0), np.cumsum(step * np.sin(yaw), axis=0), yaw)
+    block = ground(
+        np.cumsum(step * np.cos(yaw), axis=0), np.cumsum(step * np.sin(yaw), axis=0), yaw
+    )
     lost = rng.random((samples, vehicles)) < 0.3
     lost[samples // 2 : samples // 2 + 15, 0] = True
     block.signals[lost, S.LATITUDE : S.LONGITUDE + 1] = np.nan
@@ -106,7 +112,9 @@ class Watch:
         """One block."""
         self.tracks, located = locate(self.tracks, block.t, block.signals)
         reported = cast("Estimates", output)  # which has more, of what nobody reads here
-        self.open, observations, states = observe(self.open, block.time, located, reported, self.config)
+        self.open, observations, states = observe(
+            self.open, block.time, located, reported, self.config
+        )
         return located, observations, states
 
 
@@ -119,7 +127,9 @@ def a_log(samples: int) -> dict[str, Any]:
     """Columns of a log at 100 Hz with every channel, of random numbers; rolling straight ahead would look like this."""
     rng = np.random.default_rng(4)
     columns: dict[str, Any] = {name: rng.normal(0.0, 0.1, samples) for name in CHANNELS}
-    columns |= {name: rng.normal(30.0, 0.1, samples) for name in CHANNELS if name.startswith("omega")}
+    columns |= {
+        name: rng.normal(30.0, 0.1, samples) for name in CHANNELS if name.startswith("omega")
+    }
     columns |= {"latitude": np.full(samples, LATITUDE), "longitude": np.full(samples, LONGITUDE)}
     return {"t": np.arange(samples) / 100.0} | columns
 
@@ -128,7 +138,9 @@ def _written(**changes: object) -> Callable[[Path], object]:
     """Writes a log of five samples with some columns replaced, or left out where the change is None."""
 
     def write(path: Path) -> None:
-        columns = {name: column for name, column in (a_log(5) | changes).items() if column is not None}
+        columns = {
+            name: column for name, column in (a_log(5) | changes).items() if column is not None
+        }
         pq.write_table(pa.table(columns), path)
 
     return write

@@ -49,7 +49,9 @@ class Router:
 
     @property
     def settings(self) -> ZenohSettings:
-        return ZenohSettings(connect=[self.endpoint], config={"connect/retry": {"period_init_ms": 50}})
+        return ZenohSettings(
+            connect=[self.endpoint], config={"connect/retry": {"period_init_ms": 50}}
+        )
 
 
 @dataclass
@@ -99,7 +101,9 @@ class Service:
     def wait(self, condition: Callable[[list[Batch]], bool]) -> None:
         """Until the batches received are as wanted."""
         with self._changed:
-            assert self._changed.wait_for(lambda: condition(self.batches), DEADLINE_S), f"{len(self.batches)} batches"
+            assert self._changed.wait_for(lambda: condition(self.batches), DEADLINE_S), (
+                f"{len(self.batches)} batches"
+            )
 
     def identities(self) -> list[tuple[str, int, Kind, int, int]]:
         return [(b.vehicle, b.boot, b.kind, b.region, b.seq) for b in self.batches]

@@ -49,7 +49,11 @@ def replay(drive: Path, out: Path, *more: str, log: Path | None = None) -> list[
 
 def config(folder: Path, router: Router) -> list[str]:
     path = folder / "agent.json"
-    settings = {"zenoh": router.settings.model_dump(), "spool": str(folder / "spool.sqlite"), "flush_s": 0.1}
+    settings = {
+        "zenoh": router.settings.model_dump(),
+        "spool": str(folder / "spool.sqlite"),
+        "flush_s": 0.1,
+    }
     path.write_text(json.dumps(settings))
     return ["--config", str(path)]
 
@@ -71,11 +75,15 @@ def test_simulate_lists_the_manoeuvres(capsys: Output) -> None:
     listed = capsys.readouterr().out
     assert all(re.search(rf"^{re.escape(name)}\s+\S", listed, re.MULTILINE) for name in MANOEUVRES)
     assert main(["simulate", "--list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {name: found.about for name, found in MANOEUVRES.items()}
+    assert json.loads(capsys.readouterr().out) == {
+        name: found.about for name, found in MANOEUVRES.items()
+    }
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_replay_writes_one_row_per_sample_as_the_contract_says(drive: Path, tmp_path: Path, estimator: str) -> None:
+def test_replay_writes_one_row_per_sample_as_the_contract_says(
+    drive: Path, tmp_path: Path, estimator: str
+) -> None:
     out = tmp_path / "estimates.parquet"
     arguments = replay(drive, out)
     arguments[arguments.index("ckf")] = estimator
@@ -90,35 +98,68 @@ def test_replay_writes_one_row_per_sample_as_the_contract_says(drive: Path, tmp_
     assert (middle <= upper).all()
 
 
-def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(drive: Path, tmp_path: Path) -> None:
+def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(
+    drive: Path, tmp_path: Path
+) -> None:
     log, half = pq.read_table(drive / "log.parquet"), tmp_path / "half.parquet"
     pq.write_table(log.slice(0, 411), half)
     assert main(replay(drive, tmp_path / "whole.parquet")) == 0
     assert main(replay(drive, tmp_path / "half-out.parquet", log=half)) == 0
-    whole, first = pq.read_table(tmp_path / "whole.parquet"), pq.read_table(tmp_path / "half-out.parquet")
+    whole, first = (
+        pq.read_table(tmp_path / "whole.parquet"),
+        pq.read_table(tmp_path / "half-out.parquet"),
+    )
     assert first.num_rows == 411
     for name in whole.column_names:
-        expected, found = (np.array(table[name].to_pylist(), dtype=float)[:411] for table in (whole, first))
+        expected, found = (
+            np.array(table[name].to_pylist(), dtype=float)[:411] for table in (whole, first)
+        )
         assert np.array_equal(expected, found, equal_nan=True), name
 
 
-def test_publishing_changes_no_estimate(drive: Path, tmp_path: Path, router: Router, service: Service) -> None:
+def test_publishing_changes_no_estimate(
+    drive: Path, tmp_path: Path, router: Router, service: Service
+) -> None:
     assert main(replay(drive, tmp_path / "plain.parquet")) == 0
-    assert main(replay(drive, tmp_path / "sent.parquet", "--publish", "--trust", *config(tmp_path, router))) == 0
-    assert pq.read_table(tmp_path / "plain.parquet").equals(pq.read_table(tmp_path / "sent.parquet"))
+    assert (
+        main(
+            replay(
+                drive, tmp_path / "sent.parquet", "--publish", "--trust", *config(tmp_path, router)
+            )
+        )
+        == 0
+    )
+    assert pq.read_table(tmp_path / "plain.parquet").equals(
+        pq.read_table(tmp_path / "sent.parquet")
+    )
 
 
 def test_replay_publishes_at_the_time_of_the_drive_and_waits(
     drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
-    more = ["--publish", "--trust", *config(tmp_path, router), "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]
+    more = [
+        "--publish",
+        "--trust",
+        *config(tmp_path, router),
+        "--name",
+        "car-one",
+        "--start",
+        "2026-01-31T07:00:00Z",
+    ]
     assert main(replay(drive, tmp_path / "out", *more)) == 0
     reported = counts(capsys)
     assert reported["unsettled"] == 0
-    assert reported["published"] == reported["acknowledged"] == sum(b.rows for b in service.batches) > 20
+    assert (
+        reported["published"]
+        == reported["acknowledged"]
+        == sum(b.rows for b in service.batches)
+        > 20
+    )
     assert {b.vehicle for b in service.batches} == {"car-one"}
     assert {b.kind for b in service.batches} == set(Kind)
-    enter = np.concatenate([b.columns["enter_time"] for b in service.batches if b.kind is Kind.OBSERVATION])
+    enter = np.concatenate(
+        [b.columns["enter_time"] for b in service.batches if b.kind is Kind.OBSERVATION]
+    )
     assert np.datetime64(int(enter.min()), "ns") == np.datetime64("2026-01-31T07:00:00")
     assert np.datetime64(int(enter.max()), "ns") < np.datetime64("2026-01-31T07:00:08")
 
@@ -127,19 +168,36 @@ IMPATIENT = "import sys; from edge_agent.cli import main, replay; replay.DRAIN_S
 
 
 @pytest.mark.parametrize("well", [True, False])
-def test_replay_with_a_hanging_session_keeps_its_estimates(drive: Path, tmp_path: Path, well: bool) -> None:
+def test_replay_with_a_hanging_session_keeps_its_estimates(
+    drive: Path, tmp_path: Path, well: bool
+) -> None:
     """A frozen router takes the connection and never answers."""
-    router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path)
+    router = Part(
+        "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
+    )
     router.start()
     try:
         settings = {"zenoh": {"connect": [router.line_with("router: ").split()[1]]}}
         router.send(signal.SIGSTOP)
-        (tmp_path / "agent.json").write_text(json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")}))
-        words = replay(drive, tmp_path / "out", "--publish", "--trust", "--config", str(tmp_path / "agent.json"))
-        code = (
-            IMPATIENT if well else f"from edge_agent.observe.pipeline import Pipeline as P; P.finish = 0; {IMPATIENT}"
+        (tmp_path / "agent.json").write_text(
+            json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")})
         )
-        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=150)
+        words = replay(
+            drive,
+            tmp_path / "out",
+            "--publish",
+            "--trust",
+            "--config",
+            str(tmp_path / "agent.json"),
+        )
+        code = (
+            IMPATIENT
+            if well
+            else f"from edge_agent.observe.pipeline import Pipeline as P; P.finish = 0; {IMPATIENT}"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=150
+        )
     finally:
         router.send(signal.SIGCONT)
         router.kill()
@@ -147,25 +205,61 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(drive: Path, tmp_path
     assert json.loads(done.stdout)["unsettled"] > 20
     assert done.returncode == 1
     if well:
-        assert pq.read_table(tmp_path / "out").num_rows == pq.read_table(drive / "log.parquet").num_rows
+        assert (
+            pq.read_table(tmp_path / "out").num_rows
+            == pq.read_table(drive / "log.parquet").num_rows
+        )
     else:
-        assert "TypeError: 'int' object is not callable" in done.stderr, "what went wrong is not swallowed"
+        assert "TypeError: 'int' object is not callable" in done.stderr, (
+            "what went wrong is not swallowed"
+        )
         assert not (tmp_path / "out").exists()
 
 
 def test_run_drives_a_log_in_real_time_and_publishes_it(
     drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
-    source = ["--source", str(drive / "log.parquet"), "--vehicle", str(drive / "vehicle.json"), "--name", "car-two"]
-    assert main(["run", *source, "--estimator", "ckf", "--duration", "1", "--trust", *config(tmp_path, router)]) == 0
+    source = [
+        "--source",
+        str(drive / "log.parquet"),
+        "--vehicle",
+        str(drive / "vehicle.json"),
+        "--name",
+        "car-two",
+    ]
+    assert (
+        main(
+            [
+                "run",
+                *source,
+                "--estimator",
+                "ckf",
+                "--duration",
+                "1",
+                "--trust",
+                *config(tmp_path, router),
+            ]
+        )
+        == 0
+    )
     reported = counts(capsys)
-    assert reported["acknowledged"] == reported["published"] == sum(b.rows for b in service.batches) >= 3
+    assert (
+        reported["acknowledged"]
+        == reported["published"]
+        == sum(b.rows for b in service.batches)
+        >= 3
+    )
     assert {b.estimator for b in service.batches} == {"ckf"}
     assert reported["unsettled"] == 0
 
 
 def test_run_drives_with_the_source_of_another_distribution(
-    drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output, monkeypatch: pytest.MonkeyPatch
+    drive: Path,
+    tmp_path: Path,
+    router: Router,
+    service: Service,
+    capsys: Output,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     about = tmp_path / "their_source-1.0.dist-info"
     about.mkdir()
@@ -176,14 +270,28 @@ def test_run_drives_with_the_source_of_another_distribution(
         "blocks = lambda address: read_log(pathlib.Path(address)).blocks(time.time_ns(), 10)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(plugins, "entry_points_of", plugins.entry_points_of.__wrapped__)  # the cache was filled before
-    source = ["--source", f"theirs:{drive / 'log.parquet'}", "--vehicle", str(drive / "vehicle.json")]
+    monkeypatch.setattr(
+        plugins, "entry_points_of", plugins.entry_points_of.__wrapped__
+    )  # the cache was filled before
+    source = [
+        "--source",
+        f"theirs:{drive / 'log.parquet'}",
+        "--vehicle",
+        str(drive / "vehicle.json"),
+    ]
     words = ["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]
     assert main([*words, "--name", "car-three"]) == 0
     reported = counts(capsys)
-    assert reported["acknowledged"] == reported["published"] == sum(b.rows for b in service.batches) >= 3
+    assert (
+        reported["acknowledged"]
+        == reported["published"]
+        == sum(b.rows for b in service.batches)
+        >= 3
+    )
     assert main([*words[:2], "no-such:address", *words[3:]]) == 2
-    assert "source: 'no-such:address' is no file, and 'no-such' no kind of source" in (line := capsys.readouterr().err)
+    assert "source: 'no-such:address' is no file, and 'no-such' no kind of source" in (
+        line := capsys.readouterr().err
+    )
     assert "kinds are can, gpsd, ros2, theirs, vss" in line
 
 
@@ -191,10 +299,30 @@ def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
     tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
     truth = tmp_path / "truth.parquet"
-    options = ["--vehicles", "4", "--scenario", "demo", "--rate", "50", "--seed", "2", "--truth", str(truth)]
-    assert main(["fleet", *options, "--estimator", "ckf", "--duration", "2", *config(tmp_path, router)]) == 0
+    options = [
+        "--vehicles",
+        "4",
+        "--scenario",
+        "demo",
+        "--rate",
+        "50",
+        "--seed",
+        "2",
+        "--truth",
+        str(truth),
+    ]
+    assert (
+        main(
+            ["fleet", *options, "--estimator", "ckf", "--duration", "2", *config(tmp_path, router)]
+        )
+        == 0
+    )
     names = {f"sim-{n:03}" for n in range(1, 5)}
-    assert {b.vehicle for b in service.batches} == names == set(pq.read_table(truth)["vehicle"].to_pylist())
+    assert (
+        {b.vehicle for b in service.batches}
+        == names
+        == set(pq.read_table(truth)["vehicle"].to_pylist())
+    )
     assert {b.estimator for b in service.batches} == {"ckf"}
     reported = counts(capsys)
     assert reported["unsettled"] == reported["observations_unsettled"] == 0
@@ -230,15 +358,23 @@ def test_what_a_killed_agent_had_stored_is_sent_by_the_next(
     service.batches.clear()
     assert main([*options, "--duration", "0.5"]) == 0
     seen = capsys.readouterr()
-    assert "driving; a line of counts every 5 s" in seen.err, "the first of them comes after five seconds"
+    assert "driving; a line of counts every 5 s" in seen.err, (
+        "the first of them comes after five seconds"
+    )
     assert json.loads(seen.out.splitlines()[-1])["unsettled"] == 0
     assert earlier <= set(service.identities())
 
 
 BAD_ARGUMENTS = {
-    "unknown estimator": (["--estimator", "oracle"], "^error: estimator: 'oracle' is unknown; .*aco-fckf.*ckf"),
+    "unknown estimator": (
+        ["--estimator", "oracle"],
+        "^error: estimator: 'oracle' is unknown; .*aco-fckf.*ckf",
+    ),
     "no vehicle file": (["--vehicle", "nowhere.json"], "^error: vehicle: cannot read nowhere.json"),
-    "broken start": (["--start", "yesterday"], "^error: start: 'yesterday' is no time; write it like 2026"),
+    "broken start": (
+        ["--start", "yesterday"],
+        "^error: start: 'yesterday' is no time; write it like 2026",
+    ),
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
     "name for no key": (
         ["--publish", "--trust", "--name", "My Car/**"],
@@ -268,7 +404,10 @@ def test_a_bad_log_is_one_line_and_exit_code_2_and_leaves_no_output(
 
 
 BAD_VEHICLES = {
-    "negative mass": ({"mass": -1500.0}, "^error: mass: .*greater than 0 .*; correct it in the vehicle file"),
+    "negative mass": (
+        {"mass": -1500.0},
+        "^error: mass: .*greater than 0 .*; correct it in the vehicle file",
+    ),
     "no mass": ({"mass": None}, "^error: mass: "),
     "mass in tonnes": (
         {"mass": 1.643},
@@ -295,9 +434,15 @@ BAD_COMMANDS = {
     "no vehicles": (["fleet", "--vehicles", "0"], "^error: vehicles: "),
     "no rate": (["fleet", "--rate", "nan"], "^error: rate"),
     "unknown scenario": (["fleet", "--scenario", "moon"], "^error: scenario: "),
-    "truth into nowhere": (["fleet", "--truth", "/dev/null/truth"], "^error: truth: cannot write /dev/null/truth"),
+    "truth into nowhere": (
+        ["fleet", "--truth", "/dev/null/truth"],
+        "^error: truth: cannot write /dev/null/truth",
+    ),
     "log without vehicle": (["run", "--source", __file__], "^error: vehicle: is not given; "),
-    "misspelt source": (["run", "--source", "simulted", "--name", "car-x"], "^error: source: 'simulted' is no file"),
+    "misspelt source": (
+        ["run", "--source", "simulted", "--name", "car-x"],
+        "^error: source: 'simulted' is no file",
+    ),
 }
 
 
@@ -318,12 +463,21 @@ def _one_error(capsys: Output, message: str) -> None:
 
 def test_a_setting_that_zenoh_refuses_is_named(drive: Path, tmp_path: Path, capsys: Output) -> None:
     (tmp_path / "agent.json").write_text('{"zenoh": {"config": {"connect/retri": 1}}}')
-    options = ["--publish", "--trust", "--config", str(tmp_path / "agent.json"), "--name", "car-one"]
+    options = [
+        "--publish",
+        "--trust",
+        "--config",
+        str(tmp_path / "agent.json"),
+        "--name",
+        "car-one",
+    ]
     assert main(replay(drive, tmp_path / "out", *options)) == 2
     _one_error(capsys, "^error: zenoh.config.connect/retri: ")
 
 
-def test_an_outbox_in_use_is_refused(drive: Path, tmp_path: Path, router: Router, capsys: Output) -> None:
+def test_an_outbox_in_use_is_refused(
+    drive: Path, tmp_path: Path, router: Router, capsys: Output
+) -> None:
     from edge_agent.publish.outbox import Outbox
 
     options = ["--publish", "--trust", *config(tmp_path, router), "--name", "car-one"]
@@ -342,8 +496,12 @@ def test_every_command_explains_itself(name: str, capsys: Output) -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     script = "import sys; from edge_agent.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-    heavy = "print([m for m in ('numba', 'numpy', 'pyarrow', 'zenoh', 'pydantic') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script + heavy], capture_output=True, text=True, check=True)
+    heavy = (
+        "print([m for m in ('numba', 'numpy', 'pyarrow', 'zenoh', 'pydantic') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script + heavy], capture_output=True, text=True, check=True
+    )
     assert done.stdout.splitlines()[-1] == "[]"
 
 
@@ -351,7 +509,9 @@ def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path
     """Torque, rear steering and half of the wheel speeds are gone."""
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]
-    holes = pa.array(np.where(np.arange(log.num_rows) % 2, np.nan, np.array(log["omega_fl"], dtype=float)))
+    holes = pa.array(
+        np.where(np.arange(log.num_rows) % 2, np.nan, np.array(log["omega_fl"], dtype=float))
+    )
     index = log.column_names.index("omega_fl")
     pq.write_table(log.set_column(index, "omega_fl", holes).drop_columns(gone), tmp_path / "log")
     assert main(replay(drive, tmp_path / "out", log=tmp_path / "log")) == 0

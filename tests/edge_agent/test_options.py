@@ -34,7 +34,19 @@ from schemas.wire import Kind
 from tests.edge_agent.estimators.drives import drive
 
 # simulate: option -> another value than that of SIMULATED
-SIMULATED = ["slalom", "--mu", "0.5", "--speed", "9", "--duration", "2", "--rate", "50", "--seed", "1"]
+SIMULATED = [
+    "slalom",
+    "--mu",
+    "0.5",
+    "--speed",
+    "9",
+    "--duration",
+    "2",
+    "--rate",
+    "50",
+    "--seed",
+    "1",
+]
 SIMULATE = {
     "manoeuvre": ["sine", *SIMULATED[1:]],
     **{name: [*SIMULATED, name, value] for name, value in (
@@ -71,6 +83,7 @@ SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
 UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
 LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
 LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
+PLANNER = "test_limits_for_a_planner_without_listening_are_a_mistake"
 LISTENS = "test_a_car_that_listens_prints_its_warnings_and_heeds_its_route"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
@@ -83,6 +96,7 @@ ELSEWHERE = {
                "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
+               "--compare": "test_compared_estimators_stand_in_the_report",
                "--jobs": "test_so_many_drives_are_under_way_at_once",
                "--engine": "test_an_engine_is_for_several_logs_and_wants_no_jobs",
                "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
@@ -90,6 +104,7 @@ ELSEWHERE = {
               "--json": "test_what_the_doctor_found_is_json_for_a_program"},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS,
+            "--autoware": PLANNER, "--autoware-hash": PLANNER,
             "--vss": "test_the_command_prints_lines_of_the_drive"},
     "fleet": {
         "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",
@@ -128,20 +143,36 @@ WATCHED = {"metrics_port", "metrics_host", "log"}  # shown by tests/schemas/test
 def options(command: str) -> set[str]:
     """Names of the options that a command declares."""
     parser = argparse.ArgumentParser(add_help=False)
-    importlib.import_module(next(c.module for c in COMMANDS if c.name == command)).add_arguments(parser)
-    return {action.option_strings[0] if action.option_strings else action.dest for action in parser._actions}
+    importlib.import_module(next(c.module for c in COMMANDS if c.name == command)).add_arguments(
+        parser
+    )
+    return {
+        action.option_strings[0] if action.option_strings else action.dest
+        for action in parser._actions
+    }
 
 
 def test_every_option_of_every_command_is_in_a_table() -> None:
     for command in COMMANDS:
-        shown = set(ELSEWHERE[command.name]) | {option for name, option in CHANGED if name == command.name}
-        assert options(command.name) == shown | (set(SIMULATE) if command.name == "simulate" else set()), command.name
+        shown = set(ELSEWHERE[command.name]) | {
+            option for name, option in CHANGED if name == command.name
+        }
+        assert options(command.name) == shown | (
+            set(SIMULATE) if command.name == "simulate" else set()
+        ), command.name
 
 
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
     """In their module, with another value or with none elsewhere; that is read, not run."""
-    texts = [path.read_text() for path in sorted(Path(__file__).parent.rglob("test_*.py")) if path != Path(__file__)]
-    texts += [(Path(__file__).parents[1] / f"test_{name}.py").read_text() for name in ("commands", "faces")]
+    texts = [
+        path.read_text()
+        for path in sorted(Path(__file__).parent.rglob("test_*.py"))
+        if path != Path(__file__)
+    ]
+    texts += [
+        (Path(__file__).parents[1] / f"test_{name}.py").read_text()
+        for name in ("commands", "faces")
+    ]
     texts.append(Path(__file__).read_text().partition("def options(")[2])  # behind the tables
     for command, shown in ELSEWHERE.items():
         for option, test in shown.items():
@@ -176,7 +207,9 @@ def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> o
         first = [next(source) for _ in range(3)]
         at_end()
         signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]
-        seen.append([list(vehicles), list(names), signals, config, estimator, memberships, duration_s])
+        seen.append(
+            [list(vehicles), list(names), signals, config, estimator, memberships, duration_s]
+        )
         return 0
 
     monkeypatch.setattr(live, "drive_live", note)
@@ -194,7 +227,9 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
     usual = USUAL[command]
     if option == "--vehicle":
         usual = [*usual, *(word.format(folder / "0", folder / "1") for word in LOGGED)]
-    first, again, other = (driven(words, monkeypatch, folder) for words in (usual, usual, [*usual, *changed]))
+    first, again, other = (
+        driven(words, monkeypatch, folder) for words in (usual, usual, [*usual, *changed])
+    )
     assert first == again
     assert other != first
 
@@ -213,7 +248,9 @@ def tuned(folder: Path, *words: str) -> tuple[object, list[str]]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("option", [option for command, option in CHANGED if command == "tune"])
-def test_every_option_of_tune_changes_what_is_found(option: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_every_option_of_tune_changes_what_is_found(
+    option: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     base = tmp_path_factory.getbasetemp() / "tuned"
     words = [word.format("0") for word in CHANGED["tune", option]]
     assert tuned(base / "usual") != tuned(base / option, *words)
@@ -231,13 +268,24 @@ def test_every_option_of_simulate_changes_what_is_written(option: str, tmp_path:
 
 def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Path) -> None:
     for name, seed in (("one", "1"), ("other", "2")):
-        files = ["--out", str(tmp_path / f"{name}.parquet"), "--vehicle-out", str(tmp_path / f"{name}.json")]
+        files = [
+            "--out",
+            str(tmp_path / f"{name}.parquet"),
+            "--vehicle-out",
+            str(tmp_path / f"{name}.json"),
+        ]
         assert main(["simulate", "slalom", "--duration", "3", "--seed", seed, *files]) == 0
     (tmp_path / "agent.json").write_text(json.dumps({"estimator": "sr-ukf"}))
 
     def reported(log: str = "one", vehicle: str = "one", *more: str) -> FloatArray:
         out = tmp_path / "out.parquet"
-        files = [str(tmp_path / f"{log}.parquet"), "--vehicle", str(tmp_path / f"{vehicle}.json"), "--out", str(out)]
+        files = [
+            str(tmp_path / f"{log}.parquet"),
+            "--vehicle",
+            str(tmp_path / f"{vehicle}.json"),
+            "--out",
+            str(out),
+        ]
         assert main(["replay", *files, *more]) == 0
         return np.asarray(pq.read_table(out)["mu"].to_numpy())
 
@@ -257,7 +305,9 @@ def recorded(
     source = blocks(fleet, rate)
     parts = [next(source) for _ in range(round(10 * seconds))]
     time = np.concatenate([part.t for part in parts])
-    return Block(time, (time * 1e9).astype(np.int64), np.concatenate([part.signals for part in parts])), fleet
+    return Block(
+        time, (time * 1e9).astype(np.int64), np.concatenate([part.signals for part in parts])
+    ), fleet
 
 
 def records(config: AgentConfig) -> list[object]:
@@ -265,7 +315,11 @@ def records(config: AgentConfig) -> list[object]:
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), 2, config)
     _, *output = pipeline.step(block)
     return [
-        [part.vehicle.tolist(), part.urgent.tolist(), *(np.nan_to_num(part.columns[n]).tolist() for n in part.columns)]
+        [
+            part.vehicle.tolist(),
+            part.urgent.tolist(),
+            *(np.nan_to_num(part.columns[n]).tolist() for n in part.columns),
+        ]
         for part in output
     ]
 
@@ -301,7 +355,9 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 
 
 @pytest.mark.parametrize(("estimator", "name"), NUMBERS)
-def test_every_number_of_the_vehicle_file_changes_what_is_estimated(estimator: str, name: str) -> None:
+def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
+    estimator: str, name: str
+) -> None:
     """One fifth more of it; `name` is what a vehicle publishes under, and 002 drives every wheel by its own motor."""
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()
@@ -309,5 +365,7 @@ def test_every_number_of_the_vehicle_file_changes_what_is_estimated(estimator: s
     given = getattr(vehicle, name)
     changed = vehicle.model_copy(update={name: 1.2 * given})
     assert given is not None
-    usual, other = (bank_of(estimator, [one]).advance(t[:, None], broken[:, None]) for one in (vehicle, changed))
+    usual, other = (
+        bank_of(estimator, [one]).advance(t[:, None], broken[:, None]) for one in (vehicle, changed)
+    )
     assert not (np.array_equal(usual.vx, other.vx) and np.array_equal(usual.mu, other.mu))

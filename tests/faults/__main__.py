@@ -13,14 +13,22 @@ from tests.faults.frame import conduct, leave
 def main() -> int:
     """Run; 0 if every bar holds, 1 if one does not."""
     names = [campaign.name for campaign in CAMPAIGNS]
-    parser = argparse.ArgumentParser(prog="tests.faults", description="Fault campaigns; see tests/faults/README.md.")
+    parser = argparse.ArgumentParser(
+        prog="tests.faults", description="Fault campaigns; see tests/faults/README.md."
+    )
     parser.add_argument("--quick", action="store_true", help="three minutes, smaller numbers")
     parser.add_argument("--only", nargs="+", choices=names, help="these campaigns alone")
-    parser.add_argument("--out", type=Path, default=Path(".faults"), help="figures and left-overs (default .faults)")
+    parser.add_argument(
+        "--out", type=Path, default=Path(".faults"), help="figures and left-overs (default .faults)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
     args = parser.parse_args()
-    chosen = [c for c in CAMPAIGNS if (c.name in args.only if args.only else c.in_quick or not args.quick)]
-    found = conduct(chosen, args.out, "faults-quick" if args.quick else "faults", args.quick, args.seed)
+    chosen = [
+        c for c in CAMPAIGNS if (c.name in args.only if args.only else c.in_quick or not args.quick)
+    ]
+    found = conduct(
+        chosen, args.out, "faults-quick" if args.quick else "faults", args.quick, args.seed
+    )
     print(figures.markdown(found))
     return 0 if all(figure.holds for figure in found) else 1
 

@@ -37,7 +37,9 @@ DAYS: Final = 6
 SINCE: Final = 20_000  # observations after the checkpoint
 SEGMENT: Final = 20_000
 OWN: Final = ("processor_s", "mb")  # what a start costs by itself
-NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"  # a quarter of a road
+NEAR: Final = (
+    f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"  # a quarter of a road
+)
 
 
 def run(site: Site) -> list[Figure]:
@@ -46,16 +48,24 @@ def run(site: Site) -> list[Figure]:
     millions = site.of(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)
     smaller = [_smaller(site, millions * share) for share in shares]
-    root = _made(site, (site.folder if site.quick else site.folder.parent) / "age-archive", round(millions * 1e6))
+    root = _made(
+        site,
+        (site.folder if site.quick else site.folder.parent) / "age-archive",
+        round(millions * 1e6),
+    )
     shutil.rmtree(root / CHECKPOINTS, ignore_errors=True)
     cold = _measured("ready", root)
     site.say(f"from Parquet alone: {cold}")
     warm, then = _asked_of(root)
     site.say(f"from a checkpoint: {warm}; a question about the past: {then}")
-    young, old = (_last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2)))
+    young, old = (
+        _last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2))
+    )
     tries = [(_measured("ready", young), _measured("ready", old)) for _ in range(2)]
     # the least of two: what else the machine does only adds
-    alone, aged = ({name: min(one[name] for one in side) for name in OWN} for side in zip(*tries, strict=True))
+    alone, aged = (
+        {name: min(one[name] for one in side) for name in OWN} for side in zip(*tries, strict=True)
+    )
     site.say(f"one day alone: {alone}; after {DAYS - 1} days of months ago: {aged}")
     return [
         figure("faults.age.ready_s", warm["seconds"]),
@@ -68,7 +78,10 @@ def run(site: Site) -> list[Figure]:
         figure("faults.age.old_days", max(aged[name] / alone[name] for name in OWN)),
         figure(
             "faults.age.tenfold",
-            max(now["mb"] / before["mb"] for now, before in zip((warm, then), smaller[0], strict=True)),
+            max(
+                now["mb"] / before["mb"]
+                for now, before in zip((warm, then), smaller[0], strict=True)
+            ),
         ),
         Figure("faults.age.observations", millions, "10^6 observations"),
         Figure("faults.age.at_s", then["seconds"], "s"),
@@ -102,7 +115,9 @@ def _made(site: Site, root: Path, observations: int) -> Path:
     _states(root, 2 * observations)
     site.say("written; being compacted")
     words = ["compact", "--archive", str(root), "--round-rows", "1000000"]
-    subprocess.run([sys.executable, "-m", "fleet_service.cli", *words], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "fleet_service.cli", *words], check=True, stdout=subprocess.DEVNULL
+    )
     said.write_text(str(observations))
     return root
 
@@ -136,7 +151,10 @@ def _states(root: Path, rows: int) -> None:
         for name in ("vx", "vy", "yaw_rate", "sideslip"):
             part[name] = rng.normal(10.0, 1.0, n).astype(np.float32)
         part["received_at"] = part["time"] + 10**9
-        columns = {f.name: part[f.name] if f.name in part else np.zeros(n, np.float32) for f in SCHEMAS[Kind.STATE]}
+        columns = {
+            f.name: part[f.name] if f.name in part else np.zeros(n, np.float32)
+            for f in SCHEMAS[Kind.STATE]
+        }
         writer.write(Kind.STATE, columns | {"with_likelihood": np.zeros(n, bool)})
         writer.sync()
         at += n

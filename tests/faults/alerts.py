@@ -42,7 +42,9 @@ def run(site: Site) -> list[Figure]:
         beside = _beside(there)
         with _opened(there.endpoint) as driver, _opened(beside.command[-1]) as watcher:
             fleet, heard = Fleet(driver).meet(), dict[Place, float]()
-            watched = watcher.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _note(heard, sample))
+            watched = watcher.declare_subscriber(
+                f"{keys.ROOT}/alert/**", lambda sample: _note(heard, sample)
+            )
             for turn in range(site.of(8, 1)):
                 beside.kill()
                 until(lambda: not list(watcher.info.routers_zid()))
@@ -60,7 +62,9 @@ def run(site: Site) -> list[Figure]:
                 waits += [heard[place] - back for place in standing & heard.keys()]
             watched.undeclare()
         beside.kill()
-    site.say(f"{len(waits)} alerts heard again, the last after {max(waits, default=0.0):.1f} s; {missing} missing")
+    site.say(
+        f"{len(waits)} alerts heard again, the last after {max(waits, default=0.0):.1f} s; {missing} missing"
+    )
     return [
         figure("faults.alerts.missing_after_reconnect", missing),
         figure("faults.alerts.standing", len(waits) + missing),

@@ -47,13 +47,20 @@ def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object
         return False
 
 
-def issued(ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0) -> dict[str, Any]:
+def issued(
+    ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
+) -> dict[str, Any]:
     """TLS entries with a certificate that the fleet's own authority issued at some time."""
     authority = ca.read(ground.folder / "authority" / "ca")
     assert authority is not None
     folder.mkdir(exist_ok=True)
-    ca.issue(authority, name, [], days, datetime.now(UTC) - timedelta(days=days_ago)).write(folder / "it")
-    return {"connect_certificate": str(folder / "it.pem"), "connect_private_key": str(folder / "it.key")}
+    ca.issue(authority, name, [], days, datetime.now(UTC) - timedelta(days=days_ago)).write(
+        folder / "it"
+    )
+    return {
+        "connect_certificate": str(folder / "it.pem"),
+        "connect_private_key": str(folder / "it.key"),
+    }
 
 
 def stranger(ground: Ground) -> Path:
@@ -72,7 +79,9 @@ def certificate_of_another_authority(ground: Ground) -> bool:
 
 @attempt
 def no_certificate(ground: Ground) -> bool:
-    return opens(ground, ROGUE, connect_certificate=None, connect_private_key=None, enable_mtls=False)
+    return opens(
+        ground, ROGUE, connect_certificate=None, connect_private_key=None, enable_mtls=False
+    )
 
 
 @attempt
@@ -156,7 +165,9 @@ def vehicle_puts_where_it_may_not(ground: Ground) -> bool:
 
 @attempt
 def reader_puts(ground: Ground) -> bool:
-    return put_by(ground, ground.open(READER, ROUTERS[1]), *spoofed(HONEST), key(READER), keys.ack_key(READER))
+    return put_by(
+        ground, ground.open(READER, ROUTERS[1]), *spoofed(HONEST), key(READER), keys.ack_key(READER)
+    )
 
 
 @attempt
@@ -183,9 +194,13 @@ def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     ground.judged()  # else the refusals of attacks before it are counted as its own
     before, refused = ground.admitted, ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
-    session.put(f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])
+    session.put(
+        f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION]
+    )
     ground.drive(session, ROGUE)
-    return ground.admitted != before + 1 or ground.service.engine.counts["refused.key"] != refused + 1
+    return (
+        ground.admitted != before + 1 or ground.service.engine.counts["refused.key"] != refused + 1
+    )
 
 
 @attempt
@@ -202,10 +217,20 @@ def another_name_within_ones_own_key(ground: Ground) -> bool:
 @attempt
 def delete(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
-    for place in (key(HONEST), key(ROGUE), keys.map_key(TILE), f"{keys.ROOT}/**", keys.ack_key(HONEST)):
+    for place in (
+        key(HONEST),
+        key(ROGUE),
+        keys.map_key(TILE),
+        f"{keys.ROOT}/**",
+        keys.ack_key(HONEST),
+    ):
         session.delete(place)
     ground.passed(session)
-    return not all(put for one in (ground.monitor, ground.reader, ground.honest) for _, put, _ in list(one.heard))
+    return not all(
+        put
+        for one in (ground.monitor, ground.reader, ground.honest)
+        for _, put, _ in list(one.heard)
+    )
 
 
 @attempt
@@ -220,7 +245,9 @@ def spoofed_reply(ground: Ground) -> bool:
     lying = [session.declare_queryable(place, lie, complete=True) for place in places]
     ground.passed(session)
     asked: Any = ground.reader.session.get(
-        f"{keys.ROOT}/map/**", target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE
+        f"{keys.ROOT}/map/**",
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
     )
     through = any(reply.ok is not None and reply.ok.payload.to_bytes() == SECRET for reply in asked)
     for queryable in lying:
@@ -254,7 +281,12 @@ def reader_overhears(ground: Ground) -> bool:
 def foreign_liveliness_token(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
     false = keys.ServiceToken("1202/310/*", ROGUE, "1f").key
-    foreign = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", false)
+    foreign = (
+        keys.alive_key(HONEST),
+        keys.shard_key(ROGUE),
+        f"{keys.ROOT}/alive/{ROGUE}/more",
+        false,
+    )
     places = (*foreign, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]
 
@@ -283,7 +315,9 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 def as_router(ground: Ground, mode: str) -> bool:
     """A vehicle that plays router or peer, so that others' traffic might pass through it."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
-    given = given.model_copy(update={"config": {**given.config, "mode": mode, "listen/endpoints": []}})
+    given = given.model_copy(
+        update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
+    )
     told = {
         "settings": given.model_dump(),
         "name": ROGUE,
@@ -292,7 +326,9 @@ def as_router(ground: Ground, mode: str) -> bool:
         "payload": SECRET.decode(),
     }
     command = [sys.executable, "-m", "tests.faults.rogue"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdin
         assert process.stdout
         print(json.dumps(told), file=process.stdin, flush=True)
@@ -302,8 +338,15 @@ def as_router(ground: Ground, mode: str) -> bool:
         heard = json.loads(process.stdout.readline())
     ground.passed(ground.honest.session)
     own = set(told["put"])  # what it puts itself, it hears
-    overheard = [name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own]
-    return bool(overheard) or heard.count(key(HONEST)) > 1 or ground.monitor.has(SECRET) or ground.reader.has(SECRET)
+    overheard = [
+        name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own
+    ]
+    return (
+        bool(overheard)
+        or heard.count(key(HONEST)) > 1
+        or ground.monitor.has(SECRET)
+        or ground.reader.has(SECRET)
+    )
 
 
 @attempt
@@ -320,8 +363,15 @@ def vehicle_that_plays_peer(ground: Ground) -> bool:
 def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
     through = False
     for name in ("*", "**", "0123", "sim-*", "role/services"):
-        with ground.network.session(name, ROUTERS[1], **issued(ground, name, ground.folder / "odd")) as session:
-            places = (key(HONEST), f"{keys.ROOT}/obs/1202/310/232/0123", keys.map_key(TILE), "gripmap/v1/ack/*")
+        with ground.network.session(
+            name, ROUTERS[1], **issued(ground, name, ground.folder / "odd")
+        ) as session:
+            places = (
+                key(HONEST),
+                f"{keys.ROOT}/obs/1202/310/232/0123",
+                keys.map_key(TILE),
+                "gripmap/v1/ack/*",
+            )
             for place in places:
                 session.put(place, SECRET + name.encode())
             listener = Listener(session, (f"{keys.ROOT}/**",))
@@ -335,9 +385,23 @@ def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
 @attempt
 def names_that_look_like_a_tile_or_a_path_are_enrolled(ground: Ground) -> bool:
     through = False
-    for name in ("0123", "*", "**", "$*", "a/b", "../sim", "sim-000\n", "Sim-000", "", "@admin", "role/services"):
+    for name in (
+        "0123",
+        "*",
+        "**",
+        "$*",
+        "a/b",
+        "../sim",
+        "sim-000\n",
+        "Sim-000",
+        "",
+        "@admin",
+        "role/services",
+    ):
         with suppress(ValueError):
-            through |= bool(Enrolment.model_validate({"routers": {"router-a": {}}, "vehicles": [name]}))
+            through |= bool(
+                Enrolment.model_validate({"routers": {"router-a": {}}, "vehicles": [name]})
+            )
     return through
 
 

@@ -56,7 +56,10 @@ class Made:
         """Take as much as a step allows, and put it on disk; returns acknowledgements."""
         if not self.up:
             return []
-        taken = [self.queue.popleft() for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)))]
+        taken = [
+            self.queue.popleft()
+            for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)))
+        ]
         self.engine.intake.ingest([_message(one) for one in taken], START + round(now * NS))
         return self.engine.settlement.flush()
 
@@ -76,7 +79,9 @@ def _draft(car: int, now: float) -> tuple[Draft, int]:
     )  # fmt: skip
 
     def encoded(seq: int, first_held: int) -> bytes:
-        return wire.encode(replace(told, boot=car + 1, region=region, seq=seq, first_held=first_held))
+        return wire.encode(
+            replace(told, boot=car + 1, region=region, seq=seq, first_held=first_held)
+        )
 
     return Draft(told.vehicle, Kind.OBSERVATION, region, 1, encoded), cell
 
@@ -133,7 +138,9 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
         outbox.close()
     begun = next((at for at, n in enumerate(taken) if n > cars), 0)  # the first cars have noticed
     drain = sum(taken[begun:]) / max(len(taken) - begun, 1) / (TAKEN_PER_S * STEP_S * cars)
-    site.say(f"{backlog} batches waited; {while_away} messages while away; drained in {len(taken) * STEP_S:.0f} s")
+    site.say(
+        f"{backlog} batches waited; {while_away} messages while away; drained in {len(taken) * STEP_S:.0f} s"
+    )
     return [
         figure("faults.away.bytes_ratio", service.sent / made),
         figure("faults.away.lost", lost + left),

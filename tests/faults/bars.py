@@ -50,7 +50,9 @@ BARS: Final = {
     "faults.fuzz.refused": Bar("messages", 1000, "more"),
     "faults.fuzz.answered": Bar("queries", 5, "more"),
     "faults.fuzz.pasts": Bar("pasts rebuilt", 1, "more"),
-    "faults.fuzz_wire.crashes": Bar("ends, tracebacks and failed answers of a real service and vehicles", 0),
+    "faults.fuzz_wire.crashes": Bar(
+        "ends, tracebacks and failed answers of a real service and vehicles", 0
+    ),
     "faults.fuzz_wire.honest_lost": Bar("batches", 0),
     "faults.fuzz_wire.doubled": Bar("rows", 0),
     "faults.fuzz_wire.honest": Bar("batches acknowledged amid it", 10, "more"),
@@ -88,7 +90,9 @@ BARS: Final = {
     "faults.webhook.late": Bar("kinds of receivers that recovered and did not get all", 0),
     "faults.webhook.kinds": Bar("kinds of broken receivers", 12, "more"),
     "faults.webhook.arrived": Bar("alerts", 60, "more"),
-    "faults.path.implausible_accepted": Bar("reports of places that their car cannot have reached", 0),
+    "faults.path.implausible_accepted": Bar(
+        "reports of places that their car cannot have reached", 0
+    ),
     "faults.path.honest_excluded": Bar("rows of the same cars' own way", 0),
     "faults.path.teleports": Bar("cars that report a far place", 100, "more"),
     "faults.path.two_car_alerts": Bar("of 210 places on idle roads, the worst of three ways", 2),
@@ -104,8 +108,12 @@ BARS: Final = {
     "faults.age.cold_mb": Bar("MB", 1500),
     "faults.age.cells": Bar("cells", 50_000, "more"),
     "faults.age.at_bytes": Bar("bytes of the answer", 10_000, "more"),
-    "faults.age.tenfold": Bar("of memory, a start's and a question's, over those of a tenth of the archive", 1.5),
-    "faults.age.old_days": Bar("of the time or memory of a start without days that no longer matter", 1.2),
+    "faults.age.tenfold": Bar(
+        "of memory, a start's and a question's, over those of a tenth of the archive", 1.5
+    ),
+    "faults.age.old_days": Bar(
+        "of the time or memory of a start without days that no longer matter", 1.2
+    ),
     "faults.disk.false_acks": Bar("batches", 0),
     "faults.disk.stuck": Bar("times", 0),
     "faults.disk.times_full": Bar("times", 3, "more"),
@@ -120,7 +128,9 @@ BARS: Final = {
     "cluster.unacknowledged_lost": Bar("batches, likewise", 0),
     "cluster.takeover_s.kill": Bar("s to the next acknowledgement, the longest", 8),
     "cluster.takeover_s.freeze": Bar("s to the next acknowledgement, the longest", 12),
-    "cluster.failovers": Bar("failovers", 95, "more"),  # of a hundred; a frozen one may wake in time
+    "cluster.failovers": Bar(
+        "failovers", 95, "more"
+    ),  # of a hundred; a frozen one may wake in time
     "cluster.failovers.kill": Bar("killed", 5, "more"),
     "cluster.failovers.freeze": Bar("frozen for good", 5, "more"),
     "cluster.failovers.bucket": Bar("cut from the bucket", 5, "more"),

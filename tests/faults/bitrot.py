@@ -55,7 +55,9 @@ def run(site: Site) -> list[Figure]:
             try:
                 found = _found(copy, whole)
             except InputError:
-                if kind != "key":  # without its key an archive is another one: only a person can decide
+                if (
+                    kind != "key"
+                ):  # without its key an archive is another one: only a person can decide
                     loops.append(f"{kind}: {path.name} bit {bit}")
             except Exception as error:  # noqa: BLE001 whatever ends a service at its start ends it at each
                 loops.append(f"{kind}: {path.name} bit {bit}: {error!r}")
@@ -106,7 +108,11 @@ def _rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]
 
 def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
     now, then = (np.asarray(one["map"]["beliefs"]) for one in (found, right))
-    return bool(found["rows"] == right["rows"] and now.shape == then.shape and np.allclose(now, then, 0.0, 1e-6))
+    return bool(
+        found["rows"] == right["rows"]
+        and now.shape == then.shape
+        and np.allclose(now, then, 0.0, 1e-6)
+    )
 
 
 def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
@@ -114,17 +120,25 @@ def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[s
     path, wrong = site.folder / "whole.sqlite", []
     outbox = Outbox(path, boot=5)
     payloads = {seq: random_.randbytes(random_.choice((80, 400))) for seq in range(1, BATCHES + 1)}
-    outbox.store([Draft("car-a", Kind.OBSERVATION, 1, 2, lambda s, f: payloads[s]) for _ in payloads], 0.0)
+    outbox.store(
+        [Draft("car-a", Kind.OBSERVATION, 1, 2, lambda s, f: payloads[s]) for _ in payloads], 0.0
+    )
     outbox.close()
     for number in range(times):
         copy = site.folder / f"spool-{number}.sqlite"
         shutil.copyfile(path, copy)
         bit = _flip(copy, random_)
         outbox = Outbox(copy, boot=6)
-        held = {batch.seq: batch.payload for batch in outbox.held_batches() if batch.stream.vehicle == "car-a"}
+        held = {
+            batch.seq: batch.payload
+            for batch in outbox.held_batches()
+            if batch.stream.vehicle == "car-a"
+        }
         lost = payloads.keys() - held.keys()
         counted = outbox.counts.damages + outbox.counts.damaged
-        if any(payloads.get(seq) != payload for seq, payload in held.items()) or (lost and not counted):
+        if any(payloads.get(seq) != payload for seq, payload in held.items()) or (
+            lost and not counted
+        ):
             wrong.append(f"spool: bit {bit}")
         outbox.close()
     return times, wrong

@@ -58,7 +58,9 @@ CAMPAIGNS: Final = (
             *("faults.age.old_days", "faults.age.tenfold"),
         ),
     ),
-    Campaign("truncation", truncation.run, ("faults.truncation.lost_rows", "faults.truncation.damages")),
+    Campaign(
+        "truncation", truncation.run, ("faults.truncation.lost_rows", "faults.truncation.damages")
+    ),
     Campaign(
         "versions",
         versions.run,
@@ -84,8 +86,17 @@ CAMPAIGNS: Final = (
         "kill",
         kill.run,
         (
-            *("faults.kill.acknowledged_lost", "faults.kill.doubled", "faults.kill.unacknowledged_lost_at_end"),
-            *("faults.kill.map_difference", "faults.kill.upkeep", "faults.kill.kills", "faults.kill.offered_per_s"),
+            *(
+                "faults.kill.acknowledged_lost",
+                "faults.kill.doubled",
+                "faults.kill.unacknowledged_lost_at_end",
+            ),
+            *(
+                "faults.kill.map_difference",
+                "faults.kill.upkeep",
+                "faults.kill.kills",
+                "faults.kill.offered_per_s",
+            ),
         ),
     ),
     Campaign(
@@ -102,15 +113,26 @@ CAMPAIGNS: Final = (
         "away",
         away.run,
         (
-            *("faults.away.bytes_ratio", "faults.away.lost", "faults.away.drain_share", "faults.away.backlog"),
+            *(
+                "faults.away.bytes_ratio",
+                "faults.away.lost",
+                "faults.away.drain_share",
+                "faults.away.backlog",
+            ),
             *("faults.away.map_missing", "faults.away.late"),
         ),
     ),
-    Campaign("alerts", alerts.run, ("faults.alerts.missing_after_reconnect", "faults.alerts.standing")),
+    Campaign(
+        "alerts", alerts.run, ("faults.alerts.missing_after_reconnect", "faults.alerts.standing")
+    ),
     Campaign(
         "leaving",
         outages.leaving,
-        ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost", "faults.leaving.acknowledged"),
+        (
+            "faults.leaving.longest_s",
+            "faults.leaving.acknowledged_lost",
+            "faults.leaving.acknowledged",
+        ),
     ),
     Campaign(
         "disk-full",
@@ -130,7 +152,11 @@ CAMPAIGNS: Final = (
         "fuzz",
         fuzz.run,
         (
-            *("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost"),
+            *(
+                "faults.fuzz.crashes",
+                "faults.fuzz.admitted_out_of_range",
+                "faults.fuzz.honest_lost",
+            ),
             *("faults.fuzz.refused", "faults.fuzz.answered", "faults.fuzz.pasts"),
         ),
     ),
@@ -138,7 +164,11 @@ CAMPAIGNS: Final = (
         "fuzz-wire",
         fuzz_wire.run,
         (
-            *("faults.fuzz_wire.crashes", "faults.fuzz_wire.honest_lost", "faults.fuzz_wire.doubled"),
+            *(
+                "faults.fuzz_wire.crashes",
+                "faults.fuzz_wire.honest_lost",
+                "faults.fuzz_wire.doubled",
+            ),
             *("faults.fuzz_wire.honest", "faults.fuzz_wire.refused", "faults.fuzz_wire.answered"),
         ),
     ),
@@ -146,7 +176,11 @@ CAMPAIGNS: Final = (
         "insider",
         insider.run,
         (
-            *("faults.insider.alerts_alone", "faults.insider.mb_per_hour", "faults.insider.honest_delay_s"),
+            *(
+                "faults.insider.alerts_alone",
+                "faults.insider.mb_per_hour",
+                "faults.insider.honest_delay_s",
+            ),
             *("faults.insider.messages", "faults.insider.honest_lost", "faults.insider.replayed"),
         ),
     ),
@@ -162,7 +196,11 @@ CAMPAIGNS: Final = (
         "path",
         path.run,
         (
-            *("faults.path.implausible_accepted", "faults.path.honest_excluded", "faults.path.teleports"),
+            *(
+                "faults.path.implausible_accepted",
+                "faults.path.honest_excluded",
+                "faults.path.teleports",
+            ),
             *("faults.path.two_car_alerts", "faults.path.pair_alerts", "faults.path.honest_alerts"),
         ),
     ),
@@ -176,6 +214,8 @@ CAMPAIGNS: Final = (
         flood.run,
         ("faults.flood.honest_delay_s", "faults.flood.map_difference", "faults.flood.rate"),
     ),
-    Campaign("link", link.measure, link.OWES, in_quick=False),  # needs root, and a minute for each transport
+    Campaign(
+        "link", link.measure, link.OWES, in_quick=False
+    ),  # needs root, and a minute for each transport
     Campaign("soak", soak.run, soak.OWES, in_quick=False),  # what grows shows only in half an hour
 )

@@ -51,7 +51,11 @@ class Told(NamedTuple):
 
     def longest_wait(self, since: float) -> float:
         """Seconds from `since` until the last batch stored before it was settled; infinite if one never was."""
-        waits = [self.settled.get(name, float("inf")) - since for name, (_, at) in self.stored.items() if at <= since]
+        waits = [
+            self.settled.get(name, float("inf")) - since
+            for name, (_, at) in self.stored.items()
+            if at <= since
+        ]
         return max(waits, default=0.0)
 
     def stored_between(self, begin: float, end: float) -> int:
@@ -105,7 +109,10 @@ def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, i
     found = whole.group_by(ROW[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
     pseudonyms, now = Pseudonyms(archive / "keys"), time.time_ns()
     start_of = {
-        (pseudonyms.of(vehicle, now - ago), pseudonyms.boot(vehicle, boot, now - ago)): (vehicle, boot)
+        (pseudonyms.of(vehicle, now - ago), pseudonyms.boot(vehicle, boot, now - ago)): (
+            vehicle,
+            boot,
+        )
         for vehicle, boot in starts
         for ago in (0, HOUR_NS)
     }

@@ -77,7 +77,9 @@ class Found:
 
 def run(site: Site) -> list[Figure]:
     """A year ahead, a year back, thirty years back as without a battery; at run and at start."""
-    cases = [Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)]
+    cases = [
+        Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)
+    ]
     found = Found()
     for number, case in enumerate(cases):
         _one(site.folder / str(number), case, found, site.of(60, 20))
@@ -104,7 +106,12 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             found.sent += VEHICLES
             for again in (max(seq - 5, 1), seq):
                 ingest_messages(
-                    engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)]
+                    engine,
+                    clock,
+                    [
+                        _message(v, again, machine.true - (seq - again) * NS)
+                        for v in range(VEHICLES)
+                    ],
                 )
             engine.settlement.flush()
             if clock.moment().sure:
@@ -132,7 +139,9 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             keep(engine, root)
             compact(root)
             drive(engine, clock, 3)
-            found.rejected += sum(n for name, n in engine.counts.items() if name.startswith("refused"))
+            found.rejected += sum(
+                n for name, n in engine.counts.items() if name.startswith("refused")
+            )
             found.alerts_lost += engine.alerts.count == 0
 
     def stands(engine: Engine) -> None:
@@ -154,11 +163,15 @@ def _retire(root: Path, engine: Engine, clock: SteadyClock) -> None:
 
 def _message(vehicle: int, seq: int, at: int) -> Message:
     one = batch(f"sim-{vehicle:03}", seq, at, [0.15])
-    return Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+    return Message(
+        Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
+    )
 
 
 def _rows(root: Path) -> Counter[tuple[int, int]]:
     """Return how often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
     tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)
-    return Counter(zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True))
+    return Counter(
+        zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True)
+    )

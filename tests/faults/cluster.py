@@ -50,7 +50,12 @@ PROCESSES, VEHICLES, RATE = 2, 6, 25.0  # 300 observations/s
 EVERY: Final = 8  # failovers; in the middle and at the end of them the region is handed over
 HOLD_S: Final = (1.0, 5.0)  # in which all goes well, between two failovers
 # Often, so that the few seconds in which a service lives have some of each; a snapshot costs a second.
-PERIODS: Final[dict[str, object]] = {"compact_s": 5.0, "checkpoint_s": 4.0, "snapshot_s": 20.0, "segment_s": 0.25}
+PERIODS: Final[dict[str, object]] = {
+    "compact_s": 5.0,
+    "checkpoint_s": 4.0,
+    "snapshot_s": 20.0,
+    "segment_s": 0.25,
+}
 KILLED: Final = ("kill", TWO, COMPACTING, COPYING)
 FROZEN: Final = ("freeze", WAKES)
 NAMED: Final = {way: way.replace(" ", "_") for way in WAYS}
@@ -74,7 +79,16 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         bucket = stack.enter_context(bucket_server(site.folder / "objects"))
         module, names = "tests.faults.cluster_service", ["one", "two", "three"]
         there = stack.enter_context(
-            hosts(site.folder, names, endpoint, bucket, module=module, named=True, lease_s=lease_s, **PERIODS)
+            hosts(
+                site.folder,
+                names,
+                endpoint,
+                bucket,
+                module=module,
+                named=True,
+                lease_s=lease_s,
+                **PERIODS,
+            )
         )
         box = populate(there[0].root)
         there[0].part.start()
@@ -85,7 +99,9 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         for part in parts:
             stack.callback(part.kill)
         machines, asking = (
-            Machines(there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_),
+            Machines(
+                there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_
+            ),
             Asking(endpoint, box, site.say),
         )
         ways, router_of = list(WAYS), ZenohSettings(connect=[endpoint])
@@ -96,7 +112,9 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
             found = machines.fail(way)
             happened += [found] if found else []
             told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
-            site.say(f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that nobody serves")
+            site.say(
+                f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that nobody serves"
+            )
             if number % EVERY == EVERY // 2 - 1:
                 machines.ready(1)
                 pauses.append(machines.pause_s(router_of))
@@ -145,7 +163,10 @@ def _counted(failovers: int, happened: list[Failover], census: list[Census]) -> 
         figure("cluster.takeover_s.freeze", longest(FROZEN)),
         _shown(failovers, "cluster.failovers", len(happened), "failovers"),
         _shown(failovers, "cluster.acknowledged", census[0].settled, "batches"),
-        *(_shown(failovers, f"cluster.failovers.{name}", len(ways[way]), "failovers") for way, name in NAMED.items()),
+        *(
+            _shown(failovers, f"cluster.failovers.{name}", len(ways[way]), "failovers")
+            for way, name in NAMED.items()
+        ),
     ]
 
 
@@ -160,19 +181,35 @@ def _told(happened: list[Failover]) -> list[Figure]:
     for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
         seconds = [one.seconds for one in happened if one.way in kinds]
         if seconds:
-            found.append(Figure(f"cluster.takeover_p50_s.{name}", statistics.median(seconds), f"s, of {len(seconds)}"))
+            found.append(
+                Figure(
+                    f"cluster.takeover_p50_s.{name}",
+                    statistics.median(seconds),
+                    f"s, of {len(seconds)}",
+                )
+            )
     return found
 
 
 def main() -> int:
     """Run; 0 if every bar holds."""
-    parser = argparse.ArgumentParser(prog="tests.faults.cluster", description="Services that follow each other.")
-    parser.add_argument("--failovers", type=int, default=FULL, help=f"how many (default {FULL}, half an hour)")
-    parser.add_argument("--lease-s", type=float, default=LEASE_S, help="on a machine that has no time for 5 s")
-    parser.add_argument("--out", type=Path, default=Path(".faults/cluster"), help="figures and what was left")
+    parser = argparse.ArgumentParser(
+        prog="tests.faults.cluster", description="Services that follow each other."
+    )
+    parser.add_argument(
+        "--failovers", type=int, default=FULL, help=f"how many (default {FULL}, half an hour)"
+    )
+    parser.add_argument(
+        "--lease-s", type=float, default=LEASE_S, help="on a machine that has no time for 5 s"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(".faults/cluster"), help="figures and what was left"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
     args = parser.parse_args()
-    campaign = Campaign("cluster", partial(run, failovers=args.failovers, lease_s=args.lease_s), OWES)
+    campaign = Campaign(
+        "cluster", partial(run, failovers=args.failovers, lease_s=args.lease_s), OWES
+    )
     found = conduct([campaign], args.out, "cluster", quick=args.failovers < FULL, seed=args.seed)
     print(figures.markdown(found))
     return 0 if all(one.holds for one in found) else 1

@@ -57,7 +57,9 @@ def populate(root: Path) -> str:
         writer.write(Kind.OBSERVATION, rows | moved)
     writer.sync()
     compact(root)
-    return ",".join(f"{side:.6f}" for side in (*(at - SIDE for at in place), *(at + SIDE for at in place)))
+    return ",".join(
+        f"{side:.6f}" for side in (*(at - SIDE for at in place), *(at + SIDE for at in place))
+    )
 
 
 class Journals:
@@ -101,9 +103,16 @@ def loads(folder: Path, endpoint: str, processes: int, vehicles: int, rate: floa
     for number in range(processes):
         config = folder / f"load-{number}.json"
         names = [f"sim-{number}{vehicle:02}" for vehicle in range(vehicles)]
-        plan = {"endpoint": endpoint, "names": names, "rate": rate, "outbox": str(folder / f"load-{number}.sqlite")}
+        plan = {
+            "endpoint": endpoint,
+            "names": names,
+            "rate": rate,
+            "outbox": str(folder / f"load-{number}.sqlite"),
+        }
         config.write_text(json.dumps(plan | {"seed": number}))
-        made.append(Part(f"load-{number}", [sys.executable, "-m", "tests.faults.load", str(config)], folder))
+        made.append(
+            Part(f"load-{number}", [sys.executable, "-m", "tests.faults.load", str(config)], folder)
+        )
         made[-1].start()
     for part in made:
         part.line_with("ready: ")
@@ -144,7 +153,9 @@ class Asking:
             return frozenset(), True
         table = answer.table
         assert table is not None
-        both = [np.asarray(table[name].to_numpy(), np.int64).tolist() for name in ("cell", "sector")]
+        both = [
+            np.asarray(table[name].to_numpy(), np.int64).tolist() for name in ("cell", "sector")
+        ]
         found = frozenset((cell, sector) for cell, sector in zip(*both, strict=True))
         return found, answer.gap is not None or not answer.served
 
@@ -156,7 +167,9 @@ class Asking:
             self.unserved += missing
             if not whole and not missing:
                 self.silent += 1
-                self._say(f"{len(self._known - found)} of {len(self._known)} cells are missing, and nothing is said")
+                self._say(
+                    f"{len(self._known - found)} of {len(self._known)} cells are missing, and nothing is said"
+                )
 
 
 Go = Callable[[Host, random.Random, float], None]
@@ -179,7 +192,9 @@ def _freeze(host: Host, *_: object) -> None:
 
 def _doze(host: Host, random_: random.Random, lease_s: float) -> None:
     host.part.send(signal.SIGSTOP)
-    timer = threading.Timer(lease_s * random_.uniform(*FROZEN), lambda: host.part.send(signal.SIGCONT))
+    timer = threading.Timer(
+        lease_s * random_.uniform(*FROZEN), lambda: host.part.send(signal.SIGCONT)
+    )
     timer.daemon = True
     timer.start()
 
@@ -235,7 +250,12 @@ class Machines:
     """Machines of one region: one serves, one waits, others are spare."""
 
     def __init__(
-        self, hosts: list[Host], leases: Path, lease_s: float, journals: Journals, random_: random.Random
+        self,
+        hosts: list[Host],
+        leases: Path,
+        lease_s: float,
+        journals: Journals,
+        random_: random.Random,
     ) -> None:
         self.serving, self._idle = hosts[0], hosts[1:]
         self._leases, self._lease_s = leases, lease_s
@@ -309,7 +329,9 @@ class Machines:
         mine = self.serving.root / CHECKPOINTS
         last = max(path.name for path in (former.root / CHECKPOINTS).glob("*-*"))
         until(lambda: any(path.name > last for path in mine.glob("*-*")), PATIENCE_S)
-        both = [checkpoints.load(checkpoints.newest(host.root)[0]) for host in (former, self.serving)]
+        both = [
+            checkpoints.load(checkpoints.newest(host.root)[0]) for host in (former, self.serving)
+        ]
         for part in parts:
             part.send(signal.SIGCONT)
         return difference(both[0].tables, both[1].tables)

@@ -89,7 +89,9 @@ def outside(root: Path) -> Iterable[pa.Table]:
 
 def complete(tables: Iterable[pa.Table], owed: int) -> bool:
     """Return True if the rows of batches 1 … `owed` are there, and none twice."""
-    rows = Counter(p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True))
+    rows = Counter(
+        p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
+    )
     there = all((seq, row) in rows for seq in range(1, owed + 1) for row in range(ROWS))
     return there and (not rows or max(rows.values()) == 1)
 
@@ -97,7 +99,9 @@ def complete(tables: Iterable[pa.Table], owed: int) -> bool:
 def run(site: Site) -> list[Figure]:
     """50 kills; in a quick run, five."""
     root, random_ = site.folder / "archive", random.Random(site.seed)
-    part = Part("compaction", [sys.executable, "-m", "tests.faults.compaction", str(root)], site.folder)
+    part = Part(
+        "compaction", [sys.executable, "-m", "tests.faults.compaction", str(root)], site.folder
+    )
     with closing(Writing(root)) as writing, closing(Reading(root, writing)) as reader:
         for _ in range(site.of(50, 5)):
             part.start()

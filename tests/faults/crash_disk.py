@@ -88,8 +88,15 @@ class CrashDisk:
             "replace": self._rename,
             "open": self._open,
         }
-        calls |= {"unlink": self._unlink, "remove": self._unlink, "mkdir": self._mkdir, "rmdir": self._unlink}
-        patches = [mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()]
+        calls |= {
+            "unlink": self._unlink,
+            "remove": self._unlink,
+            "mkdir": self._mkdir,
+            "rmdir": self._unlink,
+        }
+        patches = [
+            mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()
+        ]
         patches.append(mock.patch.object(Path, "open", self._path_open(Path.open)))
         patches.append(mock.patch.object(shutil, "rmtree", _rmtree))
         for patch in patches:
@@ -199,7 +206,9 @@ class CrashDisk:
         """Create the folder that a machine finds after power loss at this moment."""
         there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
         numbered = {self._number.get(path.stat().st_ino): path for path in there}
-        written = {number: path.read_bytes() for number, path in numbered.items() if number is not None}
+        written = {
+            number: path.read_bytes() for number, path in numbered.items() if number is not None
+        }
         self._image(str(self.live), target, {**self._written, **written})
 
     def _image(self, folder: str, target: Path, written: dict[int, bytes]) -> None:
@@ -215,7 +224,9 @@ class CrashDisk:
             if number == FOLDER:
                 self._image(f"{folder}/{name}", target / name, written)
             else:
-                (target / name).write_bytes(self._survives(self._synced.get(number), written[number]))
+                (target / name).write_bytes(
+                    self._survives(self._synced.get(number), written[number])
+                )
 
     def _survives(self, synced: bytes | None, written: bytes) -> bytes:
         """Bytes of a file: the synced ones, or a prefix of what was written since, and rubbish."""

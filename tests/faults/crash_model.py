@@ -57,12 +57,24 @@ class Batch(NamedTuple):
 def rows_of(batches: list[Batch]) -> Rows:
     """Rows of batches of one kind as the log takes them."""
     kind, n = batches[0].kind, ROWS * len(batches)
-    rows: Rows = {"with_likelihood": np.ones(n, bool), "log_likelihood": np.zeros((n, 32), np.uint8)}
+    rows: Rows = {
+        "with_likelihood": np.ones(n, bool),
+        "log_likelihood": np.zeros((n, 32), np.uint8),
+    }
     for f in segments.SCHEMAS[kind]:
         if f.name not in rows:
             rows[f.name] = np.full(n, "") if f.type == pa.string() else np.zeros(n, np.int64)
-    seq, row = np.repeat([batch.seq for batch in batches], ROWS), np.tile(np.arange(ROWS), len(batches))
-    rows |= {"seq": seq, "row": row, "boot": seq * 0 + 1, "region": seq * 0 + 1, "first_held": seq * 0 + 1}
+    seq, row = (
+        np.repeat([batch.seq for batch in batches], ROWS),
+        np.tile(np.arange(ROWS), len(batches)),
+    )
+    rows |= {
+        "seq": seq,
+        "row": row,
+        "boot": seq * 0 + 1,
+        "region": seq * 0 + 1,
+        "first_held": seq * 0 + 1,
+    }
     rows["vehicle"], rows["late"] = np.full(n, VEHICLE.to_bytes(8).hex()), np.zeros(n, bool)
     rows["cell"], rows[layout.TIME[kind]] = CELLS[row], START + seq
     return rows
@@ -106,10 +118,14 @@ class History(Lives[Batch]):
         self.sent.append(Batch(kind, 1 + sum(batch.kind is kind for batch in self.sent)))
         return self.sent[-1]
 
-    def _let_in(self, log: SegmentLog[Batch], streams: SequenceTrackers, batches: list[Batch]) -> None:
+    def _let_in(
+        self, log: SegmentLog[Batch], streams: SequenceTrackers, batches: list[Batch]
+    ) -> None:
         for kind in Kind:
             stream = streams[VEHICLE, 1, kind, 1]
-            new = [b for b in dict.fromkeys(batches) if b.kind is kind and not stream.accepted(b.seq)]
+            new = [
+                b for b in dict.fromkeys(batches) if b.kind is kind and not stream.accepted(b.seq)
+            ]
             if new:
                 for batch in new:
                     stream.accept(batch.seq)
@@ -123,12 +139,21 @@ class History(Lives[Batch]):
         for kind in Kind:
             tables = list(reading.read(root, kind, ["seq", "row"]))
             rows = Counter(
-                pair for t in tables for pair in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
+                pair
+                for t in tables
+                for pair in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
             )
-            found += [f"{kind} {pair} is there {count} times" for pair, count in rows.items() if count > 1]
+            found += [
+                f"{kind} {pair} is there {count} times" for pair, count in rows.items() if count > 1
+            ]
             owed = {b.seq for b in (self.sent if last else self.acknowledged) if b.kind is kind}
             held = {seq for seq, _ in rows}
-            found += [f"{kind} {seq} is lost" for seq in sorted(owed) for row in range(ROWS) if not rows[seq, row]]
+            found += [
+                f"{kind} {seq} is lost"
+                for seq in sorted(owed)
+                for row in range(ROWS)
+                if not rows[seq, row]
+            ]
             stream = streams[VEHICLE, 1, kind, 1]
             found += [f"{kind} {b.seq} only counts as held" for b in self.sent
                       if b.kind is kind and stream.accepted(b.seq) and b.seq not in held]  # fmt: skip
@@ -174,7 +199,9 @@ def run(site: Site) -> list[Figure]:
     kinds = (("log", _lived, logs), ("spool", _stored, outboxes), ("service", _served, services))
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
         for kind, one, count in kinds:
-            for number, (found, safe) in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
+            for number, (found, safe) in enumerate(
+                pool.map(one, range(first, first + count), chunksize=10)
+            ):
                 bad += bool(found)
                 acknowledged[kind] += safe
                 for problem in found[:3]:
@@ -190,5 +217,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _quiet() -> None:
-    for module in (load, restart):  # torn files are set aside, and checkpoints not begun from, all the time
+    for module in (
+        load,
+        restart,
+    ):  # torn files are set aside, and checkpoints not begun from, all the time
         logging.getLogger(module.__name__).setLevel(logging.ERROR)

@@ -28,7 +28,12 @@ from fleet_service.archive.format.load import load
 from fleet_service.archive.format.segments import nanoseconds
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
 from fleet_service.archive.maintenance.compaction import compact
-from fleet_service.archive.maintenance.retention import LEAST_DAYS, forget_period, forget_vehicle, retire_rows
+from fleet_service.archive.maintenance.retention import (
+    LEAST_DAYS,
+    forget_period,
+    forget_vehicle,
+    retire_rows,
+)
 from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
@@ -83,7 +88,9 @@ class ServiceHistory(Lives[Sent]):
         super().__init__(number_, folder)
         self.sent: list[Sent] = []
         self.weather: set[int] = set()  # times of reports that acted
-        self.forgetting: set[tuple[str, str]] = set()  # month, and vehicle or nothing, whose forgetting began
+        self.forgetting: set[tuple[str, str]] = (
+            set()
+        )  # month, and vehicle or nothing, whose forgetting began
         self.gone: set[Sent] = set()  # whose rows were forgotten
         self.destroyed: set[bytes] = set()  # keys
         self._nobodys: set[Sent] = set()  # whose rows nobody can tell any more
@@ -94,7 +101,10 @@ class ServiceHistory(Lives[Sent]):
     def _live(self, root: Path, last: bool) -> None:
         if self.sent and self.random.random() < 0.4:
             self._forget(root)
-        with suppress(OSError), ExitStack() as held:  # a service that finds the disk full at its start says so and ends
+        with (
+            suppress(OSError),
+            ExitStack() as held,
+        ):  # a service that finds the disk full at its start says so and ends
             engine = Engine(CONFIG, root)
             held.callback(engine.holding.close)
             for _ in range(STEPS):
@@ -121,13 +131,24 @@ class ServiceHistory(Lives[Sent]):
                 self._nobodys.update(sent for sent in self.sent if sent.month == one.month)
             else:
                 forget_vehicle(root, one.vehicle, one.month)
-                theirs = {sent for sent in self.acknowledged if (sent.month, sent.vehicle) == (one.month, one.vehicle)}
+                theirs = {
+                    sent
+                    for sent in self.acknowledged
+                    if (sent.month, sent.vehicle) == (one.month, one.vehicle)
+                }
                 self.gone |= theirs - self._nobodys
             self.done["forgetting"] += 1
 
     def _step(self, engine: Engine, root: Path) -> None:
         self._now += self.random.randint(5, 3000) * SECOND
-        jobs = {"batches": 8, "flush": 5, "compaction": 2, "checkpoint": 2, "weather": 1, "retention": 1}
+        jobs = {
+            "batches": 8,
+            "flush": 5,
+            "compaction": 2,
+            "checkpoint": 2,
+            "weather": 1,
+            "retention": 1,
+        }
         job = self.random.choices([*jobs], [*jobs.values()])[0]
         with suppress(OSError):  # upkeep counts it and goes on
             if job == "batches":
@@ -166,7 +187,14 @@ class ServiceHistory(Lives[Sent]):
         seq = 1 + sum(one.vehicle == vehicle for one in self.sent)
         latitude = np.full(2, LATITUDE + NORTH * self.random.randrange(PLACES))
         mu = self.random.choice((0.15, 0.5, 0.85))
-        made = batch(vehicle, seq, self._now, [mu, mu], latitude=latitude, cell=grid.cell_of(latitude, LONGITUDE))
+        made = batch(
+            vehicle,
+            seq,
+            self._now,
+            [mu, mu],
+            latitude=latitude,
+            cell=grid.cell_of(latitude, LONGITUDE),
+        )
         self.sent.append(Sent(vehicle, seq, self._now, wire.encode(made)))
         return self.sent[-1]
 
@@ -210,7 +238,12 @@ class ServiceHistory(Lives[Sent]):
         found = [f"{time} is there {count} times" for time, count in rows.items() if count > 1]
         found += self._lost(rows, last) + self._came_back(root, rows)
         reports = (load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.files(root))
-        there = {time for table in reports if table is not None for time in nanoseconds(table["time"]).tolist()}
+        there = {
+            time
+            for table in reports
+            if table is not None
+            for time in nanoseconds(table["time"]).tolist()
+        }
         found += [f"the weather of {time} is lost" for time in sorted(self.weather - there)
                   if time // layout.DAY_NS > self.retired]  # fmt: skip
         found += self._known(root, rows)
@@ -218,7 +251,9 @@ class ServiceHistory(Lives[Sent]):
 
     def _lost(self, rows: Counter[int], last: bool) -> list[str]:
         """Acknowledged, and neither there nor given up; in the last life everything that may come was sent again."""
-        owed = [one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))]
+        owed = [
+            one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
+        ]
         return [f"{one.vehicle} {one.seq} is lost" for one in owed
                 if not self._given_up(one) and not all(rows[time] for time in one.rows)]  # fmt: skip
 
@@ -231,7 +266,11 @@ class ServiceHistory(Lives[Sent]):
 
     def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
         """Return forgotten data that is there nevertheless."""
-        found = [f"{one.vehicle} {one.seq} came back" for one in self.gone if any(rows[time] for time in one.rows)]
+        found = [
+            f"{one.vehicle} {one.seq} came back"
+            for one in self.gone
+            if any(rows[time] for time in one.rows)
+        ]
         keys = (path.read_bytes() for path in (root / "keys").glob("*.key"))
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
 
@@ -244,7 +283,9 @@ class ServiceHistory(Lives[Sent]):
             shutil.copytree(root, copy)
         shutil.rmtree(bare / layout.CHECKPOINTS, ignore_errors=True)
         damaged: list[Path] = []
-        begun, whole = (load_state(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare))
+        begun, whole = (
+            load_state(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare)
+        )
         found = _different(begun, whole, self._now)
         for copy in (same, bare):
             shutil.rmtree(copy)
@@ -257,7 +298,10 @@ class ServiceHistory(Lives[Sent]):
                     found.append(f"{one.vehicle} {one.seq} is there, its key is lost")
                 continue
             first = one.rows[0]
-            name = number(pseudonyms.of(one.vehicle, first)), pseudonyms.boot(one.vehicle, _boot(one.vehicle), first)
+            name = (
+                number(pseudonyms.of(one.vehicle, first)),
+                pseudonyms.boot(one.vehicle, _boot(one.vehicle), first),
+            )
             names = np.array([[*name, REGION, one.seq]], np.int64)
             for memory, by in ((begun, "the checkpoint"), (whole, "the log")):
                 held = bool(rows[one.time])
@@ -276,10 +320,14 @@ def _different(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)
-    there = begun.fusion.slots_of(whole.fusion.cell[slots], whole.fusion.sector[slots].astype(np.int64))
+    there = begun.fusion.slots_of(
+        whole.fusion.cell[slots], whole.fusion.sector[slots].astype(np.int64)
+    )
     if (there < 0).any():
         return [f"{int((there < 0).sum())} cells are not in the checkpoint's map"]
     apart = np.abs(begun.fusion.beliefs(there, now) - whole.fusion.beliefs(slots, now)).max(axis=1)
-    anew = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]  # dropped meanwhile, when it was at rest
+    anew = (
+        begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
+    )  # dropped meanwhile, when it was at rest
     wrong = apart > np.where(anew, NEARLY, SAME)
     return [f"the maps differ by {apart[wrong].max():.2g}"] if wrong.any() else []

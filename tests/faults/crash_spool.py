@@ -53,7 +53,10 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
         settled = {seq for seq in held if random_.random() < 0.3}
         outbox.settle(stream, [(seq, seq) for seq in settled])
         payload = random_.randbytes(random_.choice((50, 3000, 400_000)))
-        batches = outbox.store([Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2, 0.0)  # type: ignore[misc]
+        batches = outbox.store(
+            [Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2,  # type: ignore[misc]
+            0.0,
+        )
         held.update({batch.seq: batch.payload for batch in batches})
         after = Files.of(path)
         for image in (after, _torn(random_, before, after)):
@@ -69,7 +72,10 @@ def _torn(random_: random.Random, before: Files, after: Files) -> Files:
     """Return the files that power loss during the commit may leave."""
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
-        chosen = (random_.choice((before, after)).database[at : at + PAGE].ljust(PAGE, b"\0") for at in pages)
+        chosen = (
+            random_.choice((before, after)).database[at : at + PAGE].ljust(PAGE, b"\0")
+            for at in pages
+        )
         return Files(b"".join(chosen), before.log)
     cut = random_.randint(0, len(after.log))
     database = before.database if before.database == after.database else after.database
@@ -87,5 +93,7 @@ def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes])
     again.close()
     found = [f"batch {seq} is lost" for seq in owed - there.keys()]
     return found + [
-        f"batch {seq} is not what was stored" for seq, payload in there.items() if known.get(seq) != payload
+        f"batch {seq} is not what was stored"
+        for seq, payload in there.items()
+        if known.get(seq) != payload
     ]

@@ -119,7 +119,13 @@ def run(site: Site) -> list[Figure]:
                     acknowledged += _until_settled(engine)
                     stuck += engine.settlement.unsettled > 0
                 acknowledged += _until_done(engine)
-            runs.update({name: n for name, n in engine.counts.items() if name.endswith(("_runs", "_failures"))})
+            runs.update(
+                {
+                    name: n
+                    for name, n in engine.counts.items()
+                    if name.endswith(("_runs", "_failures"))
+                }
+            )
             false += acknowledged > _rows(root)
             room = _room_made(engine, site.folder / "disk") if mounted else 0
         stuck += not _outbox_recovers(site.folder / "disk", mounted)
@@ -143,7 +149,9 @@ def _drive(engine: Engine, since: int, steps: int) -> int:
         now = time.time_ns()
         for vehicle in range(VEHICLES):
             one = batch(f"sim-{vehicle:03}", seq, now - NS, [0.8])
-            engine.intake.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+            engine.intake.ingest(
+                [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now
+            )
         got += _acked(engine.settlement.flush())
         threading.Event().wait(0.2)  # for the jobs
     return got
@@ -187,7 +195,10 @@ def _room_made(engine: Engine, folder: Path) -> int:
         disk_reserve.allocate(root)
         assert (root / disk_reserve.NAME).exists()
         jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
-        retention, before = next(job for job in jobs if job.name == "retention"), len(old_days(root))
+        retention, before = (
+            next(job for job in jobs if job.name == "retention"),
+            len(old_days(root)),
+        )
         with full(folder, mounted=True):
             retention.work(threading.Event())
             return before - len(old_days(root))

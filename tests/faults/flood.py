@@ -115,7 +115,9 @@ def run(site: Site) -> list[Figure]:
     with network(site.folder / "certificates", fleet=fleet) as running:
         service = _service(site.folder, running)
         try:
-            honest = [Honest(running.session(name, ROUTERS[k % 2]), name) for k, name in enumerate(HONEST)]
+            honest = [
+                Honest(running.session(name, ROUTERS[k % 2]), name) for k, name in enumerate(HONEST)
+            ]
             _drive(honest, 4 * EVERY_S)
             _settle(honest)
             before = max(delay for one in honest for delay in one.delays.values())
@@ -123,7 +125,9 @@ def run(site: Site) -> list[Figure]:
             first = {one.name: len(one.sent) for one in honest}
             put = _flood(running, honest, seconds)
             _settle(honest)
-            delays = np.array([d for one in honest for seq, d in one.delays.items() if seq > first[one.name]])
+            delays = np.array(
+                [d for one in honest for seq, d in one.delays.items() if seq > first[one.name]]
+            )
             table = _map(running)
             with_flood = time.time_ns()
             for one in honest:
@@ -132,7 +136,9 @@ def run(site: Site) -> list[Figure]:
             service.terminate()
             service.wait(20.0)
     expected = _without(site.folder / "calm", honest, seconds, with_flood)
-    site.say(f"{put / seconds:.0f} messages/s of flood; honest delays p50 {np.median(delays):.2f} s")
+    site.say(
+        f"{put / seconds:.0f} messages/s of flood; honest delays p50 {np.median(delays):.2f} s"
+    )
     return [
         figure("faults.flood.honest_delay_s", float(delays.max())),
         figure("faults.flood.map_difference", _difference(table, expected, honest)),
@@ -145,7 +151,9 @@ def run(site: Site) -> list[Figure]:
 
 def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
     """The service as a process; returns when it listens."""
-    config = ServiceConfig(zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE)
+    config = ServiceConfig(
+        zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
+    )
     file, log = folder / "service.json", folder / "service.log"
     file.write_text(config.model_dump_json())
     command = [
@@ -190,7 +198,9 @@ def _flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
         "seconds": seconds,
     }
     command = [sys.executable, "-m", "tests.faults.flooder"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdin
         assert process.stdout
         print(json.dumps(told), file=process.stdin, flush=True)
@@ -210,10 +220,14 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
     sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
     began = min(int(one.columns["leave_time"][0]) for one in sent)
     rounds = max(int(seconds), CELLS)
-    sent += [visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds) for k in range(rounds)]
+    sent += [
+        visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds) for k in range(rounds)
+    ]
     engine = Engine(ServiceConfig(), folder)
     for one in sorted(sent, key=lambda one: int(one.columns["leave_time"][0])):
-        engine.intake.ingest([Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])], now)
+        engine.intake.ingest(
+            [Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])], now
+        )
     tiles = list(engine.queries.answer(query.parse({}), lambda _: True, now))
     engine.close()
     return pa.concat_tables([decode_tile(payload) for _, payload in tiles])
@@ -223,7 +237,8 @@ def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -
     """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one is missing."""
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [
-        {row["cell"]: (row["mu_lower"], row["mu_upper"]) for row in table.to_pylist()} for table in (found, expected)
+        {row["cell"]: (row["mu_lower"], row["mu_upper"]) for row in table.to_pylist()}
+        for table in (found, expected)
     ]
     if not driven <= ends[0].keys() & ends[1].keys():
         return float("nan")

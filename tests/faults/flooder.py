@@ -35,7 +35,11 @@ def main() -> None:
         for rows in ROWS
     ]  # fmt: skip
     session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), name))
-    place, encoding, block = key(name), wire.ENCODING[Kind.OBSERVATION], zenoh.CongestionControl.BLOCK
+    place, encoding, block = (
+        key(name),
+        wire.ENCODING[Kind.OBSERVATION],
+        zenoh.CongestionControl.BLOCK,
+    )
     print("ready", flush=True)
     end, sent = time.monotonic() + told["seconds"], 0
     while time.monotonic() < end:

@@ -60,7 +60,9 @@ class Campaign(NamedTuple):
     in_quick: bool = True
 
 
-def conduct(campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int) -> list[Figure]:
+def conduct(
+    campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int
+) -> list[Figure]:
     """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns all figures."""
     found: list[Figure] = []
     out.mkdir(parents=True, exist_ok=True)
@@ -94,7 +96,11 @@ def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:
     folder.mkdir()
 
     def say(line: str) -> None:
-        print(f"{time.monotonic() - began:7.1f} s  {campaign.name}: {line}", file=sys.stderr, flush=True)
+        print(
+            f"{time.monotonic() - began:7.1f} s  {campaign.name}: {line}",
+            file=sys.stderr,
+            flush=True,
+        )
 
     say("begins")
     found = campaign.run(Site(folder, quick, seed, say))

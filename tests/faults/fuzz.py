@@ -72,7 +72,9 @@ def run(site: Site) -> list[Figure]:
             failed, answered, past = _ask(site, engine, asked, now, pasts > 0)
             crashes, answers, pasts = crashes + failed, answers + answered, pasts - past
         if not turn % 200:
-            site.say(f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted")
+            site.say(
+                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted"
+            )
     counts = dict(engine.counts)
     engine.close()
     tiles, broken = _tiles(site, engine, now)
@@ -82,7 +84,10 @@ def run(site: Site) -> list[Figure]:
         figure("faults.fuzz.admitted_out_of_range", impossible),
         figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
         Figure("faults.fuzz.malformed", count + tiles, "messages, queries and tiles"),
-        figure("faults.fuzz.refused", sum(n for name, n in counts.items() if name.startswith("refused."))),
+        figure(
+            "faults.fuzz.refused",
+            sum(n for name, n in counts.items() if name.startswith("refused.")),
+        ),
         Figure("faults.fuzz.admitted", rows, "rows"),
         figure("faults.fuzz.answered", answers),
         figure("faults.fuzz.pasts", site.of(50, 3) - pasts),
@@ -92,7 +97,9 @@ def run(site: Site) -> list[Figure]:
 def _honest(seq: int, now: int) -> Iterator[Message]:
     for name in HONEST:
         sent = batch(name, seq, now, [0.8])
-        yield Message(Kind.OBSERVATION, key(name), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION])
+        yield Message(
+            Kind.OBSERVATION, key(name), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION]
+        )
 
 
 def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
@@ -109,7 +116,9 @@ def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     return 0
 
 
-def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool) -> tuple[int, int, int]:
+def _ask(
+    site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
+) -> tuple[int, int, int]:
     """Return whether a query crashed, was answered, and rebuilt a past map; none does without `past`."""
     rebuilt = 0
     try:
@@ -129,13 +138,17 @@ def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
     """Damaged tiles as a client reads them: how many, and how many crashes."""
     r, crashes, count = np.random.default_rng(site.seed), 0, site.of(50_000, 1_000)
-    (_, good), *_ = engine.queries.answer(query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now)
+    (_, good), *_ = engine.queries.answer(
+        query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now
+    )
     for _ in range(count):
         damaged = bytearray(good)
         for place in r.integers(0, len(damaged), r.integers(1, 9)).tolist():
             damaged[place] = int(r.integers(256))
         try:
-            decode_tile(bytes(damaged[: int(r.integers(len(damaged)))] if r.random() < 0.2 else damaged))
+            decode_tile(
+                bytes(damaged[: int(r.integers(len(damaged)))] if r.random() < 0.2 else damaged)
+            )
         except WireError:
             continue
         except Exception:  # noqa: BLE001
@@ -156,7 +169,9 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
             if name in columns:
                 values = columns[name].to_numpy()
                 absent = (
-                    np.isnan(values) if values.dtype.kind == "f" and name not in NEEDED else np.zeros(len(values), bool)
+                    np.isnan(values)
+                    if values.dtype.kind == "f" and name not in NEEDED
+                    else np.zeros(len(values), bool)
                 )
                 bad |= ~(((values >= least) & (values <= most)) | absent)
         for name in columns.keys() & {"enter_time", "leave_time", "time"}:
@@ -165,8 +180,14 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
         cell, latitude = columns["cell"].to_numpy(), columns["latitude"].to_numpy()
         middle, across = grid.centre(cell)
         north = (middle - latitude) * METRES_PER_DEGREE
-        east = (across - columns["longitude"].to_numpy()) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
-        bad |= (grid.region_of(cell) != columns["region"].to_numpy()) | (np.hypot(north, east) > TWO_CELLS_M)
+        east = (
+            (across - columns["longitude"].to_numpy())
+            * METRES_PER_DEGREE
+            * np.cos(np.radians(latitude))
+        )
+        bad |= (grid.region_of(cell) != columns["region"].to_numpy()) | (
+            np.hypot(north, east) > TWO_CELLS_M
+        )
         rows, impossible = rows + table.num_rows, impossible + int(bad.sum())
         found += sum(vehicle in honest for vehicle in columns["vehicle"].to_pylist())
     return rows, impossible, found

@@ -34,7 +34,13 @@ ANSWER_S: Final = 30.0
 LONGEST_ENCODING: Final = 255
 MAP: Final = f"{keys.ROOT}/map/**"
 TILE: Final = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
-ASKED: Final = (MAP, keys.map_key(TILE), f"{keys.ROOT}/alert/**", keys.alert_key(TILE), f"{keys.ROOT}/**")
+ASKED: Final = (
+    MAP,
+    keys.map_key(TILE),
+    f"{keys.ROOT}/alert/**",
+    keys.alert_key(TILE),
+    f"{keys.ROOT}/**",
+)
 
 
 def run(site: Site) -> list[Figure]:
@@ -58,9 +64,16 @@ def run(site: Site) -> list[Figure]:
         there.drain(DRAIN_S)
         code = there.service.stop() if there.service.alive else 1
         census = take(there.journals, there.archive)
-        said = [line for part in (there.service, *there.loads) for line in part.lines() if "Traceback" in line]
+        said = [
+            line
+            for part in (there.service, *there.loads)
+            for line in part.lines()
+            if "Traceback" in line
+        ]
     failures = counts.get("gripmap_answer_failures_total", 0.0)
-    refused = sum(value for name, value in counts.items() if name.startswith("gripmap_refused_messages"))
+    refused = sum(
+        value for name, value in counts.items() if name.startswith("gripmap_refused_messages")
+    )
     site.say(f"{census}; {failures:.0f} answers failed, {len(said)} tracebacks, exit {code}")
     return [
         figure("faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(said) + failures),
@@ -77,11 +90,19 @@ def _message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
     """Key, payload and encoding of the next."""
     message, what = mutants.message(), r.random()
     if what < 0.02:
-        return keys.weather_key(REGION), changed_bytes(r, message.payload), r.choice(list(wire.ENCODING.values()))
+        return (
+            keys.weather_key(REGION),
+            changed_bytes(r, message.payload),
+            r.choice(list(wire.ENCODING.values())),
+        )
     if what < 0.04:
         return keys.ack_key(r.choice(HONEST)), _unreadable_ack(r), wire.ACK_ENCODING
     if what < 0.06:
-        return r.choice((keys.map_key(TILE), keys.alert_key(TILE))), message.payload, message.encoding
+        return (
+            r.choice((keys.map_key(TILE), keys.alert_key(TILE))),
+            message.payload,
+            message.encoding,
+        )
     return message.key, message.payload, message.encoding
 
 
@@ -99,7 +120,9 @@ def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int
     if len(encoding) > LONGEST_ENCODING:
         return 0
     try:
-        session.put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+        session.put(
+            key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK
+        )
     except (zenoh.ZError, ValueError):
         return 0
     return 1

@@ -39,7 +39,9 @@ class Listener:
     heard: list[tuple[str, bool, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._subscribers = [self.session.declare_subscriber(one, self._hear) for one in self.expressions]
+        self._subscribers = [
+            self.session.declare_subscriber(one, self._hear) for one in self.expressions
+        ]
 
     def _hear(self, sample: zenoh.Sample) -> None:
         put = sample.kind == zenoh.SampleKind.PUT
@@ -57,7 +59,9 @@ class Ground:
         self.network, self.service, self._stack = network, service, stack
         self.folder = network.folder
         self.monitor = Listener(self.open(SERVICE), ("gripmap/**",))
-        self.reader = Listener(self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**"))
+        self.reader = Listener(
+            self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
+        )
         self.honest = Listener(self.open(HONEST), (keys.ack_key(HONEST),))
         self._probe = self.open(SERVICE)
         self._marks = self._seq = 0
@@ -95,7 +99,12 @@ class Ground:
             if place == keys.ack_key(sent.vehicle):
                 with suppress(WireError):
                     _, streams = wire.decode_ack(payload)
-                    durable = [reach for stream in streams if stream.boot == sent.boot for reach in stream.durable]
+                    durable = [
+                        reach
+                        for stream in streams
+                        if stream.boot == sent.boot
+                        for reach in stream.durable
+                    ]
                     if any(first <= sent.seq <= last for first, last in durable):
                         return True
         return False
@@ -118,10 +127,16 @@ class Ground:
 def ground(network: Network) -> Iterator[Ground]:
     """A service behind the network, and the honest parties, connected and heard."""
     config = ServiceConfig(
-        zenoh=settings(network.endpoints[ROUTERS[0]], network.folder), name=SERVICE, put_s=0.1, segment_s=0.05
+        zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),
+        name=SERVICE,
+        put_s=0.1,
+        segment_s=0.05,
     )
     lines: list[str] = []
-    service, stop = Service(config, Path(network.folder, "archive"), lines.append), threading.Event()
+    service, stop = (
+        Service(config, Path(network.folder, "archive"), lines.append),
+        threading.Event(),
+    )
     thread = threading.Thread(target=service.run, args=(stop,))
     thread.start()
     try:

@@ -47,10 +47,17 @@ def _growth(grown: float, seconds: int, *, quick: bool) -> Figure:
 def run(site: Site) -> list[Figure]:
     """An hour, or four minutes in a quick run."""
     seconds, counts = site.of(3600, 240), Counter[str]()
-    random_, start, longest, sent = np.random.default_rng(site.seed), time.time_ns() - 4000 * NS, 0.0, 0
+    random_, start, longest, sent = (
+        np.random.default_rng(site.seed),
+        time.time_ns() - 4000 * NS,
+        0.0,
+        0,
+    )
     at, replayed, said = 0.0, 0, deque[Message](maxlen=100)
     config = ServiceConfig()
-    limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at)
+    limits = RateLimiter(
+        config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at
+    )
     with closing(Engine(config, site.folder / "archive")) as engine:
         warm = 0.0
         for first in range(6):  # what is compiled at first use is no harm that it does
@@ -61,7 +68,11 @@ def run(site: Site) -> list[Figure]:
             attack: list[Message] = []
             while True:
                 again = sent % 7 == 6 and bool(said)
-                one = said[int(random_.integers(len(said)))] if again else _attack(sent, second, now, random_)
+                one = (
+                    said[int(random_.integers(len(said)))]
+                    if again
+                    else _attack(sent, second, now, random_)
+                )
                 if not limits.allows(one.key, len(one.payload), one.encoding):
                     break
                 attack.append(one)
@@ -74,7 +85,9 @@ def run(site: Site) -> list[Figure]:
             if second == WARM_S:
                 warm = _memory_mb()
         grown = _memory_mb() - warm
-        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.alerts.next_to_repeat(10**6))
+        alone = sum(
+            _alone(alert.latitude, alert.longitude) for alert in engine.alerts.next_to_repeat(10**6)
+        )
         settled = engine.counts[Kind.OBSERVATION]
         ours = {name: n for name, n in engine.counts.items() if n}
     site.say(f"{sent} messages of the insider, {settled} observations; {ours}")
@@ -96,7 +109,9 @@ def _attack(number: int, second: int, now: int, random_: np.random.Generator) ->
     if what == 1:  # ... and over the world
         return _message(_scattered(seq, now, random_, 60.0))
     if what == 2:  # a stream for each batch
-        return _message(replace(_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62))))
+        return _message(
+            replace(_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62)))
+        )
     if what == 3:  # text, which is dear to read
         one = _scattered(seq, now, random_, 0.001)
         return _text(one)
@@ -104,13 +119,19 @@ def _attack(number: int, second: int, now: int, random_: np.random.Generator) ->
         old = now - MONTH_NS
         one = _ice(seq, now, 2)
         leave = np.array([old, now])
-        return _message(replace(one, columns=one.columns | {"leave_time": leave, "enter_time": leave - NS}))
+        return _message(
+            replace(one, columns=one.columns | {"leave_time": leave, "enter_time": leave - NS})
+        )
     return _message(_ice(seq, now, 1))  # and its own report, again and again
 
 
 def _ice(seq: int, now: int, rows: int) -> Batch:
     cell = int(grid.cell_of(*ICE))
-    where = {"latitude": np.full(rows, ICE[0]), "longitude": np.full(rows, ICE[1]), "cell": np.full(rows, cell)}
+    where = {
+        "latitude": np.full(rows, ICE[0]),
+        "longitude": np.full(rows, ICE[1]),
+        "cell": np.full(rows, cell),
+    }
     one = batch(CAR, seq, now, [0.15] * rows)
     return replace(one, region=int(grid.region_of(cell)), columns=one.columns | where)
 
@@ -120,7 +141,9 @@ def _visit(name: str, seq: int, now: int, second: int) -> Batch:
     longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
     one = batch(name, seq, now, [0.8])
     cell = grid.cell_of(LATITUDE, longitude)
-    return replace(one, columns=one.columns | {"longitude": np.array([longitude]), "cell": np.array([cell])})
+    return replace(
+        one, columns=one.columns | {"longitude": np.array([longitude]), "cell": np.array([cell])}
+    )
 
 
 def _scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:

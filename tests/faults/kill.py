@@ -38,12 +38,22 @@ AGENTS: Final = 12
 # all that was killed to do as well.
 RATE: Final = 700.0
 KILLS_PER_ROUND: Final = 20
-PAUSE_S: Final = (0.5, 3.0)  # between kills: before, during and after the restart of the ones killed before
+PAUSE_S: Final = (
+    0.5,
+    3.0,
+)  # between kills: before, during and after the restart of the ones killed before
 DOWN_S: Final = (0.0, 1.0)  # how long the killed ones stay away
 DRAIN_S: Final = 90.0
 # So short that compaction, checkpoints and snapshots happen many times within the seconds that a service lives.
-PERIODS: Final[dict[str, object]] = {"compact_s": 2.0, "checkpoint_s": 1.5, "snapshot_s": 3.0, "vehicle_kb_s": 250.0}
-OLD: Final = synthetic.SyntheticFleet(4000, 4, vehicles=50)  # rows of January 2026, beyond what retention keeps
+PERIODS: Final[dict[str, object]] = {
+    "compact_s": 2.0,
+    "checkpoint_s": 1.5,
+    "snapshot_s": 3.0,
+    "vehicle_kb_s": 250.0,
+}
+OLD: Final = synthetic.SyntheticFleet(
+    4000, 4, vehicles=50
+)  # rows of January 2026, beyond what retention keeps
 RETIRED_EVERY: Final = 4  # kills
 RETIRING_KILLED: Final = 0.5
 
@@ -82,7 +92,11 @@ def run(site: Site) -> list[Figure]:
         _reached(site, "faults.kill.upkeep", len(upkeep), 2),
         _reached(site, "faults.kill.kills", kills, 5),
         _reached(site, "faults.kill.offered_per_s", offered / seconds, 100),
-        Figure("faults.kill.whole_per_s", total["observations"] / whole_s, "observations/s, with starts and drains"),
+        Figure(
+            "faults.kill.whole_per_s",
+            total["observations"] / whole_s,
+            "observations/s, with starts and drains",
+        ),
         Figure("faults.kill.observations", total["observations"], "observations"),
     ]
 
@@ -97,7 +111,9 @@ def begin_with_old_rows(archive: Path) -> None:
     """An archive of old rows, which no service reads again: it has a day of today, too."""
     synthetic.write(archive, OLD, OLD.rows // 4)
     compact(archive)
-    (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(exist_ok=True)
+    (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(
+        exist_ok=True
+    )
 
 
 def old_days(archive: Path) -> list[Path]:
@@ -122,10 +138,14 @@ def map_difference(archive: Path) -> float:
             maps.append(cell_table(fusion, slots, engine.seen))
         drop_checkpoints(archive)
     ours, theirs = maps
-    if not all(ours[name].equals(theirs[name]) for name in ("cell", "sector", "observations", "vehicles")):
+    if not all(
+        ours[name].equals(theirs[name]) for name in ("cell", "sector", "observations", "vehicles")
+    ):
         return float("inf")
     told = ("mu", "mu_lower", "mu_upper", "p_slippery")
-    return max(float(np.nanmax(np.abs(ours[name].to_numpy() - theirs[name].to_numpy()))) for name in told)
+    return max(
+        float(np.nanmax(np.abs(ours[name].to_numpy() - theirs[name].to_numpy()))) for name in told
+    )
 
 
 def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tuple[Census, Load]:
@@ -159,11 +179,15 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
     retention.start()  # what the kills left of it
     retention.wait(DRAIN_S)
     assert not old_days(there.archive), f"retention did not go on after a kill; see {retention.log}"
-    amid = sum(records for records, at in told(there.journals).stored.values() if began <= at <= end)
+    amid = sum(
+        records for records, at in told(there.journals).stored.values() if began <= at <= end
+    )
     return take(there.journals, there.archive), Load(amid, end - began, retired)
 
 
 def _victims(there: Stage, random_: random.Random) -> list[Part]:
     """One or several at once; router and service as often as all the agents together."""
     chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
-    return chosen + random_.sample(there.loads, random_.choice((0, 1, 3)) if chosen else random_.choice((1, 2, 5)))
+    return chosen + random_.sample(
+        there.loads, random_.choice((0, 1, 3)) if chosen else random_.choice((1, 2, 5))
+    )

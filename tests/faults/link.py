@@ -53,7 +53,9 @@ class Namespaces:
         self._tag = f"gm{os.getpid()}"
         self.certificates = folder / "certificates"
         routers = {
-            f"router-{letter}": Router(hosts=[ROUTER_ADDRESS, "127.0.0.1"], listen="0.0.0.0", port=port)
+            f"router-{letter}": Router(
+                hosts=[ROUTER_ADDRESS, "127.0.0.1"], listen="0.0.0.0", port=port
+            )
             for letter, port in zip("ab", PORTS, strict=True)
         }
         names = {"services": [SERVICE], "readers": [READER], "vehicles": [*HONEST, FLOODER]}
@@ -67,7 +69,9 @@ class Namespaces:
         run("ip", "-n", namespace, "link", "set", "lo", "up")
         return namespace
 
-    def connect(self, name: str, terms: LinkTerms, net: str = "10.77.0") -> tuple[str, subprocess.Popen[str]]:
+    def connect(
+        self, name: str, terms: LinkTerms, net: str = "10.77.0"
+    ) -> tuple[str, subprocess.Popen[str]]:
         """Return a new namespace of cars, linked to the road, and the process of the link."""
         car, device = self._add(name), f"{DEVICE}{net[3:5]}"
         given = {"left": car, "right": self.road, "device": device, "terms": asdict(terms)}
@@ -98,12 +102,24 @@ class Namespaces:
         file = self.certificates / f"router-{letter}.json5"
         config = json.loads(file.read_text())
         listen = config["listen"]
-        listen["endpoints"] = [one for one in listen["endpoints"] if one.partition("/")[0] in protocols]
+        listen["endpoints"] = [
+            one for one in listen["endpoints"] if one.partition("/")[0] in protocols
+        ]
         if not capped:
             del config["downsampling"]
         used = file.with_suffix(".running.json5")
         used.write_text(json.dumps(config))
-        command = ["ip", "netns", "exec", self.road, sys.executable, "-m", "deploy.router", "--config", str(used)]
+        command = [
+            "ip",
+            "netns",
+            "exec",
+            self.road,
+            sys.executable,
+            "-m",
+            "deploy.router",
+            "--config",
+            str(used),
+        ]
         process = self._popen(command)
         read_line(process)
         return process
@@ -116,11 +132,19 @@ class Namespaces:
         ports = given.pop("ports", PORTS[:1])
         assert isinstance(ports, Sequence)
         connect = [f"{protocol}/{inside}:{port}" for port in ports for protocol in protocols]
-        whole = {"role": role, "name": name, "connect": connect, "certificates": str(self.certificates), **given}
+        whole = {
+            "role": role,
+            "name": name,
+            "connect": connect,
+            "certificates": str(self.certificates),
+            **given,
+        }
         return self.start(namespace, "tests.faults.link_ends", whole)
 
     def _popen(self, command: list[str]) -> subprocess.Popen[str]:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         self._stack.callback(stop, process)
         return process
 
@@ -230,7 +254,9 @@ def block_udp(site: Site) -> float:
         for letter in "ab":
             there.router(letter)
         car, _ = there.connect("car", LinkTerms(delay_s=0.04, drop_udp=True))
-        found = json.loads(read_line(there.end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS)))
+        found = json.loads(
+            read_line(there.end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS))
+        )
         assert found["protocols"] == ["tls"], found
         return float(found["seconds"])
 
@@ -268,7 +294,9 @@ def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
         service = there.end("receive", there.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"])
         read_line(service)
         honest = there.end("send", cars, HONEST[0], ("quic",), streams=streams, drain_s=QUIET_S)
-        attacker = there.end("send", flooding, FLOODER, ("quic",), streams=[{"key": place, "size": 1000, "rate": 0}])
+        attacker = there.end(
+            "send", flooding, FLOODER, ("quic",), streams=[{"key": place, "size": 1000, "rate": 0}]
+        )
         read_line(honest)
         read_line(attacker)
         command(honest, "go")
@@ -295,14 +323,18 @@ def measure(site: Site) -> list[Figure]:
     address_s, lossy_s, flood_s = site.of(15, 6), site.of(60, 12), site.of(20, 5)
     put, lost, gap = change_address(site, "quic", address_s)
     _, tls_lost, tls_gap = change_address(site, "tls", address_s)
-    site.say(f"new addresses: QUIC lost {lost} of {put}, gap {gap:.2f} s; TLS lost {tls_lost}, gap {tls_gap:.2f} s")
+    site.say(
+        f"new addresses: QUIC lost {lost} of {put}, gap {gap:.2f} s; TLS lost {tls_lost}, gap {tls_gap:.2f} s"
+    )
     quic, tls = (delay_alerts(site, protocol, lossy_s) for protocol in ("quic", "tls"))
     site.say(f"lossy link: QUIC {quic}; TLS {tls}")
     ready_s = block_udp(site)
     back_s = return_with_tls(site, (1.0, 4.0, 7.0) if not site.quick else (2.0,))
     ratio, passed = flood(site, flood_s, capped=True)
     free_ratio, free = flood(site, flood_s, capped=False)
-    site.say(f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} {free_ratio:.2f} uncapped")
+    site.say(
+        f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} {free_ratio:.2f} uncapped"
+    )
     return [
         figure("link.address_change.lost", lost),
         figure("link.address_change.gap_s", gap),

@@ -31,7 +31,9 @@ def open_end(given: dict[str, Any]) -> zenoh.Session:
     """Open a session with the certificate of its name."""
     one = settings(given["connect"][0], Path(given["certificates"]))
     config = {key: value for key, value in one.config.items() if key != "connect/retry"}
-    session = open_session(ZenohSettings(connect=given["connect"], config=config), None, given["name"])
+    session = open_session(
+        ZenohSettings(connect=given["connect"], config=config), None, given["name"]
+    )
     assert session is not None
     return session
 
@@ -47,7 +49,10 @@ def receive(given: dict[str, Any]) -> None:
 
     with open_end(given) as session:
         subscribers = [session.declare_subscriber(key, note) for key in given["keys"]]
-        print(json.dumps({"protocols": wait_for_link(session), "subscribers": len(subscribers)}), flush=True)
+        print(
+            json.dumps({"protocols": wait_for_link(session), "subscribers": len(subscribers)}),
+            flush=True,
+        )
         sys.stdin.read()
         print(json.dumps(arrived), flush=True)
 
@@ -72,13 +77,16 @@ def send(given: dict[str, Any]) -> None:
                 over.wait(max(due - time.monotonic(), 0.0))
 
     sessions = {
-        name: open_end({**given, "name": name}) for name in {one.get("name", given["name"]) for one in given["streams"]}
+        name: open_end({**given, "name": name})
+        for name in {one.get("name", given["name"]) for one in given["streams"]}
     }
     links = {name: wait_for_link(session) for name, session in sessions.items()}
     print(json.dumps({"protocols": links}), flush=True)
     sys.stdin.readline()
     threads = [
-        threading.Thread(target=drive, args=(sessions[one.get("name", given["name"])], one), daemon=True)
+        threading.Thread(
+            target=drive, args=(sessions[one.get("name", given["name"])], one), daemon=True
+        )
         for one in given["streams"]
     ]
     for thread in threads:
@@ -114,7 +122,11 @@ def watch(given: dict[str, Any]) -> None:
 
         def tell() -> None:
             if seen:
-                told = {"time": time.monotonic(), "connected": seen[0].is_connected, "protocols": seen[0].protocols}
+                told = {
+                    "time": time.monotonic(),
+                    "connected": seen[0].is_connected,
+                    "protocols": seen[0].protocols,
+                }
                 print(json.dumps(told), flush=True)
 
         seen.append(LinkWatch(session, given["name"], tell))

@@ -136,7 +136,10 @@ def _packets(device: int) -> list[bytes]:
 def main() -> int:
     """Create both devices, say `relay: ready`, and move packets."""
     given = json.loads(sys.argv[1])
-    ends = (open_device(given["left"], given["device"]), open_device(given["right"], given["device"]))
+    ends = (
+        open_device(given["left"], given["device"]),
+        open_device(given["right"], given["device"]),
+    )
     print("relay: ready", flush=True)
     relay(ends, LinkTerms(**given["terms"]))
     return 0

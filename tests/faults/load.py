@@ -52,7 +52,10 @@ def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
     """Tell `+ vehicle boot kind region seq records time` of what is on disk, `- …` of what is settled."""
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
-        os.write(sys.stdout.fileno(), f"{sign} {' '.join(map(str, stream))} {seq} {records} {at}\n".encode())
+        os.write(
+            sys.stdout.fileno(),
+            f"{sign} {' '.join(map(str, stream))} {seq} {records} {at}\n".encode(),
+        )
 
 
 class WatchedOutbox(Outbox):
@@ -74,12 +77,17 @@ def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: 
     n = len(vehicle)
     columns: Columns = {}
     for name, dtype in column_types(Kind.OBSERVATION).items():
-        columns[name] = np.zeros(n, dtype) if dtype.kind != "f" else rng.uniform(0.3, 0.9, n).astype(dtype)
+        columns[name] = (
+            np.zeros(n, dtype) if dtype.kind != "f" else rng.uniform(0.3, 0.9, n).astype(dtype)
+        )
     span = cells_across * 360.0 / 2**grid.CELL_ZOOM
     columns["latitude"], columns["longitude"] = (centre + span * rng.random(n) for centre in PLACE)
     columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
     columns["sector"] = grid.sector_of(columns["yaw"]).astype(np.int8)
-    columns["mu_lower"], columns["mu_upper"] = columns["mu"] - np.float32(0.1), columns["mu"] + np.float32(0.1)
+    columns["mu_lower"], columns["mu_upper"] = (
+        columns["mu"] - np.float32(0.1),
+        columns["mu"] + np.float32(0.1),
+    )
     columns["leave_time"] = np.full(n, now, np.int64)
     columns["enter_time"] = columns["leave_time"] - rng.integers(300_000_000, 900_000_000, n)
     seen = -0.5 * np.square((mugrid.CENTRES - columns["mu"][:, None]) / 0.1)
@@ -128,8 +136,17 @@ def main(path: str) -> int:
     while publisher.unsettled() and not leave.wait(BLOCK_S):
         pass
     clean = publisher.close(STOPPED_DRAIN_S)
-    found = {"late_blocks": late, "longest_lag_s": round(longest, 3), "unsettled": publisher.unsettled()}
-    print(json.dumps({**found, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}), flush=True)
+    found = {
+        "late_blocks": late,
+        "longest_lag_s": round(longest, 3),
+        "unsettled": publisher.unsettled(),
+    }
+    print(
+        json.dumps(
+            {**found, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}
+        ),
+        flush=True,
+    )
     if not clean:
         os._exit(0)
     return 0

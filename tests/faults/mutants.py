@@ -17,12 +17,31 @@ from tests.schemas.examples import batch as whole_batch
 
 Random = random.Random
 PLACES: Final = 64
-_MESSAGE: Final[dict[Kind, Any]] = {Kind.OBSERVATION: pb.ObservationBatch, Kind.STATE: pb.StateBatch}
+_MESSAGE: Final[dict[Kind, Any]] = {
+    Kind.OBSERVATION: pb.ObservationBatch,
+    Kind.STATE: pb.StateBatch,
+}
 _NUMBERS: Final = (
     float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1.0, 1e-320, 0.049, 1.21, 2.0001, 90.0, 180.0, 181.0, 400.0,
     1e9, 1e38, 1e308, 3.15,
 )  # fmt: skip
-_WHOLE: Final = (0, -1, 1, 3, 4, 5, 255, 2**31 - 1, -(2**31), 2**62, 2**63 - 1, -(2**63), 1 << 42, REGION, REGION + 1)
+_WHOLE: Final = (
+    0,
+    -1,
+    1,
+    3,
+    4,
+    5,
+    255,
+    2**31 - 1,
+    -(2**31),
+    2**62,
+    2**63 - 1,
+    -(2**63),
+    1 << 42,
+    REGION,
+    REGION + 1,
+)
 _TEXT: Final = (
     "", "*", "**", "$*", "../../etc/passwd", "<script>alert(1)</script>", "sim-000\n", "\0", "é", "a" * 4000, "0123",
     "rogue-1/../x", "'; drop table", "{name}", "@/**",
@@ -50,7 +69,9 @@ class Mutants:
             place = _changed_key(r, place)
         if r.random() < 0.05:
             encoding = r.choice(_ENCODINGS)
-        return Message(r.choice(list(Kind)) if r.random() < 0.02 else kind, place, payload, encoding)
+        return Message(
+            r.choice(list(Kind)) if r.random() < 0.02 else kind, place, payload, encoding
+        )
 
     def _payload(self, kind: Kind, name: str) -> tuple[bytes, str]:
         r = self._random
@@ -112,12 +133,17 @@ def _states() -> Any:  # noqa: ANN401
 def _at(place: int, rows: int) -> dict[str, Any]:
     """Columns of a batch some cells to the east."""
     longitude = LONGITUDE + 2e-4 * place
-    return {"longitude": [longitude] * rows, "cell": [int(grid.cell_of(LATITUDE, longitude))] * rows}
+    return {
+        "longitude": [longitude] * rows,
+        "cell": [int(grid.cell_of(LATITUDE, longitude))] * rows,
+    }
 
 
 _VALID: Final = {
     Kind.OBSERVATION: [
-        pb.ObservationBatch.FromString(wire.encode(batch("rogue-00", 1, 0, mu, told=told, **_at(place, len(mu)))))
+        pb.ObservationBatch.FromString(
+            wire.encode(batch("rogue-00", 1, 0, mu, told=told, **_at(place, len(mu))))
+        )
         for mu in ([0.8], [0.2], [0.3, 0.9], [0.5, 0.6, 0.7, 0.8, 0.9])
         for told in (True, False)
         for place in range(PLACES)
@@ -193,14 +219,28 @@ def _changed_text(r: Random, text: str) -> str:
         return text[: r.randrange(len(text))]
     if act == 2:
         return text.replace(
-            "1", r.choice(("1e999", "NaN", '"Infinity"', "9" * 5000, "true", "null", "-1e-400")), r.choice((1, 3))
+            "1",
+            r.choice(("1e999", "NaN", '"Infinity"', "9" * 5000, "true", "null", "-1e-400")),
+            r.choice((1, 3)),
         )
     if act == 3:
         return text.replace("}", ', "estimator": ' + '{"a":' * r.choice((1, 40, 2000)) + "}", 1)
     if act == 4:
         return text.replace('"', r.choice(("'", "", '""', "\\u0000")), r.randrange(1, 6))
     if act == 5:
-        return r.choice(("", "null", "[]", "{}", "[" * 50_000, '{"' + "a" * 60_000 + '":1}', "\ud800", "1", '"x"'))
+        return r.choice(
+            (
+                "",
+                "null",
+                "[]",
+                "{}",
+                "[" * 50_000,
+                '{"' + "a" * 60_000 + '":1}',
+                "\ud800",
+                "1",
+                '"x"',
+            )
+        )
     if act == 6:
         return text + text
     at = r.randrange(len(text))

@@ -57,7 +57,10 @@ def frozen(site: Site) -> list[Figure]:
             part.send(signal.SIGCONT)
         census = _at_rest(there)
         known = told(there.journals)
-        ends = [json.loads(next(line for line in part.lines() if line.startswith("{"))) for part in there.loads]
+        ends = [
+            json.loads(next(line for line in part.lines() if line.startswith("{")))
+            for part in there.loads
+        ]
     site.say(f"{census}; {ends}")
     return [
         figure("faults.frozen.lost", census.lost),

@@ -58,7 +58,9 @@ def _at(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, FloatArray]:
     return latitude, np.asarray(longitude, np.float64)
 
 
-def _visits(name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float) -> list[Batch]:
+def _visits(
+    name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float
+) -> list[Batch]:
     """Return one batch per region of visits at these times [ns] and places."""
     cell = grid.cell_of(*place)
     regions = grid.region_of(cell)
@@ -76,7 +78,9 @@ def _visits(name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatA
 
 def _messages(batches: Sequence[Batch]) -> list[Message]:
     return [
-        Message(b.kind, keys.observation_key(b.region, b.vehicle), wire.encode(b), wire.ENCODING[b.kind])
+        Message(
+            b.kind, keys.observation_key(b.region, b.vehicle), wire.encode(b), wire.ENCODING[b.kind]
+        )
         for b in batches
     ]
 
@@ -95,7 +99,9 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
             if kind == "row":
                 one, (other,) = way[0], wrong
                 columns = {k: np.concatenate([v, other.columns[k]]) for k, v in one.columns.items()}
-                engine.intake.ingest(_messages([replace(one, columns=columns)]), start + 100 * SECOND)
+                engine.intake.ingest(
+                    _messages([replace(one, columns=columns)]), start + 100 * SECOND
+                )
             elif kind == "between":  # the first half of the way, the far place, the second half
                 half = _visits(name, 1, when[:15], _at(north[:15], np.zeros(15)), 0.8)
                 rest = _visits(name, 2, when[15:], _at(north[15:], np.zeros(15)), 0.8)
@@ -103,7 +109,10 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
                 engine.intake.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
             else:
                 engine.intake.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
-            found, most = engine.counts["implausible_moves"] - before, sum(len(b.columns["mu"]) for b in wrong)
+            found, most = (
+                engine.counts["implausible_moves"] - before,
+                sum(len(b.columns["mu"]) for b in wrong),
+            )
             if found < most:
                 site.say(f"{kind}: {most - found} of {most} accepted")
             fused += max(most - found, 0)
@@ -116,16 +125,24 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
     """Return reports of a place far from the car's way, at about the same time."""
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
-    if kind == "walk":  # in leaps that the row before would allow; the first two may be what the budget allows
+    if (
+        kind == "walk"
+    ):  # in leaps that the row before would allow; the first two may be what the budget allows
         steps = np.arange(2, 50)
         when = start + 31 * SECOND + steps * (SECOND // 1000)
         return _visits(name, 2, when, _at(450.0 + np.zeros(len(steps)), steps * 2 * STEP_M), 0.2)
     if kind == "row":  # the batch is of one region, and so is the place
         home = grid.region_of(grid.cell_of(LATITUDE, LONGITUDE))
         sides = [FAR_M * 1j**turn for turn in range(4)]
-        far = next(s for s in sides if grid.region_of(grid.cell_of(*_at(np.array(s.real), np.array(s.imag)))) == home)
+        far = next(
+            s
+            for s in sides
+            if grid.region_of(grid.cell_of(*_at(np.array(s.real), np.array(s.imag)))) == home
+        )
     place = _at(np.array([float(np.real(far))]), np.array([float(np.imag(far))]))
-    found = _visits(name, 1 if kind == "boot" else 2, start + np.array([int(second * SECOND)]), place, 0.2)
+    found = _visits(
+        name, 1 if kind == "boot" else 2, start + np.array([int(second * SECOND)]), place, 0.2
+    )
     return [replace(one, boot=one.boot + 1) for one in found] if kind == "boot" else found
 
 
@@ -139,9 +156,15 @@ def _two_cars(site: Site, way: str) -> int:
             when = np.array([start + place * apart])
             for car in range(2):
                 visits = _visits(
-                    f"insider-{car}", place + 1, when + car, _at(np.zeros(1), np.array([place * STEP_M])), 0.15
+                    f"insider-{car}",
+                    place + 1,
+                    when + car,
+                    _at(np.zeros(1), np.array([place * STEP_M])),
+                    0.15,
                 )
-                alerts = engine.intake.ingest(_messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end)
+                alerts = engine.intake.ingest(
+                    _messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end
+                )
                 raised |= {alert.cell for alert in alerts if alert.raised}
     return len(raised)
 
@@ -153,6 +176,16 @@ def _honest(site: Site, cars: int) -> int:
         for place in range(ICY_PLACES):
             for car in range(cars):
                 when = np.array([start + (place * 90 + car * 60) * SECOND])
-                visits = _visits(f"car-{car}", place + 1, when, _at(np.zeros(1), np.array([place * 1_500.0])), 0.15)
-                raised |= {a.cell for a in engine.intake.ingest(_messages(visits), int(when[0]) + SECOND) if a.raised}
+                visits = _visits(
+                    f"car-{car}",
+                    place + 1,
+                    when,
+                    _at(np.zeros(1), np.array([place * 1_500.0])),
+                    0.15,
+                )
+                raised |= {
+                    a.cell
+                    for a in engine.intake.ingest(_messages(visits), int(when[0]) + SECOND)
+                    if a.raised
+                }
     return len(raised)

@@ -64,7 +64,9 @@ class Part:
 
         def found() -> list[str]:
             there = [line for line in self.lines() if line.startswith(start)]
-            assert there or self.alive, f"{self.name} ended before it said {start!r}; see {self.log}"
+            assert there or self.alive, (
+                f"{self.name} ended before it said {start!r}; see {self.log}"
+            )
             return there
 
         until(found, START_S)
@@ -127,9 +129,19 @@ class Stage:
         config = self.folder / f"{name}.json"
         outbox = str(self.folder / f"{name}.sqlite")
         config.write_text(
-            json.dumps({"endpoint": self.endpoint, "names": list(names), "rate": rate, "outbox": outbox, **more})
+            json.dumps(
+                {
+                    "endpoint": self.endpoint,
+                    "names": list(names),
+                    "rate": rate,
+                    "outbox": outbox,
+                    **more,
+                }
+            )
         )
-        self.loads.append(Part(name, [sys.executable, "-m", "tests.faults.load", str(config)], self.folder))
+        self.loads.append(
+            Part(name, [sys.executable, "-m", "tests.faults.load", str(config)], self.folder)
+        )
         return self.loads[-1]
 
     @property

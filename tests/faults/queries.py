@@ -64,7 +64,9 @@ def run(site: Site) -> list[Figure]:
 def _fill(session: zenoh.Session, there: Stage, vehicles: int) -> int:
     """Every vehicle a lane of 250 cells, each second one further on; until all of it is settled."""
     acked: set[str] = set()
-    acks = session.declare_subscriber(f"{keys.ROOT}/ack/*", lambda sample: acked.add(str(sample.key_expr)))
+    acks = session.declare_subscriber(
+        f"{keys.ROOT}/ack/*", lambda sample: acked.add(str(sample.key_expr))
+    )
     now = time.time_ns()
     names = [f"sim-{number:03}" for number in range(vehicles)]
     while len(acked) < vehicles:
@@ -90,7 +92,9 @@ def _lane(name: str, number: int, now: int) -> list[Message]:
             mine = grid.region_of(cell) == region
             one = batch(name, seq, now, [0.8] * int(mine.sum()))
             where = {"latitude": latitude[mine], "longitude": longitude[mine], "cell": cell[mine]}
-            columns = one.columns | where | {"leave_time": leave[mine], "enter_time": leave[mine] - 10**9}
+            columns = (
+                one.columns | where | {"leave_time": leave[mine], "enter_time": leave[mine] - 10**9}
+            )
             sent = Batch(Kind.OBSERVATION, name, one.boot, region, seq, 1, columns, "ckf")
             place = keys.observation_key(region, name)
             out.append(Message(sent.kind, place, wire.encode(sent), wire.ENCODING[sent.kind]))
@@ -127,7 +131,11 @@ def main() -> None:
     assert session is not None
     with session:
         while True:
-            replies = [reply for reply in session.get(f"{keys.ROOT}/map/**?format=geojson", timeout=60.0) if reply.ok]
+            replies = [
+                reply
+                for reply in session.get(f"{keys.ROOT}/map/**?format=geojson", timeout=60.0)
+                if reply.ok
+            ]
             if replies:
                 size = sum(len(reply.ok.payload) for reply in replies if reply.ok)
                 print(json.dumps({"tiles": len(replies), "bytes": size}), flush=True)

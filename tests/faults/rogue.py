@@ -22,8 +22,13 @@ def main() -> None:
     """Do as told."""
     told = json.loads(sys.stdin.readline())
     heard: list[str] = []
-    session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), told["name"]))
-    hearing = [session.declare_subscriber(one, lambda s: heard.append(str(s.key_expr))) for one in told["hear"]]
+    session = zenoh.open(
+        configuration(ZenohSettings.model_validate(told["settings"]), told["name"])
+    )
+    hearing = [
+        session.declare_subscriber(one, lambda s: heard.append(str(s.key_expr)))
+        for one in told["hear"]
+    ]
     list(session.get(f"{keys.ROOT}/map/**"))
     for place in told["put"]:
         session.put(place, told["payload"])

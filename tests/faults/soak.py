@@ -19,9 +19,13 @@ from tests.faults.frame import Campaign, Site, conduct, leave
 from tests.faults.processes import Part, stage
 
 PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
-CELLS_ACROSS: Final = 12  # few, so that every vehicle has soon been everywhere: a map that grows is no leak
+CELLS_ACROSS: Final = (
+    12  # few, so that every vehicle has soon been everywhere: a map that grows is no leak
+)
 EVERY_S: Final = 5.0
-SETTLED: Final = 1 / 3  # of the time, until buffers, windows and the cells of the map have been filled
+SETTLED: Final = (
+    1 / 3
+)  # of the time, until buffers, windows and the cells of the map have been filled
 MINUTES: Final = 30.0
 OWES: Final = (
     *("faults.soak.growth_mb", "faults.soak.handles"),
@@ -47,7 +51,9 @@ def slope(times: FloatArray, megabytes: FloatArray) -> float:
     """
     minute = (times // 60.0).astype(int)
     least = np.array([megabytes[minute == m].min() for m in np.unique(minute)])
-    return 10 * float(np.polyfit(np.unique(minute), least, 1)[0]) if len(least) > 1 else float("nan")
+    return (
+        10 * float(np.polyfit(np.unique(minute), least, 1)[0]) if len(least) > 1 else float("nan")
+    )
 
 
 def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
@@ -64,7 +70,11 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
             for part in there.parts:
                 seen.setdefault(part.name, []).append((memory_mb(part), handles(part)))
             if len(times) % 24 == 0:
-                site.say(", ".join(f"{name} {rows[-1][0]:.0f} MB {rows[-1][1]}" for name, rows in seen.items()))
+                site.say(
+                    ", ".join(
+                        f"{name} {rows[-1][0]:.0f} MB {rows[-1][1]}" for name, rows in seen.items()
+                    )
+                )
             time.sleep(EVERY_S)
         there.drain(60.0)
         there.service.stop()
@@ -82,14 +92,19 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
         figure("faults.soak.handles", max(grown.values())),
         figure("faults.soak.lost", census.lost + census.doubled),
         figure("faults.soak.observations_per_s", census.observations / (minutes * 60)),
-        *(Figure(f"faults.soak.{name}_growth_mb", slope, "MB per 10 min") for name, slope in slopes.items()),
+        *(
+            Figure(f"faults.soak.{name}_growth_mb", slope, "MB per 10 min")
+            for name, slope in slopes.items()
+        ),
         Figure("faults.soak.minutes", minutes, "minutes"),
     ]
 
 
 def main() -> int:
     """Run; 0 if every bar holds."""
-    parser = argparse.ArgumentParser(prog="tests.faults.soak", description="A steady load; does anything grow?")
+    parser = argparse.ArgumentParser(
+        prog="tests.faults.soak", description="A steady load; does anything grow?"
+    )
     parser.add_argument("--minutes", type=float, default=MINUTES, help="how long (default 30)")
     parser.add_argument("--out", type=Path, default=Path(".faults/soak"), help="figures go there")
     args = parser.parse_args()

@@ -31,7 +31,9 @@ from tests.fleet_service.examples import SECOND, batch, key
 
 SEGMENTS: Final = 2
 BATCHES: Final = 2  # to a segment
-WHOLE_WAY: Final = 200  # every so many damages a service is started on the archive and everything is sent again
+WHOLE_WAY: Final = (
+    200  # every so many damages a service is started on the archive and everything is sent again
+)
 
 
 def run(site: Site) -> list[Figure]:
@@ -83,11 +85,17 @@ def _messages(batches: Sequence[Batch]) -> list[Message]:
 
 def _rows(root: Path) -> list[tuple[int, int, float]]:
     tables = reading.read(root, Kind.OBSERVATION, ["seq", "row", "mu"])
-    return [row for table in tables for row in zip(*(table[n].to_pylist() for n in ("seq", "row", "mu")), strict=True)]
+    return [
+        row
+        for table in tables
+        for row in zip(*(table[n].to_pylist() for n in ("seq", "row", "mu")), strict=True)
+    ]
 
 
 def _expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
-    return {(b.seq, row, round(float(mu), 3)) for b in batches for row, mu in enumerate(b.columns["mu"])}
+    return {
+        (b.seq, row, round(float(mu), 3)) for b in batches for row, mu in enumerate(b.columns["mu"])
+    }
 
 
 def _lost(root: Path, batches: Sequence[Batch]) -> int:
@@ -95,11 +103,19 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
     streams = SequenceTrackers()
     restore_streams(root, streams)
-    pseudonyms, first, at = Pseudonyms(root / "keys"), batches[0], int(batches[0].columns["enter_time"][0])
+    pseudonyms, first, at = (
+        Pseudonyms(root / "keys"),
+        batches[0],
+        int(batches[0].columns["enter_time"][0]),
+    )
     vehicle, boot = number(pseudonyms.of("sim-001", at)), pseudonyms.boot("sim-001", first.boot, at)
     assert (vehicle, boot, Kind.OBSERVATION, first.region) in streams
     stream = streams[vehicle, boot, Kind.OBSERVATION, first.region]
-    owed = [b for place, b in enumerate(batches) if place < len(batches) - BATCHES or stream.accepted(b.seq)]
+    owed = [
+        b
+        for place, b in enumerate(batches)
+        if place < len(batches) - BATCHES or stream.accepted(b.seq)
+    ]
     return len(_expected(owed) - held) + len(held - _expected(batches))
 
 

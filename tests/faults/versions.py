@@ -35,7 +35,12 @@ def run(site: Site) -> list[Figure]:
     made_old = json.loads((DATA / "v1.0" / "map.json").read_text())
     made_new = make(new)
     changed = 0
-    for pattern in ("inbox/*.parquet", "inbox/states/*.parquet", "observations/*/*/*.parquet", "states/*/*/*.parquet"):
+    for pattern in (
+        "inbox/*.parquet",
+        "inbox/states/*.parquet",
+        "observations/*/*/*.parquet",
+        "states/*/*/*.parquet",
+    ):
         for path in new.glob(pattern):
             rewritten(path, with_columns, "1.7")
             changed += 1

@@ -154,10 +154,14 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 def run(site: Site) -> list[Figure]:
     """All kinds at once; seconds."""
     with ThreadPoolExecutor(len(BREAKS)) as pool:
-        found = dict(zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True))
+        found = dict(
+            zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True)
+        )
     for kind, (arrived, lost) in found.items():
         site.say(f"{kind}: {arrived} of {ALERTS} arrived, {lost} lost silently")
-    short = [kind for kind, (arrived, _) in found.items() if kind not in FOREVER and arrived < ALERTS]
+    short = [
+        kind for kind, (arrived, _) in found.items() if kind not in FOREVER and arrived < ALERTS
+    ]
     return [
         figure("faults.webhook.lost_silently", sum(lost for _, lost in found.values())),
         figure("faults.webhook.late", len(short)),

@@ -61,7 +61,9 @@ def observations(
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
     """Log-likelihood (32,) of a sender without one."""
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
-    columns: dict[str, NDArray[Any]] = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
+    columns: dict[str, NDArray[Any]] = dict(
+        zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True)
+    )
     columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
     return np.asarray(mugrid.decode_log_likelihood(evidence(columns, np.array([False])).steps)[0])
 
@@ -70,7 +72,9 @@ def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = 
     """Belief of one cell (32,) at its last observation, or at `now`."""
     slot = fusion.slots_of(np.array([cell]), np.array([sector]))
     assert slot[0] >= 0, "nobody was there"
-    return np.asarray(fusion.beliefs(slot, int(fusion.live.time[slot[0]]) if now is None else now)[0])
+    return np.asarray(
+        fusion.beliefs(slot, int(fusion.live.time[slot[0]]) if now is None else now)[0]
+    )
 
 
 def interval(p: FloatArray) -> tuple[float, float]:
@@ -110,7 +114,10 @@ def batch(
     if told:
         columns["log_likelihood"] = mugrid.encode_log_likelihood(value(mu))
     columns.update({name: np.asarray(column) for name, column in changed.items()})
-    columns = {name: column.astype(wire.column_types(Kind.OBSERVATION)[name]) for name, column in columns.items()}
+    columns = {
+        name: column.astype(wire.column_types(Kind.OBSERVATION)[name])
+        for name, column in columns.items()
+    }
     boot = 1 + sum(vehicle.encode())
     return Batch(Kind.OBSERVATION, vehicle, boot, REGION, seq, 1, columns, "ckf")
 

@@ -36,7 +36,9 @@ from tests.waiting import until
 X, Y = 1_118_000, 630_000  # of cells near Gothenburg
 
 
-def alert(x: int, y: int = 0, *, sector: int = 0, raised: bool = True, at: int = 0, mu: float = 0.2) -> Alert:
+def alert(
+    x: int, y: int = 0, *, sector: int = 0, raised: bool = True, at: int = 0, mu: float = 0.2
+) -> Alert:
     cell = int(grid.interleave(np.array([X + x]), np.array([Y + y]))[0])
     latitude, longitude = grid.centre(cell)
     return Alert(
@@ -78,7 +80,9 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
     (old,) = told(road, alert(0, at=0))
     (young,) = told(road, alert(8, at=10))
     assert old.id != young.id
-    assert told(road, alert(0, at=0), alert(8, at=10)) == [], "an alert is put again while it stands: that is no news"
+    assert told(road, alert(0, at=0), alert(8, at=10)) == [], (
+        "an alert is put again while it stands: that is no news"
+    )
     joined = {one.id: one for one in told(road, *(alert(x, at=20) for x in (2, 4, 6)))}
     assert joined[old.id].state == "changed"
     assert joined[old.id].cells == 5
@@ -156,7 +160,13 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
         until(lambda: again.counts["delivered"] == 1)
         again.close()
     assert (len(heard), again.waiting, again.troubles()) == (1, 0, [])
-    assert set(body(told(Stretches(), alert(0))[0])) >= {"receiver", "status", "alerts", "groupLabels", "externalURL"}
+    assert set(body(told(Stretches(), alert(0))[0])) >= {
+        "receiver",
+        "status",
+        "alerts",
+        "groupLabels",
+        "externalURL",
+    }
 
 
 def test_full_queue_drops_the_oldest_and_reports_it(tmp_path: Path) -> None:
@@ -207,7 +217,9 @@ def test_watch_says_stretches_as_json_and_sends_them(
             assert watching.stdout is not None
             assert json.loads(watching.stdout.readline()) == {"event": "watching"}
             fleet = Fleet(session).meet()
-            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
+            fleet.settle(
+                *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4))
+            )
             line = json.loads(watching.stdout.readline())
             until(lambda: heard)
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
@@ -222,4 +234,6 @@ def test_a_webhook_that_is_no_url_is_one_line(capsys: pytest.CaptureFixture[str]
     assert main(["watch", "--webhook", "x"]) == 2
     assert capsys.readouterr().err.startswith("error: webhook: 'x' is no URL")
     assert main(["watch", "--health-port", "1"]) == 2
-    assert capsys.readouterr().err.startswith("error: health_port: has no meaning without a webhook")
+    assert capsys.readouterr().err.startswith(
+        "error: health_port: has no meaning without a webhook"
+    )

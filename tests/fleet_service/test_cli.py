@@ -59,7 +59,9 @@ def test_help_comes_without_what_commands_need() -> None:
         "import sys; from schemas.runtime import commandline; from fleet_service import cli; "
         "commandline.parser_of(*cli.LINE, None); print(*sys.modules)"
     )
-    loaded = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout.split()
+    loaded = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert "fleet_service.cli" in loaded
     assert not {"numpy", "pyarrow", "zenoh", "numba", "pydantic"} & set(loaded)
 
@@ -129,7 +131,9 @@ def test_parameters_parted_by_an_ampersand_are_named(capsys: pytest.CaptureFixtu
     assert "part the parameters by ';'" in capsys.readouterr().err
 
 
-def test_a_taken_archive_is_said(tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_archive_is_said(
+    tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]
+) -> None:
     with running(router, tmp_path):
         handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
         try:
@@ -145,7 +149,9 @@ def test_run_and_watch_as_processes_from_start_to_signal(
 ) -> None:
     config = tmp_path / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "put_s": 0.1}))
-    begin = partial(subprocess.Popen[str], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    begin = partial(
+        subprocess.Popen[str], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     run = begin([*COMMAND, "run", "--config", str(config), "--archive", str(tmp_path / "archive")])
     watch = begin([*COMMAND, "watch", "--config", str(config), "--bbox", "11,57,13,59"])
     with run, watch:
@@ -155,7 +161,10 @@ def test_run_and_watch_as_processes_from_start_to_signal(
         assert watch.stdout.readline() == "watching\n"
         fleet = Fleet(session).meet()
         fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
-        awaited = {"alert RAISED at 57.69", "tile 12003202"}  # a tile may be told before its alert, or after
+        awaited = {
+            "alert RAISED at 57.69",
+            "tile 12003202",
+        }  # a tile may be told before its alert, or after
         for line in iter(watch.stdout.readline, ""):
             slippery = line.startswith("alert") or "likely slippery" in line
             awaited -= {begin for begin in awaited if line.startswith(begin) and slippery}
@@ -169,11 +178,15 @@ def test_run_and_watch_as_processes_from_start_to_signal(
             assert process.stderr.read() == ""
         said = run.stdout.read()
         assert "status: 4 observations" in said
-    kept = pa.concat_tables(reading.read(tmp_path / "archive", Kind.OBSERVATION, ["boot", "seq", "row"]))
+    kept = pa.concat_tables(
+        reading.read(tmp_path / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
+    )
     assert kept.num_rows == 4
     modes = {path: path.stat().st_mode for path in (tmp_path / "archive").rglob("*")}
     assert any(path.suffix == ".parquet" for path in modes)
-    assert [path for path, mode in modes.items() if mode & 0o027] == [], "readable by others, or written by the group"
+    assert [path for path, mode in modes.items() if mode & 0o027] == [], (
+        "readable by others, or written by the group"
+    )
 
 
 HANGS = """
@@ -232,7 +245,9 @@ def test_a_service_that_has_to_be_ended_gives_its_lease_free(
 
 def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path) -> None:
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
-    settings = ZenohSettings(connect=endpoints, config={"connect/retry": {"period_init_ms": 50, "period_max_ms": 100}})
+    settings = ZenohSettings(
+        connect=endpoints, config={"connect/retry": {"period_init_ms": 50, "period_max_ms": 100}}
+    )
     with running(settings, tmp_path) as run:
         router.close()
         router, _ = open_router(listen=endpoints[0])

@@ -95,7 +95,11 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
 }  # fmt: skip
 SHOWN_BELOW: Final = {
     "retention": {"--yes"},
-    "forget": {"--yes", "--put-to", "--config"},  # test_commands.py; archive/test_retention.py; app/test_copy.py
+    "forget": {
+        "--yes",
+        "--put-to",
+        "--config",
+    },  # test_commands.py; archive/test_retention.py; app/test_copy.py
     "completion": {"shell"},
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather", "--standby"},  # shards/test_successor.py
@@ -105,7 +109,17 @@ SHOWN_BELOW: Final = {
     },
     "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
     "analyze": {"--roads", "--level", "--within"},  # analytics/roads/test_contract.py
-    "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
+    "query": {
+        "--bbox",
+        "--route",
+        "--min-vehicles",
+        "--at",
+        "--basis",
+        "--format",
+        "--out",
+        "--connect",
+        "--config",
+    },
     "page": {  # page/test_server.py
         "--archive",
         "--host",
@@ -122,7 +136,16 @@ SHOWN_BELOW: Final = {
         "--config",
     },
     "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_moving.py
-    "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook", "--webhook-queue", "--health-port"},
+    "watch": {
+        "--bbox",
+        "--connect",
+        "--config",
+        "--alerts",
+        "--json",
+        "--webhook",
+        "--webhook-queue",
+        "--health-port",
+    },
 }
 # command -> the modules in which these options are given, beside this one
 GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
@@ -156,7 +179,10 @@ def place(folder: Path) -> dict[str, str]:
     names["fleet"].write_text(enrolment().model_dump_json())
     names["fleet2"].write_text(enrolment(vehicles=["car-1"]).model_dump_json())
     for name, degrees in (("warm", 20), ("cold", -5)):
-        rows = [f"{k},2024-10-04T23:00:00,{lat},{lon},{degrees}\n" for k, (lat, lon) in enumerate(PLACES)]
+        rows = [
+            f"{k},2024-10-04T23:00:00,{lat},{lon},{degrees}\n"
+            for k, (lat, lon) in enumerate(PLACES)
+        ]
         names[name].write_text("station,time,latitude,longitude,temperature\n" + "".join(rows))
     return {name: str(path) for name, path in names.items()}
 
@@ -177,7 +203,11 @@ def done(words: list[str], folder: Path, capsys: Capture) -> Done:
     code = main([word.format(**names) for word in words])
     said = capsys.readouterr()
     text = (said.out + (said.err if code else "")).replace(str(folder), "")
-    files = {str(p.relative_to(folder)): content(p, folder) for p in sorted(folder.rglob("*")) if p.is_file()}
+    files = {
+        str(p.relative_to(folder)): content(p, folder)
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
     return Done(code, text, files)
 
 
@@ -185,7 +215,10 @@ def options(command: Command) -> set[str]:
     """Return the options of a command."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)
-    return {action.option_strings[0] if action.option_strings else action.dest for action in parser._actions}
+    return {
+        action.option_strings[0] if action.option_strings else action.dest
+        for action in parser._actions
+    }
 
 
 def test_every_option_of_every_command_is_in_a_table() -> None:
@@ -200,17 +233,28 @@ def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> N
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]
     text = "".join([*texts, own.read_text().partition("class Done")[2]])
-    named = {option: (f'"{option}"', f"{option.strip('-').replace('-', '_')}=") for option in SHOWN_BELOW[command]}
-    missing = [option for option, ways in named.items() if option[0] == "-" and not any(way in text for way in ways)]
+    named = {
+        option: (f'"{option}"', f"{option.strip('-').replace('-', '_')}=")
+        for option in SHOWN_BELOW[command]
+    }
+    missing = [
+        option
+        for option, ways in named.items()
+        if option[0] == "-" and not any(way in text for way in ways)
+    ]
     assert missing == []
     assert all(option in text for option in named if option[0] != "-")
 
 
-def test_a_standby_without_a_copy_to_follow_is_refused(tmp_path: Path, router: ZenohSettings) -> None:
+def test_a_standby_without_a_copy_to_follow_is_refused(
+    tmp_path: Path, router: ZenohSettings
+) -> None:
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"zenoh": router.model_dump()}))
     words = ["run", "--config", str(config), "--archive", str(tmp_path / "a"), "--standby"]
-    ended = subprocess.run([sys.executable, "-m", "fleet_service.cli", *words], capture_output=True, text=True)
+    ended = subprocess.run(
+        [sys.executable, "-m", "fleet_service.cli", *words], capture_output=True, text=True
+    )
     assert ended.returncode == 2
     assert "error: standby: needs archive.copy" in ended.stderr
 
@@ -220,7 +264,9 @@ def test_the_end_to_end_part_of_a_campaign_is_left_out_or_run_alone(
 ) -> None:
     seen: list[tuple[bool, bool, bool]] = []
 
-    def note(folder: Path, quick: bool, drives: object, log_line: object, *, alone: bool) -> list[object]:
+    def note(
+        folder: Path, quick: bool, drives: object, log_line: object, *, alone: bool
+    ) -> list[object]:
         seen.append((quick, bool(drives), alone))
         return []
 
@@ -230,7 +276,9 @@ def test_the_end_to_end_part_of_a_campaign_is_left_out_or_run_alone(
     assert seen == [(True, True, False), (True, False, False), (True, True, True)]
 
 
-@pytest.mark.parametrize(("command", "option"), [(c, o) for c, changes in CHANGES.items() for o in changes])
+@pytest.mark.parametrize(
+    ("command", "option"), [(c, o) for c, changes in CHANGES.items() for o in changes]
+)
 def test_every_option_of_a_command_changes_what_it_does(
     command: str, option: str, tmp_path: Path, capsys: Capture
 ) -> None:
@@ -246,7 +294,9 @@ def test_every_option_of_a_command_changes_what_it_does(
     assert first == again
     assert first.code == 0, first.said
     seen = done(other, tmp_path / "other", capsys)
-    if option == "--engine" and importlib.util.find_spec("pyspark"):  # the answer is the same: test_spark
+    if option == "--engine" and importlib.util.find_spec(
+        "pyspark"
+    ):  # the answer is the same: test_spark
         assert seen == first
         return
     assert seen != first
@@ -267,7 +317,9 @@ def test_certificates_that_end_within_so_many_days_are_renewed(
     assert capsys.readouterr().out.startswith("issued 7: ") == renewed
 
 
-def test_service_weather_archive_and_configuration_are_those_given(tmp_path: Path, router: ZenohSettings) -> None:
+def test_service_weather_archive_and_configuration_are_those_given(
+    tmp_path: Path, router: ZenohSettings
+) -> None:
     rain = pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]})
     pq.write_table(rain, tmp_path / "rain.parquet")
     for name, more in (("shard-1", []), ("shard-2", ["--weather", str(tmp_path / "rain.parquet")])):
@@ -290,7 +342,9 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 def there(name: str, mu: float) -> wire.Batch:
     """A batch of another tile in the same region."""
     cell = int(grid.cell_of(*FAR))
-    return batch(name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell])
+    return batch(
+        name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell]
+    )
 
 
 @pytest.fixture
@@ -303,7 +357,9 @@ def fed(service: Running, session: zenoh.Session) -> Fleet:
 
 
 @pytest.mark.usefixtures("fed")
-def test_every_option_of_a_query_changes_the_answer(router: ZenohSettings, tmp_path: Path, capsys: Capture) -> None:
+def test_every_option_of_a_query_changes_the_answer(
+    router: ZenohSettings, tmp_path: Path, capsys: Capture
+) -> None:
     out, config = tmp_path / "a", tmp_path / "config.json"
     config.write_text(json.dumps({"zenoh": router.model_dump()}))
     usual = {"--connect": router.connect[0], "--format": "json", "--out": str(out)}
@@ -311,9 +367,13 @@ def test_every_option_of_a_query_changes_the_answer(router: ZenohSettings, tmp_p
 
     def cells(**changed: str | None) -> set[int]:
         given = usual | {f"--{name.replace('_', '-')}": value for name, value in changed.items()}
-        words = [word for name, value in given.items() if value is not None for word in (name, value)]
+        words = [
+            word for name, value in given.items() if value is not None for word in (name, value)
+        ]
         assert main(["query", *words]) == 0
-        return {row["cell"] for tile in json.loads(out.read_text())["tiles"] for row in tile["cells"]}
+        return {
+            row["cell"] for tile in json.loads(out.read_text())["tiles"] for row in tile["cells"]
+        }
 
     assert cells() == {here, far}
     assert cells(bbox="11.96,57.69,11.98,57.71") == {here}
@@ -335,7 +395,10 @@ def test_box_selects_watched_tiles_and_both_options_name_the_router(
 ) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"zenoh": router.model_dump()}))
     boxes = {"here": "11.96,57.69,11.98,57.71", "far": "12.01,57.69,12.03,57.71"}
-    ways = {"here": ["--connect", router.connect[0]], "far": ["--config", str(tmp_path / "config.json")]}
+    ways = {
+        "here": ["--connect", router.connect[0]],
+        "far": ["--config", str(tmp_path / "config.json")],
+    }
     watching = {}
     for name, box in boxes.items():
         words = [sys.executable, "-m", "fleet_service.cli", "watch", "--bbox", box, *ways[name]]
@@ -351,7 +414,9 @@ def test_box_selects_watched_tiles_and_both_options_name_the_router(
         for name, part in watching.items():
             part.send(signal.SIGTERM)
             part.wait(30.0)
-            assert {line.split()[1] for line in part.lines() if line.startswith("tile ")} == {tiles[name]}
+            assert {line.split()[1] for line in part.lines() if line.startswith("tile ")} == {
+                tiles[name]
+            }
     finally:
         for part in watching.values():
             part.kill()

@@ -12,7 +12,9 @@ from schemas.config import ZenohSettings
 Capture = pytest.CaptureFixture[str]
 
 
-def test_no_service_is_not_an_empty_map(router: ZenohSettings, tmp_path: Path, capsys: Capture) -> None:
+def test_no_service_is_not_an_empty_map(
+    router: ZenohSettings, tmp_path: Path, capsys: Capture
+) -> None:
     assert main(["query", "--connect", router.connect[0]]) == 1
     said = capsys.readouterr()
     assert said.out == ""
@@ -21,10 +23,25 @@ def test_no_service_is_not_an_empty_map(router: ZenohSettings, tmp_path: Path, c
 
 @pytest.mark.usefixtures("service")
 @pytest.mark.parametrize("ending", ["geojson", "parquet", "csv", "arrow", "json"])
-def test_an_empty_map_is_written_in_the_form_of_its_ending(router: ZenohSettings, tmp_path: Path, ending: str) -> None:
+def test_an_empty_map_is_written_in_the_form_of_its_ending(
+    router: ZenohSettings, tmp_path: Path, ending: str
+) -> None:
     out = tmp_path / f"map.{ending}"
     assert main(["query", "--connect", router.connect[0], "--out", str(out)]) == 0
-    begin = {"geojson": b'{"type": "FeatureCollection"', "parquet": b"PAR1", "json": b'{"tiles"', "csv": b'"cell"'}
+    begin = {
+        "geojson": b'{"type": "FeatureCollection"',
+        "parquet": b"PAR1",
+        "json": b'{"tiles"',
+        "csv": b'"cell"',
+    }
     assert out.read_bytes().startswith(begin.get(ending, b"\xff\xff\xff\xff"))
-    words = ["query", "--connect", router.connect[0], "--format", "json", "--out", str(tmp_path / "a.geojson")]
+    words = [
+        "query",
+        "--connect",
+        router.connect[0],
+        "--format",
+        "json",
+        "--out",
+        str(tmp_path / "a.geojson"),
+    ]
     assert main(words) == 2

@@ -37,7 +37,9 @@ def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
         now = time.time_ns()
         for name, age in (("sim-001", 1), ("sim-002", 600), ("sim-003", -60), ("sim-001", 300)):
             sent = batch(name, 1 + (age == 300), now - age * SECOND, [0.5])
-            engine.intake.ingest([Message(sent.kind, key(name), wire.encode(sent), wire.ENCODING[sent.kind])], now)
+            engine.intake.ingest(
+                [Message(sent.kind, key(name), wire.encode(sent), wire.ENCODING[sent.kind])], now
+            )
         engine.settlement.flush()
         yield engine
 
@@ -48,14 +50,19 @@ def of_engine(look: Callable[[Engine], object]) -> Show:
 
 def of_jobs(config: ServiceConfig, root: Path) -> object:
     with closing(Engine(config, root)) as engine:
-        return {job.name: job.every_s for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment)}
+        return {
+            job.name: job.every_s
+            for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment)
+        }
 
 
 def of_compaction(config: ServiceConfig, root: Path) -> object:
     shutil.copytree(DATA / "v1.0" / "archive", root)
     with closing(Engine(config, root)) as engine:
         (compaction,) = (
-            job for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment) if job.name == "compaction"
+            job
+            for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment)
+            if job.name == "compaction"
         )
         assert compaction.work(threading.Event())
     return sorted(path.name for path in root.parent.joinpath("there").rglob("*.parquet"))
@@ -72,7 +79,11 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 def let_in(made: Service) -> list[bool]:
     """Which of thirty messages of 40 kB of two vehicles are looked at."""
-    return [made.inbox._limits.allows(key(name), 40_000) for name in ("car-1", "car-2") for _ in range(60)]
+    return [
+        made.inbox._limits.allows(key(name), 40_000)
+        for name in ("car-1", "car-2")
+        for _ in range(60)
+    ]
 
 
 def queued(made: Service) -> int:
@@ -109,11 +120,20 @@ def refused(engine: Engine) -> object:
 
 
 SETTINGS: Final[dict[str, tuple[object, Show]]] = {
-    "name": ("shard-9", lambda c, r: (of_engine(refused)(c, r), [p.name[:7] for p in (r / "inbox").glob("*.parquet")])),
+    "name": (
+        "shard-9",
+        lambda c, r: (
+            of_engine(refused)(c, r),
+            [p.name[:7] for p in (r / "inbox").glob("*.parquet")],
+        ),
+    ),
     "lateness_s": (1000.0, of_engine(refused)),
     "clock_ahead_s": (120.0, of_engine(refused)),
     "oldest_s": (400.0, of_engine(refused)),
-    "public_vehicles": (9, of_engine(lambda engine: len(engine.queries.changed_tiles(time.time_ns())))),
+    "public_vehicles": (
+        9,
+        of_engine(lambda engine: len(engine.queries.changed_tiles(time.time_ns()))),
+    ),
     "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
     "compact_s": (10.0, of_jobs),
     "checkpoint_s": (10.0, of_jobs),
@@ -130,7 +150,16 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
 # Where the network or the operator sees them: zenoh and regions where two services share the world, in
 # app/test_service.py, the archive and its copy in app/test_copy.py, the lease and who waits for it in
 # shards/test_successor.py, the others in tests/schemas/runtime and app/test_metrics.py.
-SEEN_OUTSIDE: Final = {"zenoh", "regions", "archive", "standby", "lease_s", "metrics_port", "metrics_host", "log"}
+SEEN_OUTSIDE: Final = {
+    "zenoh",
+    "regions",
+    "archive",
+    "standby",
+    "lease_s",
+    "metrics_port",
+    "metrics_host",
+    "log",
+}
 
 
 def test_every_setting_of_the_service_is_in_a_table() -> None:
@@ -143,7 +172,8 @@ def test_every_setting_of_the_service_changes_what_it_does(name: str, tmp_path: 
     if isinstance(value, str):
         (tmp_path / "fleet").write_text(enrolment(vehicles=["car-1"]).model_dump_json())
         pq.write_table(
-            pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]}), tmp_path / "rain"
+            pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]}),
+            tmp_path / "rain",
         )
         value = value.format(**{file: tmp_path / "2" / file if file == "there" else tmp_path / file
                                 for file in ("fleet", "rain", "there")})  # fmt: skip

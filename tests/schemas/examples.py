@@ -47,21 +47,36 @@ def batch(kind: Kind, rows: int = 3) -> Batch:
 def batch_of_version_1(kind: Kind) -> Batch:
     """The batch as it was before there were other columns."""
     whole = batch(kind)
-    return replace(whole, columns={name: c for name, c in whole.columns.items() if name not in LATER})
+    return replace(
+        whole, columns={name: c for name, c in whole.columns.items() if name not in LATER}
+    )
 
 
 def acknowledgement() -> tuple[str, list[StreamAck]]:
     """An acknowledgement of two streams."""
     return "volvo-240", [
         StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
-        StreamAck(2**62 + 5, Kind.STATE, 396_303, durable=((1, 3),), rejected=((4, 2, "latitude"),)),
+        StreamAck(
+            2**62 + 5, Kind.STATE, 396_303, durable=((1, 3),), rejected=((4, 2, "latitude"),)
+        ),
     ]
 
 
 def alert() -> Alert:
     """An alert whose floats are exact in 32 bits."""
     return Alert(
-        1_664_484_383_910, 2, True, 1_790_000_000_000_000_000, 0.25, 0.125, 0.375, 0.9375, 3, 57.7, 11.97, "seen by 3"
+        1_664_484_383_910,
+        2,
+        True,
+        1_790_000_000_000_000_000,
+        0.25,
+        0.125,
+        0.375,
+        0.9375,
+        3,
+        57.7,
+        11.97,
+        "seen by 3",
     )
 
 
@@ -72,7 +87,9 @@ MESSAGES: dict[str, Callable[[], bytes]] = {
     "alert": lambda: wire.encode_alert(alert()),
 }
 
-if __name__ == "__main__":  # only ever run to add a message: the kept bytes of a version do not change
+if (
+    __name__ == "__main__"
+):  # only ever run to add a message: the kept bytes of a version do not change
     for name, make in MESSAGES.items():
         path = DATA / f"{name}.v1.bin"
         if not path.exists():

@@ -22,7 +22,10 @@ VEHICLE = {
 }  # fmt: skip
 
 
-@given(st.integers(0, 4**10 - 1), st.from_regex(config.NAME_PATTERN, fullmatch=True).filter(lambda s: "\n" not in s))
+@given(
+    st.integers(0, 4**10 - 1),
+    st.from_regex(config.NAME_PATTERN, fullmatch=True).filter(lambda s: "\n" not in s),
+)
 def test_a_key_is_taken_apart_as_it_was_built(region: int, vehicle: str) -> None:
     for name, build in (("obs", keys.observation_key), ("state", keys.state_key)):
         parsed = keys.parse(build(region, vehicle))
@@ -65,7 +68,10 @@ def test_a_log_likelihood_is_floored() -> None:
     assert mugrid.encode_log_likelihood(impossible)[0] == mugrid.FLOOR_STEPS
 
 
-@given(st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).filter(lambda p: sum(p) > 1e-3), st.floats(0.01, 0.99))
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).filter(lambda p: sum(p) > 1e-3),
+    st.floats(0.01, 0.99),
+)
 def test_a_quantile_has_its_share_of_the_mass_below(p: list[float], q: float) -> None:
     value = mugrid.quantiles(np.array(p), q)
     below = np.interp(value, mugrid.EDGES, np.concatenate([[0.0], np.cumsum(p)])) / sum(p)
@@ -79,9 +85,17 @@ def test_channels_have_the_order_that_the_indices_say() -> None:
 
 
 def test_every_column_has_a_unit_and_a_meaning() -> None:
-    for schema in (tables.MAP_SCHEMA, tables.ESTIMATES_SCHEMA, tables.OBSERVATION_ARCHIVE, tables.STATE_ARCHIVE):
+    for schema in (
+        tables.MAP_SCHEMA,
+        tables.ESTIMATES_SCHEMA,
+        tables.OBSERVATION_ARCHIVE,
+        tables.STATE_ARCHIVE,
+    ):
         assert len(set(schema.names)) == len(schema.names)
-        assert all(field.metadata and field.metadata[b"unit"] and field.metadata[b"meaning"] for field in schema)
+        assert all(
+            field.metadata and field.metadata[b"unit"] and field.metadata[b"meaning"]
+            for field in schema
+        )
 
 
 def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
@@ -95,7 +109,9 @@ def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
     [({"mass": -5.0}, "^mass: input should be greater than 0"), ({"mass": None}, "^mass: "),
      ({"track_front": "wide"}, "^track_front: "), ({"wheel_radius": float("nan")}, "^wheel_radius: ")],
 )  # fmt: skip
-def test_a_wrong_vehicle_field_is_named(tmp_path: Path, change: dict[str, object], complaint: str) -> None:
+def test_a_wrong_vehicle_field_is_named(
+    tmp_path: Path, change: dict[str, object], complaint: str
+) -> None:
     path = tmp_path / "vehicle.json"
     path.write_text(json.dumps(VEHICLE | change))
     with pytest.raises(InputError, match=complaint):
@@ -129,7 +145,9 @@ def test_an_unknown_setting_is_refused_and_defaults_hold(tmp_path: Path) -> None
         ("1971-01-01 00:00:00.000001", "1971-01-01T00:00:00.000001"),
     ],
 )
-def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(text: str, utc: str) -> None:
+def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(
+    text: str, utc: str
+) -> None:
     expected = int(np.datetime64(utc, "ns").astype(np.int64))
     assert config.moment(text, "from") == expected
     at = query.parse({"at": text}).at
@@ -139,7 +157,9 @@ def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(text:
 
 @pytest.mark.parametrize("text", ["", "yesterday", "07:00", "1969-12-31", "2300-01-01", "1e9"])
 def test_what_is_no_time_is_refused_by_name(text: str) -> None:
-    with pytest.raises(InputError, match="^from: .* is no time; write it like|^from: .* lies before 1970 or after"):
+    with pytest.raises(
+        InputError, match="^from: .* is no time; write it like|^from: .* lies before 1970 or after"
+    ):
         config.moment(text, "from")
 
 
@@ -151,14 +171,21 @@ def test_what_is_no_time_is_refused_by_name(text: str) -> None:
      ({"at": "yesterday"}, "at"), ({"route": "1,2"}, "route"), ({"route": "1,2|3"}, "route"), ({"box": "1"}, "box"),
      ({"basis": "guessed"}, "basis")],
 )  # fmt: skip
-def test_a_broken_query_names_the_parameter_and_the_fix(parameters: dict[str, str], field: str) -> None:
+def test_a_broken_query_names_the_parameter_and_the_fix(
+    parameters: dict[str, str], field: str
+) -> None:
     with pytest.raises(InputError, match=f"^{field}: .*; "):
         query.parse(parameters)
 
 
 def test_a_query_is_read() -> None:
     asked = query.parse(
-        {"bbox": "11.9,57.6,12.1,57.8", "min_vehicles": "2", "format": "geojson", "at": "2026-01-31T07:00:00Z"}
+        {
+            "bbox": "11.9,57.6,12.1,57.8",
+            "min_vehicles": "2",
+            "format": "geojson",
+            "at": "2026-01-31T07:00:00Z",
+        }
     )
     assert asked.bbox == (11.9, 57.6, 12.1, 57.8)
     assert (asked.min_vehicles, asked.format.encoding) == (2, "application/geo+json")

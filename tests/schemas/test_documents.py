@@ -25,7 +25,9 @@ SCHEMAS = Path(wire.__file__).parents[1]
 PROTO = (SCHEMAS / "proto" / "gripmap.proto").read_text(encoding="utf-8")
 README = (SCHEMAS / "README.md").read_text(encoding="utf-8")
 COMMENTS = " ".join(re.findall(r"//\s*(.*)", PROTO))
-BOTH = pytest.mark.parametrize("text", [COMMENTS, " ".join(README.split())], ids=["proto", "README"])
+BOTH = pytest.mark.parametrize(
+    "text", [COMMENTS, " ".join(README.split())], ids=["proto", "README"]
+)
 SERVICE = ServiceConfig()
 ENCODINGS = (
     *wire.ENCODING.values(), wire.ACK_ENCODING, wire.ALERT_ENCODING, wire.STANDING_ENCODING, wire.WEATHER_ENCODING,
@@ -41,7 +43,11 @@ def test_every_health_flag_stands_with_its_bit(text: str, flag: Health) -> None:
 
 @BOTH
 def test_no_health_flag_stands_that_does_not_exist(text: str) -> None:
-    named = set(re.findall(r"\b(?:NO_[A-Z]{3,}(?:_[A-Z]+)?|TIME_GAP|OUTLIER|SLIDING|RESET|CONTRADICTION)\b", text))
+    named = set(
+        re.findall(
+            r"\b(?:NO_[A-Z]{3,}(?:_[A-Z]+)?|TIME_GAP|OUTLIER|SLIDING|RESET|CONTRADICTION)\b", text
+        )
+    )
     assert named == {flag.name for flag in Health if flag}
 
 
@@ -114,14 +120,22 @@ def test_a_number_for_other_languages_stands_in_the_readme(statement: str) -> No
 
 def test_limits_that_are_written_in_words_are_those_of_the_code() -> None:
     day = 86_400 * thresholds.NS
-    assert (day, day, day // 8) == (validation.MAX_VISIT_NS, weather_in.AHEAD_NS, fused_weather.VALID_NS)
+    assert (day, day, day // 8) == (
+        validation.MAX_VISIT_NS,
+        weather_in.AHEAD_NS,
+        fused_weather.VALID_NS,
+    )
     assert alerts.LEAST_SOURCES == 2
 
 
 def table_of_ranges() -> str:
     """The README's table of what a report may carry, from the tables of the contract."""
     lines = ["| column | unit | range |", "|---|---|---|"]
-    fields = {field.name: field for field in (*tables.OBSERVATION, *tables.STATE) if field.range is not None}
+    fields = {
+        field.name: field
+        for field in (*tables.OBSERVATION, *tables.STATE)
+        if field.range is not None
+    }
     for name, field in fields.items():
         least, most = field.range or (0, 0)
         lines.append(f"| `{name}` | {field.unit} | {least:.9g} … {most:.10g} |")
@@ -130,15 +144,27 @@ def table_of_ranges() -> str:
 
 def test_the_ranges_of_the_readme_are_those_that_are_checked() -> None:
     assert table_of_ranges() in README
-    checked = {kind: [(r.column, r.least, r.most) for r in ranges] for kind, ranges in validation.RANGES.items()}
+    checked = {
+        kind: [(r.column, r.least, r.most) for r in ranges]
+        for kind, ranges in validation.RANGES.items()
+    }
     for kind, fields in ((Kind.OBSERVATION, tables.OBSERVATION), (Kind.STATE, tables.STATE)):
         assert checked[kind] == [(f.name, *f.range) for f in fields if f.range is not None]
 
 
 def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Path) -> None:
-    words = ["-m", "grpc_tools.protoc", "-I", str(SCHEMAS / "proto"), f"--python_out={tmp_path}", "gripmap.proto"]
+    words = [
+        "-m",
+        "grpc_tools.protoc",
+        "-I",
+        str(SCHEMAS / "proto"),
+        f"--python_out={tmp_path}",
+        "gripmap.proto",
+    ]
     subprocess.run([sys.executable, *words], check=True)
-    made, kept = ((folder / "gripmap_pb2.py").read_text() for folder in (tmp_path, SCHEMAS / "proto"))
+    made, kept = (
+        (folder / "gripmap_pb2.py").read_text() for folder in (tmp_path, SCHEMAS / "proto")
+    )
     assert descriptor(made) == descriptor(kept)
 
 

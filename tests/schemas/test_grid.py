@@ -16,7 +16,9 @@ longitudes = st.floats(-180.0, 180.0, exclude_max=True)
 @given(latitudes, longitudes)
 def test_a_position_lies_in_its_cell(latitude: float, longitude: float) -> None:
     west, south, east, north = (float(v) for v in grid.bounds(grid.cell_of(latitude, longitude)))
-    assert (longitude - west + 1e-9) % 360.0 <= east - west + 2e-9  # a hair below 180° rounds to -180°
+    assert (
+        longitude - west + 1e-9
+    ) % 360.0 <= east - west + 2e-9  # a hair below 180° rounds to -180°
     assert south - 1e-9 <= latitude <= north + 1e-9
 
 
@@ -27,7 +29,9 @@ def test_the_centre_of_a_cell_lies_in_it(latitude: float, longitude: float) -> N
 
 
 @given(latitudes, longitudes, st.sampled_from([7, 10, 14]))
-def test_a_parent_is_the_cell_of_the_coarser_zoom(latitude: float, longitude: float, zoom: int) -> None:
+def test_a_parent_is_the_cell_of_the_coarser_zoom(
+    latitude: float, longitude: float, zoom: int
+) -> None:
     cell = grid.cell_of(latitude, longitude)
     assert grid.parent(cell, zoom) == grid.cell_of(latitude, longitude, zoom)
     assert grid.quadkey(int(cell), 21).startswith(grid.quadkey(int(grid.parent(cell, zoom)), zoom))
@@ -53,7 +57,9 @@ def test_quadkeys_are_those_of_the_published_example() -> None:
 def test_cells_are_as_long_as_the_design_says() -> None:
     for latitude, side in ((0.0, 19.1), (57.7, 10.2), (60.0, 9.6)):
         west, _, east, _ = (float(v) for v in grid.bounds(grid.cell_of(latitude, 10.0)))
-        assert np.radians(east - west) * 6_378_137 * np.cos(np.radians(latitude)) == pytest.approx(side, abs=0.1)
+        assert np.radians(east - west) * 6_378_137 * np.cos(np.radians(latitude)) == pytest.approx(
+            side, abs=0.1
+        )
 
 
 def test_neighbours_touch_and_wrap_at_the_date_line() -> None:
@@ -69,14 +75,16 @@ def test_beyond_the_poles_there_is_no_neighbour() -> None:
 
 
 @pytest.mark.parametrize(
-    ("degrees", "sector"), [(0, 0), (44, 0), (46, 1), (90, 1), (180, 2), (-90, 3), (359, 0), (-180, 2)]
+    ("degrees", "sector"),
+    [(0, 0), (44, 0), (46, 1), (90, 1), (180, 2), (-90, 3), (359, 0), (-180, 2)],
 )
 def test_sectors_are_quarters_of_the_compass(degrees: float, sector: int) -> None:
     assert grid.sector_of(np.radians(degrees)) == sector
 
 
 @pytest.mark.parametrize(
-    ("degrees", "second"), [(0, -1), (29, -1), (31, 1), (59, 0), (61, -1), (-40, 3), (179, -1), (134, 2)]
+    ("degrees", "second"),
+    [(0, -1), (29, -1), (31, 1), (59, 0), (61, -1), (-40, 3), (179, -1), (134, 2)],
 )
 def test_a_heading_near_an_edge_belongs_to_both_sectors(degrees: float, second: int) -> None:
     assert grid.sectors_touched(np.radians(degrees))[1] == second

@@ -12,7 +12,9 @@ import pytest
 
 from deploy.router import open_router
 
-pytestmark = pytest.mark.timeout(400)  # a service whose kernels are not compiled yet takes minutes to begin
+pytestmark = pytest.mark.timeout(
+    400
+)  # a service whose kernels are not compiled yet takes minutes to begin
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +24,20 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": endpoints}, "segment_s": 0.1, "put_s": 0.1}))
-    words = ["fleet_service.cli", "run", "--config", str(config), "--archive", str(folder / "archive")]
-    with router, subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, text=True) as service:
+    words = [
+        "fleet_service.cli",
+        "run",
+        "--config",
+        str(config),
+        "--archive",
+        str(folder / "archive"),
+    ]
+    with (
+        router,
+        subprocess.Popen(
+            [sys.executable, "-m", *words], stdout=subprocess.PIPE, text=True
+        ) as service,
+    ):
         try:
             assert service.stdout is not None
             assert service.stdout.readline().startswith("ready: ")
@@ -38,38 +52,70 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
 
 def test_it_loads_nothing_but_the_contract_and_its_libraries(found: dict[str, Any]) -> None:
     assert not found["loaded"]
-    assert found["blocked"] == ["numba", "llvmlite", "scipy", "edge_agent", "fleet_service", "deploy"]
+    assert found["blocked"] == [
+        "numba",
+        "llvmlite",
+        "scipy",
+        "edge_agent",
+        "fleet_service",
+        "deploy",
+    ]
 
 
-def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(found: dict[str, Any]) -> None:
+def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(
+    found: dict[str, Any],
+) -> None:
     sent, (first, second) = found["sent"], found["sent"]["vehicles"]
     durable = [[1, 1]]
-    acks = {vehicle: [stream[:4] for stream in streams] for vehicle, streams in found["acks"].items()}
-    assert acks == {first: [[41, sent["region"], durable, []]], second: [[42, sent["region"], durable, []]]}
-    late, told = zip(*(stream[4:] for streams in found["acks"].values() for stream in streams), strict=True)
+    acks = {
+        vehicle: [stream[:4] for stream in streams] for vehicle, streams in found["acks"].items()
+    }
+    assert acks == {
+        first: [[41, sent["region"], durable, []]],
+        second: [[42, sent["region"], durable, []]],
+    }
+    late, told = zip(
+        *(stream[4:] for streams in found["acks"].values() for stream in streams), strict=True
+    )
     assert late == ([], [])
     assert min(told) > 0, "the service's time"
-    assert sorted(found["batches"]) == [[vehicle, sent["visits"], sent["region"]] for vehicle in (first, second)]
+    assert sorted(found["batches"]) == [
+        [vehicle, sent["visits"], sent["region"]] for vehicle in (first, second)
+    ]
     assert not found["errors"]
 
 
-def test_it_reads_the_tile_and_the_alert_that_its_reports_brought_about(found: dict[str, Any]) -> None:
+def test_it_reads_the_tile_and_the_alert_that_its_reports_brought_about(
+    found: dict[str, Any],
+) -> None:
     assert {encoding for encoding, _ in found["tiles"]} == {"application/vnd.apache.arrow.stream"}
     alert, cell = found["alerts"][0], found["sent"]["cell"]
-    assert (alert["cell"], alert["sector"], alert["raised"], alert["vehicles"]) == (cell, 1, True, 2)
+    assert (alert["cell"], alert["sector"], alert["raised"], alert["vehicles"]) == (
+        cell,
+        1,
+        True,
+        2,
+    )
     assert found["standing"] == ["application/protobuf;gripmap.v1.StandingAlerts", [cell]]
 
 
 def test_three_forms_of_an_answer_say_the_same(found: dict[str, Any]) -> None:
     encoding, (cell,) = found["arrow"]
     assert encoding == "application/vnd.apache.arrow.stream"
-    assert (cell["cell"], cell["sector"], cell["basis"], cell["vehicles"]) == (found["sent"]["cell"], 1, "measured", 2)
+    assert (cell["cell"], cell["sector"], cell["basis"], cell["vehicles"]) == (
+        found["sent"]["cell"],
+        1,
+        "measured",
+        2,
+    )
     assert cell["mu_lower"] <= 0.2 <= cell["mu_upper"] < 0.4
     (same,) = found["json"]["cells"]
     (feature,) = found["geojson"]["features"]
     for other in (same, feature["properties"]):
         assert (other["cell"], other["observations"]) == (cell["cell"], cell["observations"])
-        assert other["mu"] == pytest.approx(cell["mu"], abs=1e-3)  # answers fade from one read to the next
+        assert other["mu"] == pytest.approx(
+            cell["mu"], abs=1e-3
+        )  # answers fade from one read to the next
 
 
 def test_a_question_that_cannot_be_read_is_answered_with_the_fix(found: dict[str, Any]) -> None:

@@ -22,12 +22,17 @@ NOMINAL = nominal_states(Constants())
 
 def test_understeer_is_unknown_without_axle_stiffness() -> None:
     assert CAR.understeer_per_g() is None
-    assert means_of([CAR], NOMINAL.mean)[0, NodeState.COMPLIANCE] == NOMINAL.mean[NodeState.COMPLIANCE]
+    assert (
+        means_of([CAR], NOMINAL.mean)[0, NodeState.COMPLIANCE] == NOMINAL.mean[NodeState.COMPLIANCE]
+    )
 
 
 def test_soft_front_axle_is_compliance_of_the_prior() -> None:
     soft = CAR.model_copy(
-        update={"cornering_stiffness_front": 12.5 * LOADS[0], "cornering_stiffness_rear": 25.0 * LOADS[1]}
+        update={
+            "cornering_stiffness_front": 12.5 * LOADS[0],
+            "cornering_stiffness_rear": 25.0 * LOADS[1],
+        }
     )
     assert soft.understeer_per_g() == pytest.approx(1.0 / 12.5 - 1.0 / 25.0)
     assert means_of([soft], NOMINAL.mean)[0, NodeState.COMPLIANCE] == pytest.approx(0.04)
@@ -36,7 +41,15 @@ def test_soft_front_axle_is_compliance_of_the_prior() -> None:
 
 def test_calibrated_understeer_counts_before_the_file() -> None:
     learned = CAR.model_copy(
-        update={"steering_compliance": 0.01, "calibration": Calibration(drives=2, understeer=(0.002, 0.0001))}
+        update={
+            "steering_compliance": 0.01,
+            "calibration": Calibration(drives=2, understeer=(0.002, 0.0001)),
+        }
     )
-    assert means_of([learned], NOMINAL.mean)[0, NodeState.COMPLIANCE] == pytest.approx(0.002 * GRAVITY)
-    assert spreads_of([learned], NOMINAL.std)[0, NodeState.COMPLIANCE] < NOMINAL.std[NodeState.COMPLIANCE]
+    assert means_of([learned], NOMINAL.mean)[0, NodeState.COMPLIANCE] == pytest.approx(
+        0.002 * GRAVITY
+    )
+    assert (
+        spreads_of([learned], NOMINAL.std)[0, NodeState.COMPLIANCE]
+        < NOMINAL.std[NodeState.COMPLIANCE]
+    )

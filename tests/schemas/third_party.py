@@ -23,7 +23,9 @@ FORBIDDEN: Final = ("numba", "llvmlite", "scipy", "edge_agent", "fleet_service",
 class Blocker(MetaPathFinder):
     """Refuses to find the forbidden packages, as if they were not installed."""
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: object = None
+    ) -> ModuleSpec | None:
         if fullname.partition(".")[0] in FORBIDDEN:
             raise ModuleNotFoundError(f"{fullname} is not installed here", name=fullname)
         return None
@@ -59,7 +61,9 @@ def protobuf_batch(now: int) -> bytes:
         "cell": np.full(VISITS, CELL), "sector": np.ones(VISITS, np.int8),
         "log_likelihood": mugrid.encode_log_likelihood(np.tile(log_likelihood, (VISITS, 1))),
     }  # fmt: skip
-    return wire.encode(Batch(Kind.OBSERVATION, PROTOBUF_SENDER, 41, REGION, 1, 1, columns, "third-party"))
+    return wire.encode(
+        Batch(Kind.OBSERVATION, PROTOBUF_SENDER, 41, REGION, 1, 1, columns, "third-party")
+    )
 
 
 def json_batch(now: int) -> bytes:
@@ -68,7 +72,9 @@ def json_batch(now: int) -> bytes:
     numbers = {"latitude": LATITUDE, "longitude": LONGITUDE, "yaw": NORTH, "mu": ICE, "mu_lower": 0.12,
                "mu_upper": 0.28, "mu_utilised": 0.19}  # fmt: skip
     columns = {name: [value] * VISITS for name, value in numbers.items()}
-    return json.dumps({"vehicle": JSON_SENDER, "boot": "42", "seq": "1", "enter_time": times, **columns}).encode()
+    return json.dumps(
+        {"vehicle": JSON_SENDER, "boot": "42", "seq": "1", "enter_time": times, **columns}
+    ).encode()
 
 
 def open_session(endpoint: str) -> zenoh.Session:
@@ -92,7 +98,11 @@ class Heard:
         session.declare_subscriber(f"{keys.ROOT}/*/**", self._hear)
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        key, payload, encoding = str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)
+        key, payload, encoding = (
+            str(sample.key_expr),
+            sample.payload.to_bytes(),
+            str(sample.encoding),
+        )
         try:
             topic = keys.parse(key).topic.name
             if topic == "ack":
@@ -138,10 +148,17 @@ def main(endpoint: str) -> None:
             JSON_SENDER: (json_batch(time.time_ns()), wire.JSON),
         }
         for vehicle, (payload, encoding) in sent.items():
-            publisher = session.declare_publisher(keys.observation_key(REGION, vehicle), encoding=encoding)
+            publisher = session.declare_publisher(
+                keys.observation_key(REGION, vehicle), encoding=encoding
+            )
             matched(publisher)
             publisher.put(payload)
-        until(lambda: heard.errors or (len(heard.acks) == len(sent) and heard.alerts and heard.tiles and heard.batches))
+        until(
+            lambda: (
+                heard.errors
+                or (len(heard.acks) == len(sent) and heard.alerts and heard.tiles and heard.batches)
+            )
+        )
         box = f"bbox={LONGITUDE - 0.01},{LATITUDE - 0.01},{LONGITUDE + 0.01},{LATITUDE + 0.01};min_vehicles=2"
         ((arrow, tile),) = asked(session, f"{keys.ROOT}/map/**?{box}")
         ((_, document),) = asked(session, f"{keys.ROOT}/map/**?{box};format=json")

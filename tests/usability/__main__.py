@@ -86,7 +86,15 @@ def pages_with_errors(house: House) -> float:
     pages = []
     for words in PAGES:
         out = house.folder / f"{words.replace(' ', '')}.html"
-        command = ["analyze", *words.split(), "--archive", str(house.archive), *DAY, "--out", str(out)]
+        command = [
+            "analyze",
+            *words.split(),
+            "--archive",
+            str(house.archive),
+            *DAY,
+            "--out",
+            str(out),
+        ]
         assert fleet_service.cli.main(command) == 0, command
         pages.append(out)
     drive = drives(1, SEED, rough=False)[0]
@@ -113,7 +121,9 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
         street.put(router, ("ice", "dry"), time.time_ns(), 1)
         with opened(address) as found:
             until(lambda: found.drawn)
-            foreign = [url for url in found.requests if not url.startswith((address, "blob:", "data:"))]
+            foreign = [
+                url for url in found.requests if not url.startswith((address, "blob:", "data:"))
+            ]
             return ("live", found.errors, foreign) if found.errors or foreign else None
 
 
@@ -121,7 +131,13 @@ def service_ready_s(house: House) -> float:
     """From the command to `ready:` of a service on an empty archive, kernels as `make setup` left them."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     (house.folder / "ready.json").write_text(json.dumps({"zenoh": {"connect": endpoints}}))
-    words = ["run", "--config", str(house.folder / "ready.json"), "--archive", str(house.folder / "ready")]
+    words = [
+        "run",
+        "--config",
+        str(house.folder / "ready.json"),
+        "--archive",
+        str(house.folder / "ready"),
+    ]
     part = Part("ready", [str(Path(sys.executable).parent / "fleet-service"), *words], house.folder)
     with router:
         began = time.monotonic()
@@ -137,9 +153,15 @@ def bound_painted(house: House) -> float:
     """Outputs in which a bound has a number to colour by."""
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    counts = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", done.stdout)}
+    counts = {
+        word: int(count)
+        for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", done.stdout)
+    }
     house.note("bounds", counts)
-    whole = counts.get("passed") and not counts.keys() & {"skipped", "error"}  # what was not tried is not well
+    whole = counts.get("passed") and not counts.keys() & {
+        "skipped",
+        "error",
+    }  # what was not tried is not well
     return float(counts.get("failed", 0)) if whole else float("nan")
 
 
@@ -149,7 +171,9 @@ def colour_distance(house: House) -> float:
     lines = [style.colour for style in (*ESTIMATORS.values(), TRUTH)]
     least = {
         sight: min(
-            difference(lab(a, sight), lab(b, sight)) for alike in (surfaces, lines) for a, b in combinations(alike, 2)
+            difference(lab(a, sight), lab(b, sight))
+            for alike in (surfaces, lines)
+            for a, b in combinations(alike, 2)
         )
         for sight in SIGHTS
     }
@@ -187,9 +211,20 @@ def install_to_first_map_s(house: House) -> float:
     began, place = time.monotonic(), house.folder / "venv"
     venv.create(place, with_pip=True)
     pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
-    subprocess.run([*pip, str(ROOT / "constraints.txt"), f"{wheel}[analytics]"], check=True, capture_output=True)
+    subprocess.run(
+        [*pip, str(ROOT / "constraints.txt"), f"{wheel}[analytics]"],
+        check=True,
+        capture_output=True,
+    )
     out = house.folder / "first.html"
-    command = [str(place / "bin" / "fleet-service"), "analyze", "grip", "--archive", str(house.archive), *DAY]
+    command = [
+        str(place / "bin" / "fleet-service"),
+        "analyze",
+        "grip",
+        "--archive",
+        str(house.archive),
+        *DAY,
+    ]
     subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, cwd=house.folder)
     with opened(out) as found:
         assert found.drawn > 0
@@ -247,15 +282,29 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "options_undocumented": (options_undocumented, "", 0, "less"),
     "figures_stale": (figures_stale, "", 0, "less"),
     "first_drive_commands": (first_drive_commands, "", 5, "less"),
-    "first_drive_alerts": (first_drive_alerts, "of a real minute on a dry motorway, under three names", 0, "less"),
-    "alerts_per_stretch": (alerts_per_stretch, "per icy stretch and direction, of the last demo", 2, "less"),
+    "first_drive_alerts": (
+        first_drive_alerts,
+        "of a real minute on a dry motorway, under three names",
+        0,
+        "less",
+    ),
+    "alerts_per_stretch": (
+        alerts_per_stretch,
+        "per icy stretch and direction, of the last demo",
+        2,
+        "less",
+    ),
 }
 
 
 def main() -> int:
     """Measure; 1 where a bar does not hold or a figure is missing."""
-    parser = argparse.ArgumentParser(prog="python -m tests.usability", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS), help="parts (default: all)")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.usability", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--only", nargs="*", choices=PARTS, default=list(PARTS), help="parts (default: all)"
+    )
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     place = Path(tempfile.mkdtemp())
@@ -266,7 +315,9 @@ def main() -> int:
             print(f"-- {name}", flush=True)
             try:
                 value = measure(house)
-            except pytest.skip.Exception as missing:  # a browser that is not there: not measured does not hold
+            except (
+                pytest.skip.Exception
+            ) as missing:  # a browser that is not there: not measured does not hold
                 house.note(name, missing)
                 value = float("nan")
             found.append(Figure(f"usability.{name}", value, unit, bar, better))  # type: ignore[arg-type]

@@ -48,7 +48,8 @@ FLEET: Final = (
     "rebuild --archive {a} --out {d}/r --engine abacus", "export datex --out {d}/x.xml",
     "analyze contract --archive {a}",
     "query --connect tcp/127.0.0.1:1", "query --connect nonsense", "query --config {d}/none.json",
-    "watch --bbox 1", "watch --webhook nonsense", "cits --amqp nonsense", "watch --config {d}/bad.json", "compact --archive {d}",
+    "watch --bbox 1", "watch --webhook nonsense", "watch --config {d}/bad.json", "compact --archive {d}",
+    "cits --amqp nonsense",
     "hand-over nowhere --to north-b", "hand-over */*/* --to north-b --connect tcp/127.0.0.1:1", "hand-over */*/*",
     "compact --archive {d}/none", "compact --archive {a} --round-rows 0", "compact --archive {a} --put-to nonsense://x",
     "retention --archive {a} --raw-days 1", "retention --archive {d} --raw-days 31", "forget --archive {a} --period x",
@@ -79,7 +80,9 @@ def prepare(folder: Path) -> None:
 def tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
     """Return how many mistakes were made, and those answered with a traceback or with exit code 0."""
     bad = []
-    lines: list[tuple[Callable[[list[str]], int], str]] = [(edge_agent.cli.main, line) for line in EDGE]
+    lines: list[tuple[Callable[[list[str]], int], str]] = [
+        (edge_agent.cli.main, line) for line in EDGE
+    ]
     lines += [(fleet_service.cli.main, line) for line in FLEET]
     for main, line in lines:
         words = line.format(d=folder, a=archive).split()

@@ -44,7 +44,9 @@ LONGEST_S: Final = 300.0
 
 def blocks(text: str) -> list[tuple[str, str]]:
     """Return language and text of each fenced block of a page."""
-    return [(m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)]
+    return [
+        (m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    ]
 
 
 def pages() -> str:
@@ -61,7 +63,9 @@ def commands(text: str) -> list[str]:
         else:
             lines = (re.sub(r"\s{2,}#.*", "", line).strip() for line in block.splitlines())
             found += [
-                line for line in lines if line.startswith(("python ", "gripmap ", "fleet-service ", "edge-agent "))
+                line
+                for line in lines
+                if line.startswith(("python ", "gripmap ", "fleet-service ", "edge-agent "))
             ]
     return [one for one in found if not one.startswith(LEFT_OUT)]
 
@@ -69,7 +73,9 @@ def commands(text: str) -> list[str]:
 def run(folder: Path) -> list[str]:
     """Run all; returns those that failed, with the last line they said."""
     for name in ("deploy", "tests/data"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.py")
+        )
     bin_folder = Path(sys.executable).parent
     staying: list[tuple[str, subprocess.Popen[bytes]]] = []
     failed: list[str] = []
@@ -93,7 +99,9 @@ def run(folder: Path) -> list[str]:
                     staying.pop()
                 continue
             line = [sys.executable, "-c", command] if "\n" in command else ["bash", "-c", command]
-            code = _ended(line, folder, log, {"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())})
+            code = _ended(
+                line, folder, log, {"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())}
+            )
             if code:
                 failed.append(f"{command}: {code}: {_last(log)}")
     finally:
@@ -107,7 +115,13 @@ def _ended(line: list[str], folder: Path, log: Path, environment: dict[str, str]
     with log.open("wb") as out:
         try:
             done = subprocess.run(
-                line, cwd=folder, stdout=out, stderr=out, check=False, timeout=LONGEST_S, env=environment
+                line,
+                cwd=folder,
+                stdout=out,
+                stderr=out,
+                check=False,
+                timeout=LONGEST_S,
+                env=environment,
             )
         except subprocess.TimeoutExpired:  # the others are tried all the same
             return f"did not end within {LONGEST_S:g} s"
@@ -118,7 +132,9 @@ def _wait(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
     word = next((word for start, word in READY.items() if command.startswith(start)), None)
     deadline = time.monotonic() + (SETTLE_S if word is None else LONGEST_S)
     while process.poll() is None and time.monotonic() < deadline:
-        if word is not None and any(line.startswith(word) for line in log.read_text(errors="replace").splitlines()):
+        if word is not None and any(
+            line.startswith(word) for line in log.read_text(errors="replace").splitlines()
+        ):
             return
         time.sleep(0.1)
 

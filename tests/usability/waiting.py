@@ -21,13 +21,24 @@ COMMANDS: Final = (
     ["edge-agent", "simulate", "slalom", "--out", "{d}/s.parquet", "--vehicle-out", "{d}/s.json"],
     ["edge-agent", "check", "{d}/log.parquet", "--vehicle", "{d}/car.json", "--out", "{d}/c.html"],
     ["fleet-service", "compact", "--archive", "{a}"],
-    ["edge-agent", "replay", "{d}/log.parquet", "--vehicle", "{d}/car.json", "--out", "{d}/e.parquet"],
+    [
+        "edge-agent",
+        "replay",
+        "{d}/log.parquet",
+        "--vehicle",
+        "{d}/car.json",
+        "--out",
+        "{d}/e.parquet",
+    ],
     ["fleet-service", "analyze", "worst", "--archive", "{a}", "--out", "{d}/w.html"],
     ["fleet-service", "export", "map", "--archive", "{a}", "--out", "{d}/m.parquet"],
 )
 # what goes on until a signal, and the word with which its waiting is over
 LASTING: Final = (
-    (["fleet-service", "run", "--config", "{d}/lasting.json", "--archive", "{d}/lasting"], b"ready: "),
+    (
+        ["fleet-service", "run", "--config", "{d}/lasting.json", "--archive", "{d}/lasting"],
+        b"ready: ",
+    ),
     (["edge-agent", "run", "--config", "{d}/lasting-agent.json"], b"metrics: "),
 )
 
@@ -43,7 +54,9 @@ def longest(command: list[str], cache: Path, ready: bytes | None = None) -> floa
     last, worst, said = time.monotonic(), 0.0, b""
     began = last
     program = [str(Path(sys.executable).parent / command[0]), *command[1:]]
-    with subprocess.Popen(program, stdin=there, stdout=there, stderr=there, env=environment) as process:
+    with subprocess.Popen(
+        program, stdin=there, stdout=there, stderr=there, env=environment
+    ) as process:
         os.close(there)
         while time.monotonic() - began < LONGEST_S:
             waiting, _, _ = select.select([here], [], [], 0.1)
@@ -58,7 +71,9 @@ def longest(command: list[str], cache: Path, ready: bytes | None = None) -> floa
                 process.send_signal(signal.SIGINT)
                 break
         whole = max(worst, time.monotonic() - last)
-        while ready is not None and process.poll() is None:  # what it says in leaving is taken, that it may leave
+        while (
+            ready is not None and process.poll() is None
+        ):  # what it says in leaving is taken, that it may leave
             if select.select([here], [], [], 0.1)[0]:
                 with suppress(OSError):
                     os.read(here, 65536)

@@ -32,7 +32,9 @@ def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
 def _spoilt(name: str, drive: Recorded) -> Recorded:
     if name != TONNES:
         return PLANTED[name].spoil(drive)
-    return drive._replace(vehicle=drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1000.0}))
+    return drive._replace(
+        vehicle=drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1000.0})
+    )
 
 
 def _said(folder: Path, drive: Recorded) -> bool:
@@ -41,7 +43,14 @@ def _said(folder: Path, drive: Recorded) -> bool:
     pq.write_table(pa.table({"t": pa.array(t), **columns}), folder / "wrong.parquet")
     (folder / "wrong.json").write_text(vehicle.model_dump_json(exclude_none=True))
     heard = io.StringIO()
-    words = ["replay", str(folder / "wrong.parquet"), "--estimator", "sr-ukf", "--out", str(folder / "e.parquet")]
+    words = [
+        "replay",
+        str(folder / "wrong.parquet"),
+        "--estimator",
+        "sr-ukf",
+        "--out",
+        str(folder / "e.parquet"),
+    ]
     with contextlib.redirect_stderr(heard), contextlib.redirect_stdout(io.StringIO()):
         code = edge_agent.cli.main(words)
     return code == 2 or "warning: " in heard.getvalue()

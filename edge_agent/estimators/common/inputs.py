@@ -45,7 +45,9 @@ class InputTrack:
 
 
 @compiled
-def take(track: InputTrack, row: FloatArray, time: float, sample: FloatArray) -> tuple[int, int, float]:
+def take(
+    track: InputTrack, row: FloatArray, time: float, sample: FloatArray
+) -> tuple[int, int, float]:
     """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds elapsed)."""
     begins = not track.started
     dt = time - track.time
@@ -94,7 +96,10 @@ def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
     for k in range(S.YAW_RATE, S.OMEGA):
         value = now[k] if now[k] == now[k] else 0.0 if anew else use[k]
         if k >= S.DELTA and value != use[k]:
-            track.steering[0, k - S.DELTA], track.steering[1, k - S.DELTA] = math.cos(value), math.sin(value)
+            track.steering[0, k - S.DELTA], track.steering[1, k - S.DELTA] = (
+                math.cos(value),
+                math.sin(value),
+            )
         use[k] = value
     speed = rolling_speed(row, now)
     use[S.AX] = 0.0 if math.isnan(now[S.AX]) else now[S.AX]
@@ -122,4 +127,7 @@ def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> 
     """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation 10)."""
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step
-    return float((track.inputs[S.TORQUE + wheel] - row[Parameter.WHEEL_INERTIA] * turning) / row[Parameter.RADIUS])
+    return float(
+        (track.inputs[S.TORQUE + wheel] - row[Parameter.WHEEL_INERTIA] * turning)
+        / row[Parameter.RADIUS]
+    )

@@ -34,7 +34,14 @@ def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float)
     """The health flag of a wheel past its peak by longitudinal slip, at the inputs in use."""
     health, yaw_rate = 0, track.inputs[S.YAW_RATE]
     for wheel in range(4):
-        along = along_wheel(row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel])
-        gliding = abs(row[Parameter.RADIUS] * track.inputs[S.OMEGA + wheel] - along) * row[Parameter.SLOPE_X]
-        health |= flags.SLIDING if gliding > SLIDING_THETA * mu * max(abs(along), SLOWEST_M_S) else 0
+        along = along_wheel(
+            row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel]
+        )
+        gliding = (
+            abs(row[Parameter.RADIUS] * track.inputs[S.OMEGA + wheel] - along)
+            * row[Parameter.SLOPE_X]
+        )
+        health |= (
+            flags.SLIDING if gliding > SLIDING_THETA * mu * max(abs(along), SLOWEST_M_S) else 0
+        )
     return health

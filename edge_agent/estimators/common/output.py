@@ -25,7 +25,13 @@ PRIOR_MU_STD = (UPPER - LOWER) / math.sqrt(12.0)
 
 @compiled
 def write_motion(
-    output: FloatArray, vx: float, vy: float, yaw_rate: float, var_x: float, var_y: float, var_rate: float
+    output: FloatArray,
+    vx: float,
+    vy: float,
+    yaw_rate: float,
+    var_x: float,
+    var_y: float,
+    var_rate: float,
 ) -> None:
     """The motion [m/s, rad/s] with its variances."""
     speed = max(abs(vx), SLOWEST_M_S)
@@ -40,12 +46,20 @@ def write_motion(
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
     """The motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate` is the yaw rate."""
     write_motion(
-        output, mean[0], mean[1], mean[yaw_rate], variance(root, 0), variance(root, 1), variance(root, yaw_rate)
+        output,
+        mean[0],
+        mean[1],
+        mean[yaw_rate],
+        variance(root, 0),
+        variance(root, 1),
+        variance(root, yaw_rate),
     )
 
 
 @compiled
-def write_quality(output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float) -> None:
+def write_quality(
+    output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
+) -> None:
     """Grip used, and how the innovations were."""
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
@@ -56,7 +70,10 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
     """Median, 5 % and 95 % of friction within its range, from column `first` on."""
     wide = Z_95 * std
     output[first] = min(max(mu, LOWER), UPPER)
-    output[first + 1], output[first + 2] = min(max(mu - wide, LOWER), UPPER), min(max(mu + wide, LOWER), UPPER)
+    output[first + 1], output[first + 2] = (
+        min(max(mu - wide, LOWER), UPPER),
+        min(max(mu + wide, LOWER), UPPER),
+    )
 
 
 @compiled

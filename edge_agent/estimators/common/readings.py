@@ -21,11 +21,19 @@ LARGEST_OMEGA = 500.0  # [rad/s]
 LARGEST_TORQUE = 50_000.0  # [N m]
 # largest believable size of a reading on each channel before the position
 LIMITS = np.array(
-    [LARGEST_ACCELERATION] * 2 + [LARGEST_YAW_RATE] + [LARGEST_STEER] * 4 + [LARGEST_OMEGA] * 4 + [LARGEST_TORQUE] * 4
+    [LARGEST_ACCELERATION] * 2
+    + [LARGEST_YAW_RATE]
+    + [LARGEST_STEER] * 4
+    + [LARGEST_OMEGA] * 4
+    + [LARGEST_TORQUE] * 4
 )
 # health flags of a channel without a reading; the rear wheels' steering is optional
 MISSING = np.array(
-    [flags.NO_INERTIAL] * 3 + [flags.NO_STEERING] * 2 + [0] * 2 + [flags.NO_WHEEL_SPEED] * 4 + [flags.NO_TORQUE] * 4
+    [flags.NO_INERTIAL] * 3
+    + [flags.NO_STEERING] * 2
+    + [0] * 2
+    + [flags.NO_WHEEL_SPEED] * 4
+    + [flags.NO_TORQUE] * 4
 )
 GAP_S = 0.5  # a longer silence of all channels starts a filter's motion anew
 POSITION_S = 1.5  # a longer silence of the receiver is reported
@@ -47,7 +55,9 @@ def believe(sample: FloatArray, now: FloatArray) -> int:
 @compiled
 def position_time(sample: FloatArray, time: float, last: float) -> float:
     """Time [s] of the last position, after a sample (18,) at `time`."""
-    return time if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]) else last
+    return (
+        time if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]) else last
+    )
 
 
 @compiled

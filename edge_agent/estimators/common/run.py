@@ -71,9 +71,15 @@ def kernel_of(
                 if memory.track.started:
                     mu = report(memory, context, output)
                     write_quality(
-                        output, memory.track.excitation.largest, memory.nis, memory.adaptation, memory.log_likelihood
+                        output,
+                        memory.track.excitation.largest,
+                        memory.nis,
+                        memory.adaptation,
+                        memory.log_likelihood,
                     )
-                    health |= sliding(memory.row, memory.track, output[Column.VX], output[Column.VY], mu)
+                    health |= sliding(
+                        memory.row, memory.track, output[Column.VX], output[Column.VY], mu
+                    )
                 else:
                     write_unknown(output)
                 output[Column.HEALTH] = health
@@ -81,7 +87,9 @@ def kernel_of(
     return advance
 
 
-def new_filters(kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> RecordArray:
+def new_filters(
+    kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None
+) -> RecordArray:
     """Return a record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)

@@ -26,7 +26,10 @@ YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 
 
 def mixture_bank(
-    rows: FloatArray, design: MixtureDesign, spreads: FloatArray | None = None, means: FloatArray | None = None
+    rows: FloatArray,
+    design: MixtureDesign,
+    spreads: FloatArray | None = None,
+    means: FloatArray | None = None,
 ) -> EstimatorBank:
     """Friction mixtures of vehicles with parameters `rows` (N, 15).
 
@@ -66,14 +69,18 @@ def _advance(
             memory.log_likelihood = 0.0
             output = outputs[k, n]
             health = step(memory, design, scratch, t[k, n], signals[k, n])
-            if closes.shape[0] > 0 and memory.started and memory.block.samples == 0:  # a block has ended
+            if (
+                closes.shape[0] > 0 and memory.started and memory.block.samples == 0
+            ):  # a block has ended
                 end_part(memory, design, evidence[k, n])
             report(memory, design, output)
             output[Column.HEALTH] = health | memory.health
 
 
 @compiled
-def close_visit(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, evidence: FloatArray) -> None:
+def close_visit(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, evidence: FloatArray
+) -> None:
     """Write the evidence of the visit that ends (32,), and begin the next from the prior."""
     if not memory.started:
         clear(evidence)
@@ -97,11 +104,15 @@ def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> 
     last = memory.last
     vx, vy = velocity(memory)
     constants, var_x = design.constants, memory.overall_covariance[NodeState.VX, NodeState.VX]
-    var_x += (constants.radius_std * vx) ** 2 + (constants.common_lag * last.ax) ** 2  # what no sensor tells
+    var_x += (constants.radius_std * vx) ** 2 + (
+        constants.common_lag * last.ax
+    ) ** 2  # what no sensor tells
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
     write_motion(output, vx, vy, last.yaw_rate, var_x, var_y, var_rate)
-    _report_friction(memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU)
+    _report_friction(
+        memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU
+    )
     for wheel in range(4):
         side = memory.friction_left if wheel % 2 == 0 else memory.friction_right
         upper = side.upper if memory.split else reported_upper(memory.grip, side)

@@ -16,7 +16,10 @@ from schemas.runtime.records import Records
 
 @compiled
 def report_beliefs(
-    filters: Records[MixtureMemory], contexts: Records[MixtureContext], own: FloatArray, visit: FloatArray
+    filters: Records[MixtureMemory],
+    contexts: Records[MixtureContext],
+    own: FloatArray,
+    visit: FloatArray,
 ) -> None:
     """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both (N, 32), maximum 0."""
     design, scratch = contexts[0].design, contexts[0].scratch

@@ -28,11 +28,15 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-SLOWEST_COMPARED_M_S = 1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
+SLOWEST_COMPARED_M_S = (
+    1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
+)
 NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
 ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
 STEEPEST = 0.3  # least cosine of steering
-CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed,
+CERTAIN = (
+    4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed,
+)
 LIKELY = 2.0  # and of what is unknown of the radii
 
 
@@ -96,7 +100,9 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
     for wheel in range(4):
         torque = mean_or(block, S.TORQUE + wheel, math.nan)
         if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
-            force = force_from_torque(torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS])
+            force = force_from_torque(
+                torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS]
+            )
             inertial = row[Parameter.WHEEL_INERTIA] * features.spin[wheel] / row[Parameter.RADIUS]
             spread = math.hypot(constants.force_share * force, constants.spin_share * inertial)
             unit = 0.0
@@ -110,7 +116,10 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
             spread = math.hypot(apart, 0.25 * row[Parameter.MASS] * constants.no_torque_floor)
             if math.isnan(ax):
                 unit, spread = 0.0, NO_FORCE_SHARE * loads[wheel]
-        features.force[wheel], features.force_unit[wheel] = force / loads[wheel], unit / loads[wheel]
+        features.force[wheel], features.force_unit[wheel] = (
+            force / loads[wheel],
+            unit / loads[wheel],
+        )
         features.noise_std[wheel] = spread / loads[wheel]
     return health
 
@@ -145,7 +154,9 @@ def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
     """Side forces whose slip or moment nobody has measured become NaN; returns health flags."""
     health, counts = 0, memory.block.counts
-    if counts[S.DELTA] + counts[S.DELTA + 1] == 0:  # without steering the front axle's slip is unknown
+    if (
+        counts[S.DELTA] + counts[S.DELTA + 1] == 0
+    ):  # without steering the front axle's slip is unknown
         features.side[0] = math.nan
         health |= flags.NO_STEERING
     if memory.last.rear_steering and counts[S.DELTA + 2] + counts[S.DELTA + 3] == 0:
@@ -165,36 +176,57 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
     for wheel in range(4):
         samples = max(memory.block.counts[S.OMEGA + wheel], 1)
         noise = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS]
-        step = max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel]) * row[Parameter.RADIUS]
+        step = (
+            max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel])
+            * row[Parameter.RADIUS]
+        )
         linear = row[Parameter.SLOPE_X] / speed
         slip_variance = linear**2 * (noise**2 + step**2)
         features.abrupt_noise[wheel] = (
             linear * constants.abrupt_share * abruptness(memory, constants, features, wheel)
         ) ** 2
         shape = constants.shape_share * features.force[wheel] ** 2
-        variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
+        variance = (
+            0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
+        )
         features.noise_std[wheel] = math.sqrt(variance * scale)
         features.slip_noise[wheel] = slip_variance * scale
-    scale = design.scales[1] * memory.factor[1] * (strained_noise(memory.trust, constants) if design.adaptive else 1.0)
+    scale = (
+        design.scales[1]
+        * memory.factor[1]
+        * (strained_noise(memory.trust, constants) if design.adaptive else 1.0)
+    )
     features.axle_scale = scale
     for axle in range(2):
         side = features.side[axle]
-        turning = constants.gyro_std * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
+        turning = (
+            constants.gyro_std
+            * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR])
+            / speed
+        )
         pointing = constants.angle_share * features.steer_sin[2 * axle]
-        angle = row[Parameter.SLOPE_Y] * math.sqrt(constants.angle_std**2 + turning**2 + pointing**2)
+        angle = row[Parameter.SLOPE_Y] * math.sqrt(
+            constants.angle_std**2 + turning**2 + pointing**2
+        )
         share = constants.axle_share * side
         shape = constants.shape_share * side * side
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
         before[axle] = side
         variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
-        wide = wide_noise(design.rules, math.asin(features.steer_sin[2 * axle])) if design.adaptive else 1.0
+        wide = (
+            wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
+            if design.adaptive
+            else 1.0
+        )
         features.noise_std[4 + axle] = math.sqrt(variance * scale * wide)
         features.slip_noise[4 + axle] = angle**2 * scale * wide
 
 
 @compiled
-def abruptness(memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int) -> float:
+def abruptness(
+    memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
+) -> float:
     """How far a wheel is from its smoothed speed, moved on by the car's acceleration [m/s]; 0 where it is unknown.
 
     A wheel that spins up or locks goes on for some blocks, a bump is over within one or two.
@@ -212,7 +244,10 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
     """Speed ahead [m/s] of the centre of gravity over a wheel that rolls freely; NaN without a reading."""
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
-    return float((features.rolling[wheel] - across) / max(features.steer_cos[wheel], STEEPEST) + py * features.yaw_rate)
+    return float(
+        (features.rolling[wheel] - across) / max(features.steer_cos[wheel], STEEPEST)
+        + py * features.yaw_rate
+    )
 
 
 @compiled
@@ -222,7 +257,9 @@ def _inform(constants: Constants, features: BlockFeatures) -> None:
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
         side = features.side[axle]
         features.informs_x[axle] = along * along / (along * along + constants.informing_x**2)
-        features.informs_y[axle] = 0.0 if math.isnan(side) else side * side / (side * side + constants.informing_y**2)
+        features.informs_y[axle] = (
+            0.0 if math.isnan(side) else side * side / (side * side + constants.informing_y**2)
+        )
 
 
 @compiled
@@ -232,13 +269,19 @@ def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatur
     Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be is allowed for.
     """
     row, block, radius, first = memory.row, memory.block, memory.overall_mean, NodeState.RADIUS
-    most, speed, covariance = 0.0, max(features.speed, SLOWEST_COMPARED_M_S), memory.overall_covariance
+    most, speed, covariance = (
+        0.0,
+        max(features.speed, SLOWEST_COMPARED_M_S),
+        memory.overall_covariance,
+    )
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
         track = row[Parameter.TRACK_FRONT] if axle == 0 else row[Parameter.TRACK_REAR]
         turning = track * features.yaw_rate * features.steer_cos[left]
         i, j = first + left, first + right
-        faster = features.rolling[right] * (1.0 + radius[j]) - features.rolling[left] * (1.0 + radius[i])
+        faster = features.rolling[right] * (1.0 + radius[j]) - features.rolling[left] * (
+            1.0 + radius[i]
+        )
         slip = (faster - turning) / speed
         unknown = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j], 0.0))
         samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
@@ -261,6 +304,9 @@ def demand(features: BlockFeatures) -> float:
         right = left + 1
         side = features.side[axle]
         across = 0.0 if math.isnan(side) else side
-        along = features.load_share[left] * features.force[left] + features.load_share[right] * features.force[right]
+        along = (
+            features.load_share[left] * features.force[left]
+            + features.load_share[right] * features.force[right]
+        )
         most = max(most, math.hypot(along, across))
     return most

@@ -44,7 +44,9 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
                 row[state] = min(row[state], np.hypot(estimate[1], each_drive))
         if vehicle.calibration is not None and vehicle.calibration.understeer is not None:
             learned = GRAVITY * vehicle.calibration.understeer[1]
-            row[NodeState.COMPLIANCE] = min(row[NodeState.COMPLIANCE], np.hypot(learned, EACH_COMPLIANCE))
+            row[NodeState.COMPLIANCE] = min(
+                row[NodeState.COMPLIANCE], np.hypot(learned, EACH_COMPLIANCE)
+            )
     return spreads
 
 

@@ -12,7 +12,12 @@ from edge_agent.adaptation.rule_base import RuleBase, rule_base
 from edge_agent.estimators.friction_mixture.constants import NODES, STATES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
 from edge_agent.estimators.friction_mixture.split_sides import Sides, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import Curve, TyreCurve, curve_tables, magic_formulas
+from edge_agent.estimators.friction_mixture.tyre_curve import (
+    Curve,
+    TyreCurve,
+    curve_tables,
+    magic_formulas,
+)
 from schemas.numeric import FloatArray
 
 
@@ -68,7 +73,11 @@ def nominal_states(constants: Constants) -> Nominal:
 
 
 def design_of(
-    memberships: Memberships, *, adaptive: bool, constants: Constants | None = None, curve: Curve | None = None
+    memberships: Memberships,
+    *,
+    adaptive: bool,
+    constants: Constants | None = None,
+    curve: Curve | None = None,
 ) -> MixtureDesign:
     """The tables of a filter; other `constants` are for studies, another `curve` for other tyres."""
     mu, prior = node_table(NODES)
@@ -78,7 +87,9 @@ def design_of(
         mu=mu,
         prior=prior,
         sides=side_table(mu, prior, constants.split_prior),
-        curve=curve_tables(curve or partial(magic_formulas, c=constants.curve_c, e=constants.curve_e)),
+        curve=curve_tables(
+            curve or partial(magic_formulas, c=constants.curve_c, e=constants.curve_e)
+        ),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),

@@ -17,11 +17,18 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-DRIVES = (0.0, 0.45, 1.0)  # share of the front axle of a car that drives its rear axle, all wheels, its front axle
+DRIVES = (
+    0.0,
+    0.45,
+    1.0,
+)  # share of the front axle of a car that drives its rear axle, all wheels, its front axle
 ALL_WHEELS = 1  # of these kinds
 FIRST_ODDS = (0.35, 0.3, 0.35)
 SHARE_STD = 0.03  # of a car of a known kind
-BRAKES_FRONT, BRAKES_STD = 0.64, 0.06  # share of the front in braking, and how it differs between cars
+BRAKES_FRONT, BRAKES_STD = (
+    0.64,
+    0.06,
+)  # share of the front in braking, and how it differs between cars
 ENGINE_BRAKE = 1.5  # [m/s^2] to twice this a car may slow by its engine, on the driven axle alone
 PULLS = 0.05  # a_x over g from which the driven axle shows
 FAST_M_S = 3.0  # slip is told above this speed
@@ -54,7 +61,10 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Renew the odds of the three kinds by the slip of the axles in the block."""
     row, odds, rolling = memory.row, memory.drive_odds, features.rolling
-    pull, speed = features.change / GRAVITY, 0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3])
+    pull, speed = (
+        features.change / GRAVITY,
+        0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3]),
+    )
     if not (pull > PULLS and speed > FAST_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
         return
     apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
@@ -67,7 +77,9 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
         off = (apart - asked) / spread
         if kind != ALL_WHEELS and off * asked > 0.0:
             off = 0.0
-        odds[kind] *= math.exp(-look * (min(0.5 * off * off, LARGEST_LOSS) + math.log(spread / constants.wheel_std)))
+        odds[kind] *= math.exp(
+            -look * (min(0.5 * off * off, LARGEST_LOSS) + math.log(spread / constants.wheel_std))
+        )
         total += odds[kind]
     for kind in range(3):
         odds[kind] = max(odds[kind] / total, LEAST_ODDS)

@@ -29,7 +29,13 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 @compiled
 def change_road(
-    w: FloatArray, prior: FloatArray, chain: int, hazard: float, leaving: float, drift: float, out: FloatArray
+    w: FloatArray,
+    prior: FloatArray,
+    chain: int,
+    hazard: float,
+    leaving: float,
+    drift: float,
+    out: FloatArray,
 ) -> None:
     """out = w after a change to anywhere with probability hazard and to a neighbour with probability about drift.
 
@@ -99,7 +105,9 @@ def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
 
 
 @compiled
-def visit_evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray) -> None:
+def visit_evidence(
+    mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
+) -> None:
     """out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
     count = mu.shape[0]
     top = -math.inf

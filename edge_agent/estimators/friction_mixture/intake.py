@@ -11,7 +11,13 @@ import math
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
-from edge_agent.estimators.common.readings import GAP_S, INPUTS, believe, position_health, position_time
+from edge_agent.estimators.common.readings import (
+    GAP_S,
+    INPUTS,
+    believe,
+    position_health,
+    position_time,
+)
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.grip_guard import note_grip
@@ -22,7 +28,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-JUMP_M_S2 = 3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
+JUMP_M_S2 = (
+    3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
+)
 HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
 EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
 YAW_WALK = 3.0  # [rad/s/s^.5] yaw acceleration of a lively car as a random walk
@@ -32,14 +40,18 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 
 
 @compiled
-def take_sample(memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray) -> tuple[int, bool]:
+def take_sample(
+    memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
+) -> tuple[int, bool]:
     """Add a sample to the block; returns its health flags and whether the block is whole."""
     last = memory.last
     dt = time - last.time
     if not dt > 0.0:
         return flags.TIME_GAP, False
     now = last.now
-    health = believe(sample, now) & ~flags.NO_STEERING  # which the block judges: a single angle is bridged
+    health = (
+        believe(sample, now) & ~flags.NO_STEERING
+    )  # which the block judges: a single angle is bridged
     health |= refuse_jumps(memory.row, now)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)

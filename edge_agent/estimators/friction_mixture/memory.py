@@ -97,7 +97,9 @@ class WheelSlip:
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
     ended: float  # what of it this block no longer shows [1]
-    rear_unlike_until: float  # time until which the rear axle is on another surface than the front axle [s]
+    rear_unlike_until: (
+        float  # time until which the rear axle is on another surface than the front axle [s]
+    )
 
 
 class Trust:
@@ -109,7 +111,9 @@ class Trust:
     left: float  # of that, before it is tried again [s]
     patience: float  # how long it lasted last [s]
     strain: float  # of what is believed of vehicle and sensors: chi-square over degrees of freedom
-    hurry: float  # at which offsets, slope and bank return to their prior, beside the usual pace [1/s]
+    hurry: (
+        float  # at which offsets, slope and bank return to their prior, beside the usual pace [1/s]
+    )
 
 
 class Quantiles:
@@ -132,11 +136,17 @@ class MixtureMemory:
     mean: Annotated[FloatArray, ALL_NODES, STATES]
     covariance: Annotated[FloatArray, ALL_NODES, STATES, STATES]
     weight: Annotated[FloatArray, ALL_NODES]
-    visit_weight: Annotated[FloatArray, ALL_NODES]  # probabilities from the reference prior at the visit's start
-    surest: Annotated[FloatArray, NODES]  # they where they knew most, since the road last became another
+    visit_weight: Annotated[
+        FloatArray, ALL_NODES
+    ]  # probabilities from the reference prior at the visit's start
+    surest: Annotated[
+        FloatArray, NODES
+    ]  # they where they knew most, since the road last became another
     information: float  # of them over the prior [nat]
     patch: Annotated[FloatArray, PATCH_NODES]  # probability of a patch of ice here, by node
-    penalty: Annotated[FloatArray, ALL_NODES]  # ledger: charged so far for what a node believes of the vehicle [nat]
+    penalty: Annotated[
+        FloatArray, ALL_NODES
+    ]  # ledger: charged so far for what a node believes of the vehicle [nat]
     overall_mean: Annotated[FloatArray, STATES]  # moments of the mixture
     overall_covariance: Annotated[FloatArray, STATES, STATES]
     actual: Annotated[FloatArray, 2]  # windowed innovation variances: wheels, axles
@@ -145,7 +155,9 @@ class MixtureMemory:
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
-    drive_odds: Annotated[FloatArray, 3]  # of a car that drives its rear axle, all wheels, its front axle
+    drive_odds: Annotated[
+        FloatArray, 3
+    ]  # of a car that drives its rear axle, all wheels, its front axle
     slip: WheelSlip
     rolling: RollingMotion
     grip: GripInUse
@@ -159,7 +171,9 @@ class MixtureMemory:
     log_likelihood: float  # of what was measured at the sample [nat]
 
 
-def new_filters(rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray) -> RecordArray:
+def new_filters(
+    rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray
+) -> RecordArray:
     """Filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
 
     The prior of their states is `nominal`, with the means and standard deviations `means`, `spreads` (N, STATES).

@@ -32,7 +32,9 @@ LEAST_WEIGHT = 1e-9  # nor does a node of less
 SLEEPING_SHARE = 0.5  # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
 FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
 BRINK = 4  # power of doubt in that: a contradiction that merely grows forgets nothing yet
-LARGEST_DRIFT = 0.5  # of a node's mass in a block: more would overshoot the balance between neighbours
+LARGEST_DRIFT = (
+    0.5  # of a node's mass in a block: more would overshoot the balance between neighbours
+)
 
 
 @compiled
@@ -76,20 +78,34 @@ def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, met
     hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
-    predicted, weight, visit = scratch.predicted[:count], memory.weight[:count], memory.visit_weight[:count]
+    predicted, weight, visit = (
+        scratch.predicted[:count],
+        memory.weight[:count],
+        memory.visit_weight[:count],
+    )
     change_road(visit, prior, NODES, hazard, leaving, drift, predicted)
     put(visit, predicted)
     change_road(weight, prior, NODES, hazard, leaving, drift, predicted)
     for j in range(count):
         zeta = min(hazard * prior[j] / predicted[j], 1.0)
         memory.penalty[j] *= 1.0 - zeta
-        mix(memory.mean[j], memory.covariance[j], zeta, memory.overall_mean, memory.overall_covariance)
+        mix(
+            memory.mean[j],
+            memory.covariance[j],
+            zeta,
+            memory.overall_mean,
+            memory.overall_covariance,
+        )
     put(weight, predicted)
 
 
 @compiled
 def mix(
-    mean: FloatArray, covariance: FloatArray, zeta: float, overall_mean: FloatArray, overall_covariance: FloatArray
+    mean: FloatArray,
+    covariance: FloatArray,
+    zeta: float,
+    overall_mean: FloatArray,
+    overall_covariance: FloatArray,
 ) -> None:
     """Mix one node (mean (n,), covariance (n, n), changed in place) with the whole."""
     if zeta < LEAST_MIXING:
@@ -126,14 +142,18 @@ def match_moments(
         for i in range(n):
             apart = mean[k, i] - overall_mean[i]
             for j in range(i + 1):
-                overall_covariance[i, j] += weight[k] * (covariance[k, i, j] + apart * (mean[k, j] - overall_mean[j]))
+                overall_covariance[i, j] += weight[k] * (
+                    covariance[k, i, j] + apart * (mean[k, j] - overall_mean[j])
+                )
     for i in range(n):
         for j in range(i):
             overall_covariance[j, i] = overall_covariance[i, j]
 
 
 @compiled
-def reset_diverged(mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants) -> None:
+def reset_diverged(
+    mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
+) -> None:
     """Give nodes (K, n) whose motion has diverged the state of the most probable one, and no weight."""
     best = int(np.argmax(weight))
     for j in range(weight.shape[0]):

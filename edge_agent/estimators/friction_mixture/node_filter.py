@@ -58,7 +58,9 @@ class NodeUpdate(NamedTuple):
 
 
 @compiled
-def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float) -> NodeUpdate:
+def update_node(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float
+) -> NodeUpdate:
     """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
 
     R of the axles is larger still where they are distrusted, and where nothing changes: what is wrong of curve and
@@ -66,7 +68,12 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
 
     Writes its innovation and its theoretical variance without the inflation.
     """
-    constants, nominal, features, node = design.constants, memory.nominal, scratch.features, scratch.node
+    constants, nominal, features, node = (
+        design.constants,
+        memory.nominal,
+        scratch.features,
+        scratch.node,
+    )
     mean, root = memory.mean[j], scratch.root[j]
     innovation, theoretical = scratch.innovation[j], scratch.theoretical[j]
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
@@ -97,7 +104,9 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     loss, used = take_rows(mean, root, node, constants.axle_penalty)
     keep_within(mean, constants, nominal)
     moved = belief_cost(mean, nominal) - before
-    return NodeUpdate(-loss - constants.sliding_penalty / inflation * price, moved, plain, square, used)
+    return NodeUpdate(
+        -loss - constants.sliding_penalty / inflation * price, moved, plain, square, used
+    )
 
 
 @compiled
@@ -136,18 +145,24 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
     for r in range(ROWS):
         axle = r // 2 if r < 4 else r - 4
         across = -features.side_leak[axle] / features.side_unit[axle]
-        derivative[NodeState.LEAK_Y, r] = 0.0 if math.isnan(across) else derivative[NodeState.BIAS_Y, r] * across
+        derivative[NodeState.LEAK_Y, r] = (
+            0.0 if math.isnan(across) else derivative[NodeState.BIAS_Y, r] * across
+        )
         by_angle = derivative[NodeState.STEER, r]
         derivative[NodeState.LAG_STEER, r] = by_angle * features.steer_rate
         derivative[NodeState.STEER_GAIN, r] = by_angle * features.steering
-        derivative[NodeState.COMPLIANCE, r] = 0.0 if math.isnan(features.side[0]) else -by_angle * features.side[0]
+        derivative[NodeState.COMPLIANCE, r] = (
+            0.0 if math.isnan(features.side[0]) else -by_angle * features.side[0]
+        )
         if all_torques:  # an offset of a_x is then no force
             derivative[NodeState.BIAS_X, r] = 0.0
     return price
 
 
 @compiled
-def _by_wheel_speeds(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
+def _by_wheel_speeds(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
+) -> None:
     """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own speed.
 
     All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force is as at the mean.
@@ -167,7 +182,9 @@ def _by_wheel_speeds(memory: MixtureMemory, design: MixtureDesign, scratch: Scra
         for r in range(ROWS):
             by_radius[r] = 0.0
         by_radius[wheel] = (by_lag[wheel] - node.residual[wheel]) / step
-        by_lag[wheel] = by_radius[wheel] * features.change / max(abs(features.rolling[wheel]), SLOWEST_M_S)
+        by_lag[wheel] = (
+            by_radius[wheel] * features.change / max(abs(features.rolling[wheel]), SLOWEST_M_S)
+        )
     by_lag[4] = by_lag[5] = 0.0
 
 
@@ -187,12 +204,16 @@ def weigh_slopes(
             mu, g_x, g_y = side_mu[wheel % 2], slip.along[wheel], slip.across[wheel]
             along = slope_along(curve, g_x, g_y, mu)
             across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
-            node.noise[wheel] = features.noise_std[wheel] ** 2 - unfelt(along) * features.slip_noise[wheel]
+            node.noise[wheel] = (
+                features.noise_std[wheel] ** 2 - unfelt(along) * features.slip_noise[wheel]
+            )
             node.abrupt[wheel] = (0.5 - unfelt(along)) * features.abrupt_noise[wheel]
             if not math.isnan(features.rolling[wheel]):
                 price -= min(math.log(along / flat), 0.0)
         side = 4 + axle
-        node.noise[side] = features.noise_std[side] ** 2 - unfelt(across) * features.slip_noise[side]
+        node.noise[side] = (
+            features.noise_std[side] ** 2 - unfelt(across) * features.slip_noise[side]
+        )
         node.abrupt[side] = 0.0
     return price
 
@@ -264,7 +285,9 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 
 
 @compiled
-def take_rows(mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float) -> tuple[float, int]:
+def take_rows(
+    mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
+) -> tuple[float, int]:
     """Take in the innovations node.residual (6,) one by one: half the normalised square with its price, and rows.
 
     What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
@@ -301,7 +324,9 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 
 
 @compiled
-def predict_node(memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float) -> None:
+def predict_node(
+    memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
+) -> None:
     """Advance node j over the block: exact rotation, gained velocity, process variances scratch.process.
 
     The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).

@@ -64,7 +64,10 @@ def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> flo
     learned_end = LEARNED_END - NEARER * likeness
     level = learned_end + (UPPER_END - learned_end) * math.exp(-max(learned, 0.0) / LEARNED)
     widest = quantile(design.mu, design.prior, weight, UPPER_END)
-    upper = max(quantile(design.mu, design.prior, weight, level), widest - DRAWN_IN - DRAWN_NEARER * likeness)
+    upper = max(
+        quantile(design.mu, design.prior, weight, level),
+        widest - DRAWN_IN - DRAWN_NEARER * likeness,
+    )
     if upper >= SLIPPERY_MU:
         return upper
     surely = quantile(design.mu, design.prior, weight, SURE_END)

@@ -23,12 +23,19 @@ from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.memory import VelocityGain
-from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve, interpolated, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.tyre_curve import (
+    TyreCurve,
+    interpolated,
+    ratio_at,
+    theta_at,
+)
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-SPLIT_LIMIT = 0.9  # of its friction, that the slippery side gives before the other side takes the rest
+SPLIT_LIMIT = (
+    0.9  # of its friction, that the slippery side gives before the other side takes the rest
+)
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
 
 
@@ -48,7 +55,10 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
     An offset of a_y gains what one of a_x does, turned by a quarter.
     """
     leak_y = x[NodeState.LEAK_Y]
-    bias_x, bias_y = x[NodeState.BIAS_X] + x[NodeState.SLOPE], x[NodeState.BIAS_Y] + x[NodeState.BANK]
+    bias_x, bias_y = (
+        x[NodeState.BIAS_X] + x[NodeState.SLOPE],
+        x[NodeState.BIAS_Y] + x[NodeState.BANK],
+    )
     measured, unit = gain.measured, gain.unit
     return (
         measured.x - leak_y * gain.leak_y.x - bias_x * unit.x + bias_y * unit.y,
@@ -64,12 +74,19 @@ def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
         return 1.0
     theta = math.sqrt(square) / mu
     u = theta / (1.0 + theta)
-    return max((interpolated(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y) / square, FLATTEST)
+    return max(
+        (interpolated(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y) / square,
+        FLATTEST,
+    )
 
 
 @compiled
 def find_slips(
-    row: FloatArray, constants: Constants, mean: FloatArray, features: BlockFeatures, node: NodeWorkspace
+    row: FloatArray,
+    constants: Constants,
+    mean: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
 ) -> None:
     """Fill node.slip at node.point, a state at the beginning of the block; mean (n,) is the node's.
 
@@ -80,11 +97,16 @@ def find_slips(
     vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
     mean_kx, mean_ky = mean[NodeState.LN_KX], mean[NodeState.LN_KY]
     for axle in range(2):
-        blind = math.isnan(features.side[axle])  # slip across is then guesswork, and must not bend the force along
+        blind = math.isnan(
+            features.side[axle]
+        )  # slip across is then guesswork, and must not bend the force along
         offset = steering_offset(x, features) if axle == 0 and not blind else 0.0
         ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
-        slope_x, slope_y = row[Parameter.SLOPE_X] * math.exp(ln_kx), row[Parameter.SLOPE_Y] * math.exp(ln_ky)
+        slope_x, slope_y = (
+            row[Parameter.SLOPE_X] * math.exp(ln_kx),
+            row[Parameter.SLOPE_Y] * math.exp(ln_ky),
+        )
         slip.scale_x[axle] = math.exp(-constants.stiffness_power_x * ln_kx)
         slip.scale_y[axle] = math.exp(-constants.stiffness_power_y * ln_ky)
         for wheel in range(2 * axle, 2 * axle + 2):
@@ -96,7 +118,9 @@ def find_slips(
             rolling = features.rolling[wheel] * (1.0 + x[NodeState.RADIUS + wheel])
             rolling += x[NodeState.LAG_WHEEL] * features.change
             known = not math.isnan(rolling)
-            slip.along[wheel] = slope_x * (rolling - along) / speed if known else features.force[wheel]
+            slip.along[wheel] = (
+                slope_x * (rolling - along) / speed if known else features.force[wheel]
+            )
             slip.across[wheel] = 0.0 if blind else slope_y * (offset - across / speed)
 
 
@@ -107,11 +131,17 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
     The front axle yields to its own side force: steering column and bushes of production cars take up to 35 mrad/g.
     """
     lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
-    return float(lagged + x[NodeState.STEER_GAIN] * features.steering - x[NodeState.COMPLIANCE] * features.side[0])
+    return float(
+        lagged
+        + x[NodeState.STEER_GAIN] * features.steering
+        - x[NodeState.COMPLIANCE] * features.side[0]
+    )
 
 
 @compiled
-def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
+def find_shape_force(
+    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
+) -> None:
     """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right wheels."""
     slip, out = node.slip, node.shape_force
     out[4] = out[5] = 0.0
@@ -120,21 +150,31 @@ def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatu
         g_x, g_y = slip.along[wheel], slip.across[wheel]
         size = math.sqrt(g_x * g_x + g_y * g_y)
         theta = size / mu
-        change = 0.0 if size < TINY else mu * interpolated(curve.shape, theta / (1.0 + theta)) / size
+        change = (
+            0.0 if size < TINY else mu * interpolated(curve.shape, theta / (1.0 + theta)) / size
+        )
         out[wheel] = change * g_x
         out[4 + wheel // 2] += features.load_share[wheel] * change * g_y
 
 
 @compiled
 def correct_forces(
-    row: FloatArray, curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
+    row: FloatArray,
+    curve: TyreCurve,
+    side_mu: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
 ) -> None:
     """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape.
 
     Without torque only the sum of both sides is measured; on a split road the slippery side gives SPLIT_LIMIT of its
     friction at most, and the other side the rest. The unlike forces turn the car, which the axles' side forces hold.
     """
-    leak, shape, gain = node.point[NodeState.LEAK_Y], node.point[NodeState.SHAPE], node.point[NodeState.GAIN]
+    leak, shape, gain = (
+        node.point[NodeState.LEAK_Y],
+        node.point[NodeState.SHAPE],
+        node.point[NodeState.GAIN],
+    )
     bias_x, bias_y = node.point[NodeState.BIAS_X], node.point[NodeState.BIAS_Y]
     force, slip_at_force = node.force, node.slip_at_force
     moment = 0.0
@@ -149,7 +189,11 @@ def correct_forces(
     turning = moment / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
-        side = features.side[axle] + leak * features.side_leak[axle] - bias_y * features.side_unit[axle]
+        side = (
+            features.side[axle]
+            + leak * features.side_leak[axle]
+            - bias_y * features.side_unit[axle]
+        )
         load = (features.loads[left] + features.loads[right]) * features.steer_cos[left]
         side += (-turning if axle == 0 else turning) / load
         across = 0.0 if math.isnan(side) else side
@@ -191,7 +235,11 @@ def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> f
 
 @compiled
 def find_residuals(
-    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace, out: FloatArray
+    curve: TyreCurve,
+    side_mu: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
+    out: FloatArray,
 ) -> None:
     """out (6,) = e of each row at node.slip and node.force; NaN where its readings are missing."""
     slip, force, slip_at_force = node.slip, node.force, node.slip_at_force
@@ -207,11 +255,13 @@ def find_residuals(
             out[wheel] = (
                 math.nan
                 if math.isnan(features.rolling[wheel])
-                else slip.scale_x[axle] * distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
+                else slip.scale_x[axle]
+                * distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
             )
         row = 4 + axle
         out[row] = (
             math.nan
             if math.isnan(force[row])
-            else slip.scale_y[axle] * distance(slip_at_force[row] - side_slip, force[row] - side_model)
+            else slip.scale_y[axle]
+            * distance(slip_at_force[row] - side_slip, force[row] - side_model)
         )

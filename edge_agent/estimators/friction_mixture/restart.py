@@ -21,21 +21,34 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-REST_M_S, REST_V_STD = 0.1, 0.05  # [m/s] wheels that turn slower at the first sample are those of a car at rest
+REST_M_S, REST_V_STD = (
+    0.1,
+    0.05,
+)  # [m/s] wheels that turn slower at the first sample are those of a car at rest
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
-FREE_FORCE = 0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
+FREE_FORCE = (
+    0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
+)
 ALIKE = 0.03  # relative difference of their speeds
 FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
 LEAST_ROLLING_M_S = 0.5  # slower wheels may be locked
 LOST_SPREAD_M_S = 5.0
-FAR_M_S, FAR_SHARE, FAR_SPREADS = 0.7, 0.04, 2.0  # of the speed that agreeing wheels tell: beyond, the motion is lost
-SLOWEST_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
+FAR_M_S, FAR_SHARE, FAR_SPREADS = (
+    0.7,
+    0.04,
+    2.0,
+)  # of the speed that agreeing wheels tell: beyond, the motion is lost
+SLOWEST_M_S = (
+    1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
+)
 
 
 @compiled
-def start(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray) -> int:
+def start(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
+) -> int:
     """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
     if not math.isfinite(time):
         return flags.TIME_GAP
@@ -114,7 +127,10 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
     for i in range(covariance.shape[0]):
         for axis in range(2):
             covariance[i, axis] = covariance[axis, i] = 0.0
-    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = spread**2, FIRST_V_STD**2
+    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = (
+        spread**2,
+        FIRST_V_STD**2,
+    )
     for j in range(ALL_NODES):
         put(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
@@ -129,7 +145,9 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     for j in range(NODES):
         memory.weight[j] += hazard * (prior[j] - memory.weight[j])
         memory.visit_weight[j] += hazard * (prior[j] - memory.visit_weight[j])
-    restart_motion(memory, rolling_speed(memory.row, now), min(GAP_ACCELERATION * dt, UNKNOWN_V_STD))
+    restart_motion(
+        memory, rolling_speed(memory.row, now), min(GAP_ACCELERATION * dt, UNKNOWN_V_STD)
+    )
     rate = now[S.YAW_RATE]
     if not math.isnan(rate):
         last.yaw_rate, last.yaw_rate_var = rate, YAW_STD**2
@@ -159,7 +177,9 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
     if memory.last.time - rolling.disagreed_time < FREE_S or math.isnan(speed):
         return 0
     if abs(memory.overall_mean[NodeState.VX] - speed) > FAR_M_S + FAR_SHARE * speed:
-        restart_motion(memory, speed, FIRST_V_STD)  # friction stays: a slide that ended has taught it
+        restart_motion(
+            memory, speed, FIRST_V_STD
+        )  # friction stays: a slide that ended has taught it
     return 0
 
 

@@ -75,7 +75,9 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
 
 
 @compiled
-def _stand(memory: MixtureMemory, constants: Constants, features: BlockFeatures, still: bool) -> None:
+def _stand(
+    memory: MixtureMemory, constants: Constants, features: BlockFeatures, still: bool
+) -> None:
     rolling, time = memory.rolling, memory.last.time
     if not still or math.isnan(rolling.resting_ax):
         rolling.resting_ax = features.change
@@ -91,19 +93,29 @@ def _stand(memory: MixtureMemory, constants: Constants, features: BlockFeatures,
 
 
 @compiled
-def _tell(memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float) -> None:
+def _tell(
+    memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
+) -> None:
     """Velocities that wheels at `middle` [m/s] tell, and their spreads."""
     rolling, row = memory.rolling, memory.row
     pull = features.change / GRAVITY
     slip = pull / row[Parameter.SLOPE_X]
-    share = constants.agreeing_std + constants.agreeing_slip * abs(slip) + constants.agreeing_cube * abs(pull) ** 3
+    share = (
+        constants.agreeing_std
+        + constants.agreeing_slip * abs(slip)
+        + constants.agreeing_cube * abs(pull) ** 3
+    )
     rolling.ahead = (1.0 - slip) * middle
     late = constants.agreeing_lag * features.change
-    rolling.ahead_std = math.sqrt((share * middle) ** 2 + constants.agreeing_floor**2 + step * step + late * late)
+    rolling.ahead_std = math.sqrt(
+        (share * middle) ** 2 + constants.agreeing_floor**2 + step * step + late * late
+    )
     side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
     most = FARTHEST_FOLLOWED if memory.trust.distrust > UNSURE else constants.following_most
     if abs(side) < most and abs(features.yaw_rate * middle) < TURNING * most * GRAVITY:
-        rolling.left = row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
+        rolling.left = (
+            row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
+        )
         share = constants.following_std + SIDE_SHARE * abs(side) / row[Parameter.SLOPE_Y]
         rolling.left_std = share * abs(middle) + LEFT_FLOOR
 
@@ -121,11 +133,19 @@ def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch,
     cost, cos, sin = 0.0, features.cos, features.sin
     look = max(constants.agreeing_look / features.duration, 1.0)
     if not math.isnan(rolling.ahead):
-        now = cos * mean[NodeState.VX] + sin * mean[NodeState.VY] + gained_velocity(features.gain, mean)[0]
+        now = (
+            cos * mean[NodeState.VX]
+            + sin * mean[NodeState.VY]
+            + gained_velocity(features.gain, mean)[0]
+        )
         reading = (rolling.ahead - now, rolling.ahead_std**2 * look, constants.huber)
         cost += _take_velocity(memory, scratch, j, (cos, sin), reading)
     if not math.isnan(rolling.left):
-        now = cos * mean[NodeState.VY] - sin * mean[NodeState.VX] + gained_velocity(features.gain, mean)[1]
+        now = (
+            cos * mean[NodeState.VY]
+            - sin * mean[NodeState.VX]
+            + gained_velocity(features.gain, mean)[1]
+        )
         reading = (rolling.left - now, rolling.left_std**2 * look, constants.huber)
         cost += _take_velocity(memory, scratch, j, (-sin, cos), reading)
     return cost

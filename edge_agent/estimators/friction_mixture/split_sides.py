@@ -53,7 +53,9 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
     """All nodes, where a share `split_prior` of the roads has unlike sides; mu and prior (K,)."""
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs, mass, share = [], [], []
-    for low, high in ((a, b) for a in triangles(LOW) for b in triangles(HIGH) if b.middle > LEAST_RATIO * a.middle):
+    for low, high in (
+        (a, b) for a in triangles(LOW) for b in triangles(HIGH) if b.middle > LEAST_RATIO * a.middle
+    ):
         mean = Triangle._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
         for left, right in ((low, high), (high, low)):
             pairs.append((left.middle, right.middle))

@@ -21,7 +21,12 @@ from edge_agent.estimators.friction_mixture.grip_guard import lower_while_slidin
 from edge_agent.estimators.friction_mixture.ice_patch import drive_onto
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
-from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
+from edge_agent.estimators.friction_mixture.mixing import (
+    awake,
+    drive_on,
+    match_moments,
+    wake_or_sleep,
+)
 from edge_agent.estimators.friction_mixture.node_filter import predict_node
 from edge_agent.estimators.friction_mixture.reported_interval import find_interval
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
@@ -39,7 +44,9 @@ SLOWEST_SLIDING_M_S = 1.0  # slip of the health flag is taken against at least t
 
 
 @compiled
-def step(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray) -> int:
+def step(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
+) -> int:
     """Take one sample (18,); returns health flags of this sample alone."""
     if not memory.started:
         return start(memory, design, scratch, time, sample) | flags.RESET
@@ -83,7 +90,9 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     gyro = constants.gyro_wander * scratch.features.speed
     process[NodeState.VX] = (constants.drift_x**2 + leak**2 + block.missing_x) * duration
     unsure = constants.distrust_drift * memory.trust.distrust
-    process[NodeState.VY] = (constants.drift_y**2 + gyro**2 + unsure**2 + block.missing_y) * duration
+    process[NodeState.VY] = (
+        constants.drift_y**2 + gyro**2 + unsure**2 + block.missing_y
+    ) * duration
     forgets, speed = memory.trust.distrust / constants.distrust_forget, scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         pace = 1.0 / nominal.time[i] + forgets
@@ -99,7 +108,13 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     count = awake(memory)
     for j in range(count):
         predict_node(memory, scratch, j, cos, sin)
-    match_moments(memory.mean, memory.covariance, memory.weight[:count], memory.overall_mean, memory.overall_covariance)
+    match_moments(
+        memory.mean,
+        memory.covariance,
+        memory.weight[:count],
+        memory.overall_mean,
+        memory.overall_covariance,
+    )
 
 
 @compiled
@@ -109,12 +124,17 @@ def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> 
     note_excitation(memory.excitation, memory.last.time, scratch.features.demand)
     if not memory.split:
         for friction in (memory.friction, memory.friction_left, memory.friction_right):
-            friction.lower = lower_while_sliding(memory.slip.held, memory.excitation.largest, friction.lower)
+            friction.lower = lower_while_sliding(
+                memory.slip.held, memory.excitation.largest, friction.lower
+            )
     vx = memory.overall_mean[NodeState.VX]
     speed = max(abs(vx), SLOWEST_SLIDING_M_S)
     for wheel in range(4):
         along = scratch.features.rolling[wheel] - vx
-        if memory.row[Parameter.SLOPE_X] * abs(along) / speed > SLIDING_THETA * memory.friction.median:
+        if (
+            memory.row[Parameter.SLOPE_X] * abs(along) / speed
+            > SLIDING_THETA * memory.friction.median
+        ):
             memory.health |= flags.SLIDING
 
 
@@ -127,7 +147,9 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
         alike = likeness(memory.trust, design.constants)
-        find_interval(design, memory.weight[:NODES], memory.patch, scratch.blended, alike, memory.friction)
+        find_interval(
+            design, memory.weight[:NODES], memory.patch, scratch.blended, alike, memory.friction
+        )
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
             side.median, side.lower, side.upper = both.median, both.lower, both.upper

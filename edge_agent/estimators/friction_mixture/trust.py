@@ -38,11 +38,16 @@ LONGEST_PATIENCE = 600.0  # [s]
 RELAPSE = 4.0  # times as long as the last time
 FORGIVEN_S = 300.0  # in which that is forgotten
 STRAIGHT = 0.6  # [m/s^2] a_y up to which it is tried again: there the wheels tell the motion
-SLOW_FOOT, SLOW_PEAK = 3.0, 6.0  # [m/s] tight turns of parking lie outside the model's range, and test nothing
+SLOW_FOOT, SLOW_PEAK = (
+    3.0,
+    6.0,
+)  # [m/s] tight turns of parking lie outside the model's range, and test nothing
 
 
 @compiled
-def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int) -> None:
+def judge(
+    memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
+) -> None:
     """Update memory.trust by the beliefs, the innovations and the health of the block.
 
     `ratio` is the axles' squared innovation of the block over its stated variance.
@@ -52,8 +57,12 @@ def judge(memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: 
     trust, constants = memory.trust, design.constants
     # by what any car may be: a calibration makes the belief of this one narrower, and contradicts nothing
     cost = belief_cost(memory.overall_mean, design.nominal)
-    trust.strain = strain(cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior)
-    trust.hurry = hurry(design.rules, memory.actual[0] / max(memory.theoretical[0], LEAST_VARIANCE) - 1.0)
+    trust.strain = strain(
+        cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
+    )
+    trust.hurry = hurry(
+        design.rules, memory.actual[0] / max(memory.theoretical[0], LEAST_VARIANCE) - 1.0
+    )
     if trust.distrust > 0.0:
         trust.left -= duration
         if trust.left <= 0.0 and abs(memory.last.ay) < STRAIGHT:
@@ -83,7 +92,9 @@ def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> f
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
-    return float(moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio)
+    return float(
+        moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio
+    )
 
 
 @compiled

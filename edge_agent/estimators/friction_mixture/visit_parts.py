@@ -24,7 +24,9 @@ from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-EXCLUDED = math.exp(-3.0)  # of the largest likelihood: what lies below it, the surest belief excludes
+EXCLUDED = math.exp(
+    -3.0
+)  # of the largest likelihood: what lies below it, the surest belief excludes
 ALMOST_WHOLE = 0.9
 COMPATIBLE = 0.5  # as much as may lie there of a belief that takes the surest one's place
 KNOWING = 0.7  # [nat] half of the range is excluded; a belief that knows less says nothing against another

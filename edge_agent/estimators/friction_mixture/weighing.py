@@ -92,7 +92,9 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
     slid = memory.slip.held
     share = features.novelty / (1.0 + need)
     if design.adaptive:
-        share = math.exp(evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain))
+        share = math.exp(
+            evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
+        )
     believed = credence(memory.trust, constants)
     believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
     moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
@@ -147,8 +149,12 @@ def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> Non
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):
         if scratch.theoretical_sum[group] > 0.0:
-            memory.actual[group] = keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
-            memory.theoretical[group] = keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
+            memory.actual[group] = (
+                keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
+            )
+            memory.theoretical[group] = (
+                keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
+            )
             if design.adaptive:
                 memory.factor[group] = adapted(
                     memory.factor[group], memory.actual[group], memory.theoretical[group],

@@ -21,7 +21,9 @@ SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like 
 APART_FOOT, APART_PEAK = 0.04, 0.08  # of the speed, between two wheels: may slide, slides
 SPIN_FOOT, SPIN_PEAK = 6.0, 12.0  # [m/s^2] of a wheel beyond the car's: may slide, slides
 SEEN = 0.3  # membership from which slip counts as having begun
-REAR_LAG_S = 0.1  # [s] beside the time that the rear axle needs to reach the place of the front axle
+REAR_LAG_S = (
+    0.1  # [s] beside the time that the rear axle needs to reach the place of the front axle
+)
 
 
 @compiled
@@ -34,7 +36,9 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
     slip.ended = slip.held - seen
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
-        slip.rear_unlike_until = memory.last.time + wheelbase / max(features.speed, SLOWEST_M_S) + REAR_LAG_S
+        slip.rear_unlike_until = (
+            memory.last.time + wheelbase / max(features.speed, SLOWEST_M_S) + REAR_LAG_S
+        )
 
 
 @compiled
@@ -48,7 +52,9 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
         if not math.isnan(speed):
             slowest = min(slowest, speed)
             fastest = max(fastest, speed)
-            spin = max(spin, abs(memory.row[Parameter.RADIUS] * features.spin[wheel] - features.change))
+            spin = max(
+                spin, abs(memory.row[Parameter.RADIUS] * features.spin[wheel] - features.change)
+            )
     if fastest < SLOWEST_M_S:
         return 0.0
     apart = (fastest - slowest) / fastest

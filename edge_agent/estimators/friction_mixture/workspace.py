@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from edge_agent.estimators.friction_mixture.constants import ACTIVE, ALL_NODES, CURVED, NODES, ROWS, STATES
+from edge_agent.estimators.friction_mixture.constants import (
+    ACTIVE,
+    ALL_NODES,
+    CURVED,
+    NODES,
+    ROWS,
+    STATES,
+)
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.memory import PlanarVector, VelocityGain
 from schemas.numeric import FloatArray
@@ -42,9 +49,13 @@ class BlockFeatures:
     side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
     side_unit: Annotated[FloatArray, 2]  # its derivative by a_y [s^2/m]
     noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
-    slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
+    slip_noise: Annotated[
+        FloatArray, ROWS
+    ]  # variance of slip, as linear force over load; half of it is in noise_std
     abrupt_noise: Annotated[FloatArray, 4]  # variance of slip that came within the block, likewise
-    informs_x: Annotated[FloatArray, 2]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
+    informs_x: Annotated[
+        FloatArray, 2
+    ]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
     axle_scale: float  # R of the axles over R as the constants state it
     informs_y: Annotated[FloatArray, 2]
 
@@ -64,10 +75,14 @@ class NodeWorkspace:
     gained: PlanarVector  # mean velocity gained in the block, by the node's mean [m/s]
     point: Annotated[FloatArray, STATES]
     slip: NodeSlip
-    shape_force: Annotated[FloatArray, ROWS]  # force over load by which a tyre one spread sharper differs
+    shape_force: Annotated[
+        FloatArray, ROWS
+    ]  # force over load by which a tyre one spread sharper differs
     force: Annotated[FloatArray, ROWS]  # force over load as the node corrects it
     slip_at_force: Annotated[FloatArray, ROWS]  # linear force over load that gives it
-    residual: Annotated[FloatArray, ROWS]  # at the mean, then mean of the cubature points, then what is left of it
+    residual: Annotated[
+        FloatArray, ROWS
+    ]  # at the mean, then mean of the cubature points, then what is left of it
     ahead: Annotated[FloatArray, ROWS]
     behind: Annotated[FloatArray, ROWS]
     nonlinearity: Annotated[FloatArray, ROWS]  # variance that the rows' curvature adds
@@ -75,8 +90,12 @@ class NodeWorkspace:
     derivative: Annotated[FloatArray, ACTIVE, ROWS]
     deviation: Annotated[FloatArray, ROWS, ACTIVE]
     noise: Annotated[FloatArray, ROWS]  # variance of the rows' noise
-    abrupt: Annotated[FloatArray, ROWS]  # variance of what came within the block: a bump says nothing of later ones
-    inflated: Annotated[FloatArray, ROWS]  # of the noise, for correlation in time, for outliers and what was abrupt
+    abrupt: Annotated[
+        FloatArray, ROWS
+    ]  # variance of what came within the block: a bump says nothing of later ones
+    inflated: Annotated[
+        FloatArray, ROWS
+    ]  # of the noise, for correlation in time, for outliers and what was abrupt
 
 
 class Scratch:
@@ -90,13 +109,17 @@ class Scratch:
     keep: Annotated[FloatArray, STATES]
     log_likelihood: Annotated[FloatArray, ALL_NODES]
     joint: Annotated[FloatArray, ALL_NODES]  # log of weight times likelihood with the nominal R
-    moved: Annotated[FloatArray, ALL_NODES]  # change of what the belief about the vehicle costs [nat]
+    moved: Annotated[
+        FloatArray, ALL_NODES
+    ]  # change of what the belief about the vehicle costs [nat]
     predicted: Annotated[FloatArray, ALL_NODES]
     actual_sum: Annotated[FloatArray, 2]
     stated_sum: float  # the axles' with R as the constants state it
     theoretical_sum: Annotated[FloatArray, 2]
     root: Annotated[FloatArray, ALL_NODES, STATES, STATES]
-    velocity_row: Annotated[FloatArray, STATES]  # deviation of a velocity in the axes of a root's columns
+    velocity_row: Annotated[
+        FloatArray, STATES
+    ]  # deviation of a velocity in the axes of a root's columns
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
     blended: Annotated[FloatArray, NODES]

@@ -41,7 +41,11 @@ STEP_S = 0.02  # process variances are per so much time
 # error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
 PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
 START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
-SPEED_STD, SPEED_SHARE, SLIP_SHARE = 0.03, 0.003, 0.3  # [m/s], radius, and how wrong the slip of a force is
+SPEED_STD, SPEED_SHARE, SLIP_SHARE = (
+    0.03,
+    0.003,
+    0.3,
+)  # [m/s], radius, and how wrong the slip of a force is
 FARTHEST = 2.0  # innovations in standard deviations beyond which the wheels' speed is trusted less
 LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
 
@@ -71,7 +75,9 @@ class FederatedMotion:
     gamma: Annotated[FloatArray, 2]  # squared innovation over its expectation, per sub-filter
     innovation: Annotated[FloatArray, 2, ROWS]
     expected: Annotated[FloatArray, 2, ROWS]  # innovation variances if R were nominal
-    size: Annotated[FloatArray, 2]  # trace of the sub-filters' covariances over the starting variances
+    size: Annotated[
+        FloatArray, 2
+    ]  # trace of the sub-filters' covariances over the starting variances
 
 
 class FederatedMemory(PaperMemory):

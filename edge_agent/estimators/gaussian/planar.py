@@ -24,7 +24,9 @@ from schemas.runtime.jit import compiled, inlined
 from schemas.signals import S
 
 LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
-CALM_M_S = 2.0  # or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
+CALM_M_S = (
+    2.0  # or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
+)
 SHORTEST_SHARE = 0.2
 POINTS = 12  # of the cubature rule in six dimensions, side by side in a row
 ABREAST = 8  # of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing else
@@ -105,7 +107,14 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
     column_v, column_u, column_x, column_y = columns[0], columns[1], columns[2], columns[3]
     column_r, column_z = columns[4], columns[5]
     for p in range(first, last):
-        v, u, ax, ay, r, z = column_v[p], column_u[p], column_x[p], column_y[p], column_r[p], column_z[p]
+        v, u, ax, ay, r, z = (
+            column_v[p],
+            column_u[p],
+            column_x[p],
+            column_y[p],
+            column_r[p],
+            column_z[p],
+        )
         one = min(max(z, LOWER), UPPER)
         mu = begin.mu if by_torque else (one, one, one, one)
         _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with(begin, mu))
@@ -113,13 +122,23 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
         slope_x, slope_y = ax + r * u, ay - r * v
         ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
-        felt_x, felt_y, again = response(vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu))
+        felt_x, felt_y, again = response(
+            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu)
+        )
         if not by_torque:
             vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
             vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
         rate = r + 0.5 * step * (turn + again)
-        felt_x, felt_y, again = response(vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu))
-        column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = vx, vy, felt_x, felt_y, rate
+        felt_x, felt_y, again = response(
+            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu)
+        )
+        column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = (
+            vx,
+            vy,
+            felt_x,
+            felt_y,
+            rate,
+        )
         column_z[p] = again if by_torque else z
 
 
@@ -134,8 +153,14 @@ def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelI
     """Inputs at a share of the way from the sample before to this one."""
     before, use = track.inputs_before, track.inputs
     keep, delta, omega = 1.0 - share, S.DELTA, S.OMEGA
-    fl, fr = keep * before[delta] + share * use[delta], keep * before[delta + 1] + share * use[delta + 1]
-    rl, rr = keep * before[delta + 2] + share * use[delta + 2], keep * before[delta + 3] + share * use[delta + 3]
+    fl, fr = (
+        keep * before[delta] + share * use[delta],
+        keep * before[delta + 1] + share * use[delta + 1],
+    )
+    rl, rr = (
+        keep * before[delta + 2] + share * use[delta + 2],
+        keep * before[delta + 3] + share * use[delta + 3],
+    )
     return WheelInputs(
         (math.cos(fl), math.cos(fr), math.cos(rl), math.cos(rr)),
         (math.sin(fl), math.sin(fr), math.sin(rl), math.sin(rr)),

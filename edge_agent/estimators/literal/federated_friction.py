@@ -62,7 +62,9 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
             outcomes = forces.accelerations(k, force)
             outcomes[:, 2] = signals[k - 1, S.YAW_RATE] + given.step * outcomes[:, 2]
             reading = signals[k, [S.AX, S.AY, S.YAW_RATE]]
-            local, spread = _update(mean, predicted, points, outcomes[:, sub:], reading[sub:], noise[sub])
+            local, spread = _update(
+                mean, predicted, points, outcomes[:, sub:], reading[sub:], noise[sub]
+            )
             sizes[sub] = np.trace(spread)
             part = np.linalg.inv(spread)
             inverse += part

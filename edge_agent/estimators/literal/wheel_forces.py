@@ -46,7 +46,9 @@ class WheelForces:
         row, p = given.row, Parameter
         half_front, half_rear = 0.5 * row[p.TRACK_FRONT], 0.5 * row[p.TRACK_REAR]
         front, rear = row[p.TO_FRONT], -row[p.TO_REAR]
-        places = np.array([[front, half_front], [front, -half_front], [rear, half_rear], [rear, -half_rear]])
+        places = np.array(
+            [[front, half_front], [front, -half_front], [rear, half_rear], [rear, -half_rear]]
+        )
         delta = given.signals[:, S.DELTA : S.DELTA + 4]
         omega = given.signals[:, S.OMEGA : S.OMEGA + 4]
         rate = given.signals[:, S.YAW_RATE, None]
@@ -76,7 +78,9 @@ class WheelForces:
         free = self.free[k]
         size = np.maximum(np.hypot(free[:, 0], free[:, 1]), TINY)
         theta = size if self.proportional else size / np.maximum(mu, LEAST_MU)
-        curve = np.where(theta <= 0.5, theta, 1.0 - 0.25 / np.maximum(theta, 0.5)).astype(free.dtype)
+        curve = np.where(theta <= 0.5, theta, 1.0 - 0.25 / np.maximum(theta, 0.5)).astype(
+            free.dtype
+        )
         pull = mu * self.loads[k] * curve / size
         return np.asarray(pull[..., None] * free)
 

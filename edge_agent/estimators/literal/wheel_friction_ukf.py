@@ -89,7 +89,9 @@ class _Model:
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting
         self.kind: Any = np.float32 if setting.single else np.float64
-        self.forces = WheelForces.of(given, proportional=setting.proportional, single=setting.single)
+        self.forces = WheelForces.of(
+            given, proportional=setting.proportional, single=setting.single
+        )
         signals = given.signals
         turning = np.diff(signals[:, S.YAW_RATE], prepend=signals[0, S.YAW_RATE]) / given.step
         rows = [signals[:, S.AX], signals[:, S.AY], turning]
@@ -148,7 +150,9 @@ def _square_root_step(
     axes, sizes = _root_of(np.concatenate([measured, model.noise_root], axis=1))
     gain = (state @ measured.T) @ (axes / sizes**2) @ axes.T
     innovation = model.readings[k] - outcomes[0] - deviation
-    after, lengths = _root_of(np.concatenate([state - gain @ measured, gain @ model.noise_root], axis=1))
+    after, lengths = _root_of(
+        np.concatenate([state - gain @ measured, gain @ model.noise_root], axis=1)
+    )
     return mean + gain @ innovation, covariance, after * lengths, False
 
 

@@ -43,8 +43,14 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Examine a log, correct the measured faults, and examine the result."""
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
-    delays = {finding.channel: finding.delay_s for finding in diagnosis.findings if finding.kind == "clock"}
-    delays = {device: seconds for device, seconds in delays.items() if seconds and device in OF_DEVICE}
+    delays = {
+        finding.channel: finding.delay_s
+        for finding in diagnosis.findings
+        if finding.kind == "clock"
+    }
+    delays = {
+        device: seconds for device, seconds in delays.items() if seconds and device in OF_DEVICE
+    }
     if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
         return Adopted(log, vehicle, diagnosis, [])
     notes = [
@@ -59,12 +65,16 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     signals = align_devices(log.t, log.signals, delays) if delays else log.signals
     if diagnosis.locked == ["rear"] and not vehicle.rear_axle_locked:
         vehicle = vehicle.model_copy(update={"rear_axle_locked": True})
-        notes.append("note: the rear wheels turn as one; taken as a locked differential (rear_axle_locked)")
+        notes.append(
+            "note: the rear wheels turn as one; taken as a locked differential (rear_axle_locked)"
+        )
         signals = free_rear_wheels(signals, vehicle)
     if signals is log.signals:
         return Adopted(log, vehicle, diagnosis, notes)
     log = replace(log, signals=signals)
-    return Adopted(log, vehicle, diagnose(log.t, signals, vehicle, log.ground) if delays else diagnosis, notes)
+    return Adopted(
+        log, vehicle, diagnose(log.t, signals, vehicle, log.ground) if delays else diagnosis, notes
+    )
 
 
 def align_import(
@@ -78,13 +88,17 @@ def align_import(
     for index, name in enumerate(CHANNELS):
         if name in merged.columns:
             signals[:, index] = merged.columns[name]
-    found = [fault for fault in diagnose(merged.t, signals, vehicle).findings if fault.kind == "clock"]
+    found = [
+        fault for fault in diagnose(merged.t, signals, vehicle).findings if fault.kind == "clock"
+    ]
     late = [fault for fault in found if fault.delay_s and fault.channel in OF_DEVICE]
     if not late:
         return merged, profile
     profile, *_ = fixed(late, profile, vehicle)
     aligned = merge_with(profile)
-    aligned.notes += [f"{fault.channel} {fault.words}; corrected by delay_s of the profile" for fault in late]
+    aligned.notes += [
+        f"{fault.channel} {fault.words}; corrected by delay_s of the profile" for fault in late
+    ]
     return aligned, profile
 
 

@@ -34,7 +34,10 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
     good = np.isfinite(omega).all(axis=1)
     if good.sum() < 2:
         return 0
-    rims = np.stack([np.interp(t, t[good], omega[good, wheel]) for wheel in range(4)], axis=1) * vehicle.wheel_radius
+    rims = (
+        np.stack([np.interp(t, t[good], omega[good, wheel]) for wheel in range(4)], axis=1)
+        * vehicle.wheel_radius
+    )
     speed = np.median(rims, axis=1)
     way = np.concatenate([[0.0], np.cumsum(np.maximum(speed[:-1], 0.0) * np.diff(t))])
     way, rows = np.unique(way, return_index=True)
@@ -68,7 +71,9 @@ def _direction(front: FloatArray, rear: FloatArray, fast: BoolArray, wheelbase: 
     limits = CLIPPED * front[among].std(), CLIPPED * rear[among].std()
     front, rear = np.clip(front, -limits[0], limits[0]), np.clip(rear, -limits[1], limits[1])
     lags = np.arange(-most, most + 1)
-    like = np.array([float(np.corrcoef(front[among], np.roll(rear, -lag)[among])[0, 1]) for lag in lags])
+    like = np.array(
+        [float(np.corrcoef(front[among], np.roll(rear, -lag)[among])[0, 1]) for lag in lags]
+    )
     metres = lags * STEP_M
     top = int(np.argmax(like))
     near = abs(abs(metres[top]) - wheelbase) <= NEAR_M

@@ -13,16 +13,24 @@ from edge_agent.inputs.doctor.slip import measure_lags_twice
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
 
-FILTER_BEARS_S: Final = 0.025  # by which devices may be apart: standard deviation of the filter's own prior
+FILTER_BEARS_S: Final = (
+    0.025  # by which devices may be apart: standard deviation of the filter's own prior
+)
 LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
     """Return True if the wheels' yaw rate is late as well, by half of it at least."""
-    return axle.known and np.isfinite(axle.lag_error_s) and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
+    return (
+        axle.known
+        and np.isfinite(axle.lag_error_s)
+        and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
+    )
 
 
-def measure_clocks(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis) -> None:
+def measure_clocks(
+    t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
+) -> None:
     """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)

@@ -36,9 +36,15 @@ class Diagnosis:
     unknown: list[str] = field(default_factory=list)
     fits: dict[str, Fit] = field(default_factory=dict)
     drive: EvenDrive | None = None
-    lags: dict[str, float] = field(default_factory=dict)  # [s] behind the gyro, by quantity, where turns tell it
-    locked: list[str] = field(default_factory=list)  # axles whose wheels turn as one: "front", "rear"
-    doubts: set[str] = field(default_factory=set)  # quantities that only some parts of the drive speak against
+    lags: dict[str, float] = field(
+        default_factory=dict
+    )  # [s] behind the gyro, by quantity, where turns tell it
+    locked: list[str] = field(
+        default_factory=list
+    )  # axles whose wheels turn as one: "front", "rear"
+    doubts: set[str] = field(
+        default_factory=set
+    )  # quantities that only some parts of the drive speak against
 
     @property
     def passed(self) -> bool:

@@ -24,7 +24,9 @@ JOINED_S: Final = 1.5  # readings further apart are not joined
 FIX_S: Final = 1.0  # over which speed and course are taken from fixes
 LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
 UNLIKE: Final = 0.1  # share by which a wheel may be off its neighbour on the same side before it is said to slip
-LEFT: Final = 0.2  # share by which the wheels' speed may leave that over ground before they are said to slip
+LEFT: Final = (
+    0.2  # share by which the wheels' speed may leave that over ground before they are said to slip
+)
 SLIP_S: Final = 1.0  # before and behind a moment of slip, which is left out as well
 CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever the unit
 
@@ -45,7 +47,9 @@ class EvenDrive:
     course: FloatArray
     course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
     moving: FloatArray  # 1 where the car moves and no wheel slips by what the wheels say of each other, else 0
-    grips: FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
+    grips: (
+        FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
+    )
     yaw_front: FloatArray  # yaw rate by the front wheels alone [rad/s]
     yaw_rear: FloatArray  # the same by the rear wheels
     wheelbase: float
@@ -84,17 +88,24 @@ def over_ground(
 ) -> tuple[FloatArray, FloatArray]:
     """Speed [m/s] and course [rad] at times, from fixes half of FIX_S before and behind."""
     north = even(t, np.radians(latitude) * EARTH_RADIUS_M, at)
-    east = even(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(np.radians(np.nanmean(latitude)))
+    east = even(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
+        np.radians(np.nanmean(latitude))
+    )
     half = round(0.5 * FIX_S * RATE_HZ)
     speed, course = np.full(len(at), np.nan), np.full(len(at), np.nan)
     if len(at) > 2 * half:
-        d_east, d_north = east[2 * half :] - east[: -2 * half], north[2 * half :] - north[: -2 * half]
+        d_east, d_north = (
+            east[2 * half :] - east[: -2 * half],
+            north[2 * half :] - north[: -2 * half],
+        )
         speed[half:-half] = np.hypot(d_east, d_north) / FIX_S
         course[half:-half] = np.arctan2(d_north, d_east)
     return speed, course
 
 
-def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None) -> EvenDrive:
+def prepare(
+    t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
+) -> EvenDrive:
     """Signals (T, 18) at times t (T,) [s] as a drive.
 
     Args:
@@ -109,12 +120,17 @@ def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatA
     def column(index: int) -> FloatArray:
         return smooth(even(t, signals[:, index], at))
 
-    wheels = np.stack([even(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1) * vehicle.wheel_radius
+    wheels = (
+        np.stack([even(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1)
+        * vehicle.wheel_radius
+    )
     some = np.isfinite(wheels).any(axis=1)
     middle = np.full(len(at), np.nan)
     middle[some] = np.nanmedian(wheels[some], axis=1)
     raw = wheels
-    wheels = np.where(np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels)
+    wheels = np.where(
+        np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels
+    )
     rims = np.stack([smooth(wheels[:, i]) for i in range(4)], axis=1)
     v = smooth(np.where(np.isfinite(middle), middle, np.nan))
     tracks = vehicle.track_front, vehicle.track_rear
@@ -172,7 +188,9 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
         return np.zeros(len(v), bool)
-    ratio = np.where(known, smooth(v_ground, 1.0) / np.where(v == 0.0, np.nan, smooth(v, 1.0)), np.nan)
+    ratio = np.where(
+        known, smooth(v_ground, 1.0) / np.where(v == 0.0, np.nan, smooth(v, 1.0)), np.nan
+    )
     usual = float(np.nanmedian(ratio))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(ratio - usual) > LEFT * abs(usual))

@@ -46,10 +46,16 @@ LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
 JUMPS = 0.01  # share of readings that may jump off the other wheels
 SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
-LARGEST_AX_FAR, AVERAGED_M = 0.9, 300.0  # [m/s^2] and the way over which slopes average to less than 8 %
+LARGEST_AX_FAR, AVERAGED_M = (
+    0.9,
+    300.0,
+)  # [m/s^2] and the way over which slopes average to less than 8 %
 CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
-TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
+TIGHT, TIGHT_S = (
+    0.015,
+    1.5,
+)  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
 FEWEST_OFFSET_S: Final = 8.0
 NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
@@ -58,7 +64,9 @@ NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
 
 
-def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None) -> Diagnosis:
+def diagnose(
+    t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
+) -> Diagnosis:
     """Examine a log: times t (T,) [s], signals (T, 18), and the receiver's speed (T,) [m/s] where it was recorded."""
     diagnosis = Diagnosis()
     t, slow = _seconds(t, diagnosis)
@@ -84,7 +92,9 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
     for axle, (left, right) in find_exchanged_axles(drive):
         words = f"the {axle} wheels turn against the yaw rate, the others with it: left and right exchanged?"
         diagnosis.findings.append(Finding("omega", f"{axle} left and right exchanged", words))
-        signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[:, [S.OMEGA + right, S.OMEGA + left]]
+        signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[
+            :, [S.OMEGA + right, S.OMEGA + left]
+        ]
         drive = prepare(t, signals, vehicle, ground)
     diagnosis.locked = find_locked_axles(drive)
     if diagnosis.locked == ["rear"]:
@@ -93,7 +103,9 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
     verdict = explain(found, vehicle)
     diagnosis.fits, diagnosis.drive = found, drive
     _scales(verdict, found, diagnosis)
-    scaled = any(fault is not None for fault in verdict.faults.values())  # offsets and radii in wrong units say nothing
+    scaled = any(
+        fault is not None for fault in verdict.faults.values()
+    )  # offsets and radii in wrong units say nothing
     late = clocks(found)
     if "wheels" in late and not wheels_speak_late(found["axle"], late["wheels"][0]):
         late = {}  # in a slide wheels slow down before the car does; their yaw rate is not late then
@@ -103,13 +115,17 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
         else:
             way = "late" if seconds > 0.0 else "early"
             words = f"the clock of the {device} is {abs(seconds):.2f} s {way}"
-            diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds, confidence=margin))
+            diagnosis.findings.append(
+                Finding(device, "clock", words, delay_s=seconds, confidence=margin)
+            )
     if not late and not scaled:
         measure_clocks(t, signals, vehicle, diagnosis)
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
         diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
-        exchanged_axles = any(finding.kind == "front and rear exchanged" for finding in diagnosis.findings)
+        exchanged_axles = any(
+            finding.kind == "front and rear exchanged" for finding in diagnosis.findings
+        )
         if not exchanged_axles and leading_axle(t, signals, vehicle) < 0:
             words = "bumps reach the rear wheels first: front and rear exchanged?"
             diagnosis.findings.append(Finding("omega", "front and rear exchanged", words))
@@ -156,7 +172,9 @@ def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
         fast = float(np.percentile(np.abs(others), 95))
         above = wheels[rows, i] - others
         off = np.abs(above) > 0.3 * np.abs(others) + 0.3 * fast
-        if off.mean() <= JUMPS or not (has_equal_steps(above, off) or is_foreign(rest, others, off, fast)):
+        if off.mean() <= JUMPS or not (
+            has_equal_steps(above, off) or is_foreign(rest, others, off, fast)
+        ):
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
         words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
@@ -185,7 +203,13 @@ WORDS: Final = {
     "v": "the wheels go {wheels:.3g} times the speed that everything else tells",
     "sides": "left and right wheels differ by {gain:.3g} of track·r", "place": "the course turns by {gain:.3g} of r",
 }  # fmt: skip
-ASKED: Final = {"ax": "longitudinal", "ay": "lateral", "delta": "steering", "sides": "axle", "place": "turning"}
+ASKED: Final = {
+    "ax": "longitudinal",
+    "ay": "lateral",
+    "delta": "steering",
+    "sides": "axle",
+    "place": "turning",
+}
 
 
 def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> None:
@@ -202,12 +226,18 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
         channel = CHANNELS_OF.get(quantity, "omega")
         diagnosis.findings.append(
             Finding(
-                channel, fault.name, f"{words}: {fault.name}?", 1.0 / fault.factor, confidence=verdict.margins[quantity]
+                channel,
+                fault.name,
+                f"{words}: {fault.name}?",
+                1.0 / fault.factor,
+                confidence=verdict.margins[quantity],
             )
         )
 
 
-def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None) -> bool:
+def _always(
+    quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
+) -> bool:
     """Return True if the drive's parts all have the gains that the faults make: a slide does not keep a gain."""
     fault = verdict.faults[quantity]
     if quantity == "ay" and fault is not None and "g" in fault.name and not _turns(verdict, found):
@@ -250,7 +280,11 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
             if fault is not None:
                 gain *= fault.factor**member.power
         fit = found[name]
-        if fit.known and abs(fit.correlation) > TURNS_LIKE and share_of_parts(fit, gain) >= STEADY_SHARE:
+        if (
+            fit.known
+            and abs(fit.correlation) > TURNS_LIKE
+            and share_of_parts(fit, gain) >= STEADY_SHARE
+        ):
             return True
     return False
 
@@ -264,7 +298,12 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
     half = np.array([(-0.5 if i % 2 == 0 else 0.5) * tracks[i] for i in range(4)])
-    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & np.isfinite(drive.r) & find_followed(drive)
+    calm = (
+        (drive.moving > 0)
+        & (np.abs(drive.v_dot) < CALM)
+        & np.isfinite(drive.r)
+        & find_followed(drive)
+    )
     calm &= np.abs(drive.v * drive.r) < CALM_ACROSS
     rims = drive.wheels - half * drive.r[:, None]
     for i, wheel in enumerate(WHEELS):
@@ -273,17 +312,23 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
             continue
         others = np.median(np.delete(rims[good], i, axis=1), axis=1)
         ratio = rims[good, i] / np.where(others == 0, np.nan, others) - 1.0
-        parts = np.array([float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)])
+        parts = np.array(
+            [float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)]
+        )
         off = float(np.median(parts))
         rolls = drive.v_dot[good] < -0.1  # a wheel that spins does so only while it is driven
-        if rolls.sum() < 2 * RATE_HZ or abs(float(np.nanmedian(ratio[rolls])) - off) > 0.3 * abs(off):
+        if rolls.sum() < 2 * RATE_HZ or abs(float(np.nanmedian(ratio[rolls])) - off) > 0.3 * abs(
+            off
+        ):
             if abs(off) > LARGEST_RADIUS:
                 doubts.add("v")
             continue
         if abs(off) > LARGEST_RADIUS and np.all(np.abs(parts - off) < 0.3 * abs(off)):
             words = f"turns {off:+.1%} faster than the other wheels: another tyre, or its own scale"
             findings.append(Finding(f"omega_{wheel}", "radius", words, 1.0 / (1.0 + off)))
-    if len(findings) > 1:  # three cannot all be off the median: that is a slip they share, or an axle of other tyres
+    if (
+        len(findings) > 1
+    ):  # three cannot all be off the median: that is a slip they share, or an axle of other tyres
         findings = findings if len(findings) == 2 else []
     return findings + _axles(drive)
 
@@ -291,7 +336,13 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
 def _axles(drive: EvenDrive) -> list[Finding]:
     """Front wheels go the longer way in a turn: v_f² = v_r² + (L r)²."""
     front, rear = drive.wheels[:, :2].mean(axis=1), drive.wheels[:, 2:].mean(axis=1)
-    good = (drive.moving > 0) & np.isfinite(front) & np.isfinite(rear) & (np.abs(drive.v_dot) < 1.0) & (rear > 1.0)
+    good = (
+        (drive.moving > 0)
+        & np.isfinite(front)
+        & np.isfinite(rear)
+        & (np.abs(drive.v_dot) < 1.0)
+        & (rear > 1.0)
+    )
     turn = np.square(drive.wheelbase * drive.r / np.where(good, rear, 1.0))
     good &= np.isfinite(turn) & find_followed(drive) & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
     tight = good & (turn > TIGHT)
@@ -313,28 +364,45 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     """Return constant errors that are beyond the largest usual one by SURE standard deviations."""
     moving = drive.moving > 0
     lateral, axle, steering = found["lateral"], found["axle"], found["steering"]
-    listed: list[tuple[str, float, float, float, str]] = []  # channel, value, its error, largest, unit
+    listed: list[
+        tuple[str, float, float, float, str]
+    ] = []  # channel, value, its error, largest, unit
     beside = (drive.ax - drive.v_dot)[moving]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
         largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
-        listed.append(("ax", float(np.nanmedian(beside)), spread_of_parts(beside), largest, "m/s^2"))
+        listed.append(
+            ("ax", float(np.nanmedian(beside)), spread_of_parts(beside), largest, "m/s^2")
+        )
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
         straight &= find_followed(drive)
     beside = (drive.ay - drive.v * drive.r)[straight]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
-        listed.append(("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2"))
+        listed.append(
+            ("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2")
+        )
     if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
-        error = float(np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving])))
-        if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:  # one way round, a gain is an offset as well
+        error = float(
+            np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving]))
+        )
+        if (
+            np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ
+        ):  # one way round, a gain is an offset as well
             error = np.inf
         listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
     elif lateral.known and np.isfinite(drive.r).any():
         still = (drive.moving == 0) & (np.abs(drive.v) < 0.05)
         if still.sum() > RATE_HZ:
-            listed.append(("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s"))
-    if steering.known and abs(steering.correlation) > 0.9 and 0.7 < steering.gain < 1.6 and is_steady(steering):
+            listed.append(
+                ("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s")
+            )
+    if (
+        steering.known
+        and abs(steering.correlation) > 0.9
+        and 0.7 < steering.gain < 1.6
+        and is_steady(steering)
+    ):
         listed.append(("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad"))
     return [
         Finding(channel, "offset", f"{value:+.3g} {unit} when it should be none", offset=-value)

@@ -35,10 +35,15 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 def corrections(diagnosis: Diagnosis) -> list[Finding]:
     """Return the findings, and the small lags as if they were findings: what a corrected profile takes out."""
     lags = small_lags(diagnosis)
-    return [*diagnosis.findings, *(Finding(name, "clock", "", delay_s=lag) for name, lag in lags.items())]
+    return [
+        *diagnosis.findings,
+        *(Finding(name, "clock", "", delay_s=lag) for name, lag in lags.items()),
+    ]
 
 
-def fixed(findings: Sequence[Finding], profile: Profile, vehicle: Vehicle) -> tuple[Profile, Vehicle, list[Finding]]:
+def fixed(
+    findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
+) -> tuple[Profile, Vehicle, list[Finding]]:
     """Profile and vehicle with what the findings say, and the findings that nobody can mend from here."""
     channels, left = dict(profile.channels), list[Finding]()
     update: dict[str, object] = {}
@@ -50,7 +55,9 @@ def fixed(findings: Sequence[Finding], profile: Profile, vehicle: Vehicle) -> tu
         elif finding.channel == "t" and finding.kind in ("ms", "us", "ns"):
             update["time_unit"] = finding.kind
         elif (finding.channel, finding.kind) == ("omega", "radius"):
-            vehicle = vehicle.model_copy(update={"wheel_radius": vehicle.wheel_radius * finding.scale})
+            vehicle = vehicle.model_copy(
+                update={"wheel_radius": vehicle.wheel_radius * finding.scale}
+            )
         elif finding.channel == "yaw":
             channels["yaw"] = _yaw(channels["yaw"], finding.kind)
         elif finding.scale != 1.0 or finding.offset or finding.delay_s:

@@ -24,11 +24,19 @@ LONGEST_LAG_S: Final = 1.0
 FEWEST_S: Final = 8.0  # of excitation, below which nothing is said
 SLOW_SHARE: Final = 0.3  # of the regressor's 95 % size, from which on a moment counts as excited
 LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
-APART_S, RIVAL = 0.3, 0.85  # another peak of the correlation that far off, as high as that share, leaves no lag known
+APART_S, RIVAL = (
+    0.3,
+    0.85,
+)  # another peak of the correlation that far off, as high as that share, leaves no lag known
 PARTS: Final = 8  # of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
-USUAL_BEND, BEND_SPREAD = 0.3, 0.4  # understeer's share of the steering at the drive's fast speed: mean and std of cars
+USUAL_BEND, BEND_SPREAD = (
+    0.3,
+    0.4,
+)  # understeer's share of the steering at the drive's fast speed: mean and std of cars
 BENDS: Final = np.linspace(-0.3, 1.8, 22)  # shares that are tried
-UNLIKE_RADII: Final = 0.004  # [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
+UNLIKE_RADII: Final = (
+    0.004  # [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
+)
 CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 
@@ -89,7 +97,11 @@ def _steering(d: EvenDrive) -> Relation:
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
     v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
     return Relation(
-        d.delta * v, d.wheelbase * d.r, per=v, bend=np.square(v / max(float(fast), 1e-9)), length=d.wheelbase
+        d.delta * v,
+        d.wheelbase * d.r,
+        per=v,
+        bend=np.square(v / max(float(fast), 1e-9)),
+        length=d.wheelbase,
     )
 
 
@@ -119,7 +131,8 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 def fits(drive: EvenDrive) -> dict[str, Fit]:
     """Every identity of a drive."""
     return {
-        name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground") for name, sides in IDENTITIES.items()
+        name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground")
+        for name, sides in IDENTITIES.items()
     }
 
 
@@ -137,7 +150,9 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     left = sides.left
     right = sides.right
     if level:  # what is large all along has no edge of its own: its change has
-        lag, lag_error = lag_of(np.gradient(smooth(left, 1.0)), np.gradient(smooth(right, 1.0)), moving)
+        lag, lag_error = lag_of(
+            np.gradient(smooth(left, 1.0)), np.gradient(smooth(right, 1.0)), moving
+        )
     else:
         lag, lag_error = lag_of(left, right, moving)
     if np.isfinite(lag_error) and abs(lag) > 1.0 / RATE_HZ:
@@ -154,10 +169,24 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     if level:
         gain = _ratio(x, y)
         correlation = float(np.corrcoef(x, y)[0, 1]) if x.std() > 0 and y.std() > 0 else 0.0
-        spread = float(np.std(y - gain * x)) / max(abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12)
+        spread = float(np.std(y - gain * x)) / max(
+            abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12
+        )
         error = spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003
         parts = _gains(x, y, excited)
-        return Fit(gain, 0.0, max(correlation, 1.0 - spread), error, excited_s, lag, lag_error, y, x, (), parts)
+        return Fit(
+            gain,
+            0.0,
+            max(correlation, 1.0 - spread),
+            error,
+            excited_s,
+            lag,
+            lag_error,
+            y,
+            x,
+            (),
+            parts,
+        )
     count = max(excited_s / CORRELATED_S, 1.0)
     constant = np.ones(len(x)) if sides.per is None else sides.per[good]
     besides = [other[good] for other in sides.beside]
@@ -170,7 +199,11 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     rest = y - table[:, 1:] @ solution[1:]
     correlation = float(np.corrcoef(x, rest)[0, 1]) if x.std() > 0 and rest.std() > 0 else 0.0
     slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
-    gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope))) if correlation else 0.0
+    gain = (
+        float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope)))
+        if correlation
+        else 0.0
+    )
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
     found = tuple(float(k) for k in solution[2:])
     if sides.bend is not None:
@@ -182,7 +215,9 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     )  # fmt: skip
 
 
-def _bend_of(x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float) -> tuple[float, float]:
+def _bend_of(
+    x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
+) -> tuple[float, float]:
     """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty makes.
 
     Each share is tried: what it leaves of the left side, of `count` independent moments, against what cars have.
@@ -200,7 +235,9 @@ def _bend_of(x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArra
     return float(weights @ BENDS), float(np.sqrt(weights @ np.square(gains - centre)))
 
 
-def _loose(table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float) -> tuple[FloatArray, FloatArray]:
+def _loose(
+    table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
+) -> tuple[FloatArray, FloatArray]:
     """Robust least squares with the last columns' gains drawn to zero, and standard deviations of all gains."""
     solution = robust(table, y)
     off = np.abs(y - table @ solution)
@@ -289,7 +326,11 @@ def _peak(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[floa
     far = np.abs(np.arange(len(across)) - top) > round(APART_S * RATE_HZ)
     inner = np.arange(1, len(across) - 1)
     peaks = inner[(across[1:-1] >= across[:-2]) & (across[1:-1] > across[2:])]
-    if np.any(across[peaks[far[peaks]]] > RIVAL * here):  # periodic: lags by half a period fit as well
+    if np.any(
+        across[peaks[far[peaks]]] > RIVAL * here
+    ):  # periodic: lags by half a period fit as well
         return 0.0, False
-    sharp = across[max(top - 15, 0)] < 0.985 * here or across[min(top + 15, 2 * most)] < 0.985 * here
+    sharp = (
+        across[max(top - 15, 0)] < 0.985 * here or across[min(top + 15, 2 * most)] < 0.985 * here
+    )
     return float(lag), bool(sharp)

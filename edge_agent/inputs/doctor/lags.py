@@ -36,7 +36,9 @@ SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
-def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE) -> dict[str, float]:
+def lags(
+    t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
+) -> dict[str, float]:
     """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not tell are left out.
 
     `least` is the correlation from which on a lag is believed. Signals are smoothed less than the doctor's: over half a
@@ -52,16 +54,25 @@ def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LE
     gyro, left = column(S.YAW_RATE), signals[:, S.DELTA]
     front = (rims[1] - rims[0]) / vehicle.track_front
     rear = (rims[3] - rims[2]) / vehicle.track_rear
-    delta = smooth(even(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at), SMOOTH_S)
+    delta = smooth(
+        even(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at), SMOOTH_S
+    )
     driven = (v > DRIVEN) & np.isfinite(gyro)
-    ways = {"wheel_lag": (0.5 * (front + rear), front, rear), "steer_lag": (_bicycle(v, delta, vehicle),)}
+    ways = {
+        "wheel_lag": (0.5 * (front + rear), front, rear),
+        "steer_lag": (_bicycle(v, delta, vehicle),),
+    }
     found = {}
     for name, sides in ways.items():
         peaks = [_behind(side, gyro, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
-        if told:  # the mean of the axles comes first: a locked axle says nothing, and spoils the mean
+        if (
+            told
+        ):  # the mean of the axles comes first: a locked axle says nothing, and spoils the mean
             likest = max(peak.likeness for peak in told)
-            found[name] = next(peak for peak in told if peak.likeness > likest - ALIKE).seconds + LEAD[name]
+            found[name] = (
+                next(peak for peak in told if peak.likeness > likest - ALIKE).seconds + LEAD[name]
+            )
     return found
 
 
@@ -80,7 +91,9 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float)
     if among.sum() < LEAST_S * RATE_HZ:
         return None
     left, right = ((x - smooth(x, SLOW_S)) for x in (left, right))
-    if np.nanstd(left[among]) < LEAST_RATE or np.nanstd(right[among]) < LEAST_RATE:  # a locked axle, or straight on
+    if (
+        np.nanstd(left[among]) < LEAST_RATE or np.nanstd(right[among]) < LEAST_RATE
+    ):  # a locked axle, or straight on
         return None
     like = np.zeros(2 * most + 1)
     for k in range(-most, most + 1):
@@ -97,8 +110,15 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float)
 
 def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Yaw rate that the vehicle file's bicycle makes of the steering, by the trapezoidal rule."""
-    m, inertia, a, b = vehicle.mass, vehicle.yaw_inertia, vehicle.cg_to_front_axle, vehicle.cg_to_rear_axle
-    per_share = 4.0 * vehicle.cornering_stiffness / (a + b)  # of all wheels, shared out by their static load
+    m, inertia, a, b = (
+        vehicle.mass,
+        vehicle.yaw_inertia,
+        vehicle.cg_to_front_axle,
+        vehicle.cg_to_rear_axle,
+    )
+    per_share = (
+        4.0 * vehicle.cornering_stiffness / (a + b)
+    )  # of all wheels, shared out by their static load
     c_f, c_r = b * per_share, a * per_share
     half, motion, modelled = 0.5 / RATE_HZ, np.zeros(2), np.full(len(speed), np.nan)
     before = 0.0
@@ -111,6 +131,8 @@ def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> Float
             [(b * c_r - a * c_f) / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
         ])  # fmt: skip
         driven = np.array([c_f / m, a * c_f / inertia]) * (half * (before + delta))
-        motion = np.linalg.solve(np.eye(2) - half * system, motion + half * (system @ motion) + driven)
+        motion = np.linalg.solve(
+            np.eye(2) - half * system, motion + half * (system @ motion) + driven
+        )
         before, modelled[k] = delta, motion[1]
     return modelled

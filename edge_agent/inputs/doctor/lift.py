@@ -19,7 +19,9 @@ from schemas.vehicle import Vehicle
 TURNS_M_S: Final = 5.0  # at the rim
 STANDS_M_S: Final = 0.3
 LEAST_S: Final = 5.0  # of such turning
-LEAST_SHARE: Final = 0.8  # of the time in which a wheel turns: wheels that spin on ice do so for moments
+LEAST_SHARE: Final = (
+    0.8  # of the time in which a wheel turns: wheels that spin on ice do so for moments
+)
 RESTS_M_S2: Final = 0.3  # deviation of the accelerometers from their median
 RESTS_RAD_S: Final = 0.01
 GAINS_M_S2: Final = 0.4  # root mean square of the wheels' acceleration
@@ -30,7 +32,10 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     if len(at) < LEAST_S * RATE_HZ:
         return False
-    rims = np.stack([even(t, signals[:, S.OMEGA + wheel], at) for wheel in range(4)], axis=1) * vehicle.wheel_radius
+    rims = (
+        np.stack([even(t, signals[:, S.OMEGA + wheel], at) for wheel in range(4)], axis=1)
+        * vehicle.wheel_radius
+    )
     axles = [smooth(np.abs(rims[:, 2 * axle : 2 * axle + 2]).mean(axis=1)) for axle in range(2)]
     fastest = np.fmax(axles[0], axles[1])
     slowest = np.fmin(axles[0], axles[1])
@@ -39,7 +44,9 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
         one_stands = turns & (slowest < STANDS_M_S)
     if turns.sum() < LEAST_S * RATE_HZ:
         return False
-    along, across, yaw = (smooth(even(t, signals[:, channel], at)) for channel in (S.AX, S.AY, S.YAW_RATE))
+    along, across, yaw = (
+        smooth(even(t, signals[:, channel], at)) for channel in (S.AX, S.AY, S.YAW_RATE)
+    )
     rests = all(
         np.isfinite(value[turns]).any()
         and float(np.nanpercentile(np.abs(value[turns] - np.nanmedian(value[turns])), 90)) < limit
@@ -50,4 +57,6 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     gained = np.gradient(fastest, 1.0 / RATE_HZ)[turns]
     gains = float(np.sqrt(np.nanmean(np.square(gained)))) > GAINS_M_S2
     felt = float(np.nanstd(along[turns]))
-    return bool(one_stands.sum() > LEAST_SHARE * turns.sum() or (gains and felt < 0.25 * GAINS_M_S2))
+    return bool(
+        one_stands.sum() > LEAST_SHARE * turns.sum() or (gains and felt < 0.25 * GAINS_M_S2)
+    )

@@ -13,9 +13,13 @@ from schemas.numeric import FloatArray
 from schemas.signals import S
 
 FEWEST: Final = 200  # moments, four seconds
-BETTER: Final = 0.25  # by which another reading of yaw must fit the course better (mean resultant length)
+BETTER: Final = (
+    0.25  # by which another reading of yaw must fit the course better (mean resultant length)
+)
 SOUND: Final = 0.9  # agreement from which on another reading of yaw is the true one
-LEAST_TURN: Final = 0.5  # [rad] of yaw and of the course; a car that slides turns and its course does not
+LEAST_TURN: Final = (
+    0.5  # [rad] of yaw and of the course; a car that slides turns and its course does not
+)
 STEADIER: Final = 0.5  # of the spread of ground speed over wheel speed, that exchanging must leave
 # what the log's yaw may be instead: how to make ours of it
 COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
@@ -32,7 +36,9 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []
     fast = np.nanpercentile(np.abs(drive.v), 95)
-    good = np.isfinite(drive.course) & np.isfinite(drive.course_yaw) & (np.abs(drive.v) > 0.3 * fast)
+    good = (
+        np.isfinite(drive.course) & np.isfinite(drive.course_yaw) & (np.abs(drive.v) > 0.3 * fast)
+    )
     if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
         yaw, course = drive.course_yaw[good], drive.course[good]
         fits = {name: _agreement(made(yaw), course) for name, made in COMPASS.items()}

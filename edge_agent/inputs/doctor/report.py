@@ -18,7 +18,13 @@ AXES: Final = {
     "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
     "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
 }  # fmt: skip
-SHOWN: Final = ("gain", "offset", "correlation", "lag_s", "excited_s")  # of an identity, to a program
+SHOWN: Final = (
+    "gain",
+    "offset",
+    "correlation",
+    "lag_s",
+    "excited_s",
+)  # of an identity, to a program
 POINTS: Final = 600
 SIDE: Final = 260  # of a plot [pixel]
 EDGE: Final = 36
@@ -32,10 +38,16 @@ STYLE: Final = (
 def lines(diagnosis: Diagnosis) -> list[str]:
     """What was found, a line each."""
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
-    lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown]
-    lines += [f"{'lag':<8} {name:<10} {lag:+.3f} s behind the inertial unit" for name, lag in diagnosis.lags.items()]
     lines += [
-        f"{'note':<8} {'omega':<10} the {axle} wheels turn as one: locked differential?" for axle in diagnosis.locked
+        f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown
+    ]
+    lines += [
+        f"{'lag':<8} {name:<10} {lag:+.3f} s behind the inertial unit"
+        for name, lag in diagnosis.lags.items()
+    ]
+    lines += [
+        f"{'note':<8} {'omega':<10} the {axle} wheels turn as one: locked differential?"
+        for axle in diagnosis.locked
     ]
     return [*lines, *(f"{'sound':<8} {channel}" for channel in diagnosis.sound)]
 
@@ -64,15 +76,21 @@ def advice(diagnosis: Diagnosis) -> str:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:
         return "not passed: correct the profile (--fix writes it), import again"
-    return "not passed: drive half a minute with turns and some braking, or vouch for it with --trust"
+    return (
+        "not passed: drive half a minute with turns and some braking, or vouch for it with --trust"
+    )
 
 
 def page(diagnosis: Diagnosis, title: str) -> str:
     """A page of HTML: verdict, findings, and each identity as a plot."""
     rows = [
-        f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}" for f in diagnosis.findings
+        f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"
+        for f in diagnosis.findings
     ]
-    rows += [f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells" for channel in diagnosis.unknown]
+    rows += [
+        f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells"
+        for channel in diagnosis.unknown
+    ]
     rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in diagnosis.sound]
     plots = "".join(_figure(name, fit) for name, fit in diagnosis.fits.items() if len(fit.right))
     return (
@@ -104,9 +122,14 @@ def _figure(name: str, fit: Fit) -> str:
     def at(across: FloatArray, up: FloatArray) -> list[str]:
         right = EDGE + (across - low) / (high - low) * (SIDE - 2 * EDGE)
         down = SIDE - EDGE - (up - bottom) / (top - bottom) * (SIDE - 2 * EDGE)
-        return [f"{px:.0f},{py:.0f}" for px, py in zip(np.clip(right, 0, SIDE), np.clip(down, 0, SIDE), strict=True)]
+        return [
+            f"{px:.0f},{py:.0f}"
+            for px, py in zip(np.clip(right, 0, SIDE), np.clip(down, 0, SIDE), strict=True)
+        ]
 
-    dots = "".join(f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in at(x, y))
+    dots = "".join(
+        f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in at(x, y)
+    )
     ends = np.array([low, high])
     law, found = (" ".join(at(ends, gain * ends + fit.offset)) for gain in (1.0, fit.gain))
     across, up = AXES[name]

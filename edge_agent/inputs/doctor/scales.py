@@ -65,16 +65,35 @@ QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
 # the clocks of the devices: identity -> (device on the left, device on the right)
 CLOCKS: Final = {"longitudinal": ("imu", "wheels"), "axle": ("wheels", "imu"), "steering": ("steering", "imu"),
                  "ground": ("receiver", "wheels"), "turning": ("receiver", "imu")}  # fmt: skip
-CLOCK_SPREAD_S: Final = {"longitudinal": 0.06, "axle": 0.04, "steering": 0.06, "ground": 0.05, "turning": 0.12}
-CLOCK_CENTRE_S: Final = {"longitudinal": 0.03, "axle": 0.0, "steering": -0.05, "ground": 0.0, "turning": -0.06}
+CLOCK_SPREAD_S: Final = {
+    "longitudinal": 0.06,
+    "axle": 0.04,
+    "steering": 0.06,
+    "ground": 0.05,
+    "turning": 0.12,
+}
+CLOCK_CENTRE_S: Final = {
+    "longitudinal": 0.03,
+    "axle": 0.0,
+    "steering": -0.05,
+    "ground": 0.0,
+    "turning": -0.06,
+}
 LATE_S: Final = 0.15  # a clock this far off is a fault; sound logs lie within .1
-CLOCK_LIKE: Final = 0.8  # correlation from which on an identity's lag counts: slides move both sides apart
+CLOCK_LIKE: Final = (
+    0.8  # correlation from which on an identity's lag counts: slides move both sides apart
+)
 CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by chance
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     """What each quantity may have."""
-    g, deg, ratio, radius = 1.0 / GRAVITY, 1.0 / DEG, vehicle.steering_ratio or 16.0, vehicle.wheel_radius
+    g, deg, ratio, radius = (
+        1.0 / GRAVITY,
+        1.0 / DEG,
+        vehicle.steering_ratio or 16.0,
+        vehicle.wheel_radius,
+    )
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
     if ground.known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
@@ -87,7 +106,11 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
         "ax": [FLIPPED, Mistake("g", g), Mistake("g, sign", -g)],
         "ay": [FLIPPED, Mistake("g", g), Mistake("g, sign", -g)],
         "r": [FLIPPED, Mistake("deg/s", deg), Mistake("deg/s, sign", -deg)],
-        "delta": [FLIPPED, *angles, *(Mistake(f"{name}, sign", -factor) for name, factor in angles)],
+        "delta": [
+            FLIPPED,
+            *angles,
+            *(Mistake(f"{name}, sign", -factor) for name, factor in angles),
+        ],
         "v": [*rims, Mistake("deg/s", deg), Mistake("rpm", 60.0 / (2.0 * math.pi))],
         "sides": [Mistake("left and right exchanged", -1.0)],
         "place": [Mistake("mirrored", -1.0)],
@@ -123,7 +146,9 @@ def explain(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
     best_cost, best = min(costs, key=lambda pair: pair[0])
     margins = {}
     for quantity in QUANTITIES:
-        others = [cost for cost, guess in costs if not _alike(guess.get(quantity), best.get(quantity))]
+        others = [
+            cost for cost, guess in costs if not _alike(guess.get(quantity), best.get(quantity))
+        ]
         margins[quantity] = min(others) - best_cost if _asked(quantity, known) else 0.0
     return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
 
@@ -144,7 +169,9 @@ def _guesses(choices: Mapping[str, list[Mistake]]) -> Iterator[tuple[dict[str, M
     for count in (1, 2):
         for quantities in combinations(QUANTITIES, count):
             for faults in product(*(choices[quantity] for quantity in quantities)):
-                odd = sum(fault.name == "radius" for fault in faults)  # a known unit is the likelier of two alike
+                odd = sum(
+                    fault.name == "radius" for fault in faults
+                )  # a known unit is the likelier of two alike
                 yield dict(zip(quantities, faults, strict=True)), FAULT_COST * count + odd
     for joint in JOINT:
         chosen = {q: next(f for f in choices[q] if f.name == name) for q, name in joint}
@@ -169,7 +196,10 @@ def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
     known = {
         name: fit
         for name, fit in found.items()
-        if name in CLOCKS and fit.known and math.isfinite(fit.lag_error_s) and abs(fit.correlation) > CLOCK_LIKE
+        if name in CLOCKS
+        and fit.known
+        and math.isfinite(fit.lag_error_s)
+        and abs(fit.correlation) > CLOCK_LIKE
     }
     devices = sorted({device for name in known for device in CLOCKS[name]})
 

@@ -13,20 +13,28 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
 FEWEST_STEPS: Final = 5  # of a wheel away from the others, below which they are no bits
-FOREIGN_ROWS: Final = 3000  # of a moving car in which a wheel must have nothing to do with the others
+FOREIGN_ROWS: Final = (
+    3000  # of a moving car in which a wheel must have nothing to do with the others
+)
 FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
 RADIUS_PARTS: Final = 4
 STEADY: Final = 0.4
 STEADY_SHARE: Final = 0.75
 
-AXLES_LIKE: Final = 0.7  # correlation of each axle with the yaw rate, from which on their signs count
+AXLES_LIKE: Final = (
+    0.7  # correlation of each axle with the yaw rate, from which on their signs count
+)
 LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
 HALF_LIKE: Final = 0.7  # correlation from which on the lag of a half counts
 LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
-LEAST_CURVATURE: Final = 0.004  # [1/m] root mean square, from which on an axle shows that it is locked
+LEAST_CURVATURE: Final = (
+    0.004  # [1/m] root mean square, from which on an axle shows that it is locked
+)
 LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
 LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's
-TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
+TURNS_LIKE: Final = (
+    0.8  # correlation of the yaw rate with steering or course, below which the car may spin
+)
 
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
@@ -35,7 +43,9 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
     if len(enters) < FEWEST_STEPS:
         return False
     steps = above[enters + 1] - above[enters]
-    whole = np.abs(above[np.minimum(enters + 2, len(above) - 1)] - above[enters + 1]) < 0.1 * np.abs(steps)
+    whole = np.abs(
+        above[np.minimum(enters + 2, len(above) - 1)] - above[enters + 1]
+    ) < 0.1 * np.abs(steps)
     sudden = np.abs(steps) > 0.9 * np.abs(above[enters + 1])
     usual = float(np.median(np.abs(steps)))
     alike = np.abs(np.abs(steps) / usual - np.maximum(np.round(np.abs(steps) / usual), 1.0)) < 0.1
@@ -46,7 +56,11 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
     """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody spins for that long."""
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
     moves = np.abs(others) > 0.3 * fast
-    return bool(moves.sum() > FOREIGN_ROWS and np.mean(off[moves & agree]) > 0.6 and agree[moves].mean() > 0.6)
+    return bool(
+        moves.sum() > FOREIGN_ROWS
+        and np.mean(off[moves & agree]) > 0.6
+        and agree[moves].mean() > 0.6
+    )
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
@@ -69,7 +83,12 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
     steered = np.isfinite(drive.delta) & good
     sign = 0.0
     if steered.sum() > 10 * RATE_HZ:
-        sign = float(np.sign(np.sum(drive.ay[good] * drive.r[good]) * np.sum(drive.delta[steered] * drive.r[steered])))
+        sign = float(
+            np.sign(
+                np.sum(drive.ay[good] * drive.r[good])
+                * np.sum(drive.delta[steered] * drive.r[steered])
+            )
+        )
     if sign < 0.0:  # one of a_y, yaw rate and steering is flipped: nobody knows which axle is right
         return []
     return [("front", (0, 1))] if front < 0.0 else [("rear", (2, 3))]
@@ -82,7 +101,10 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
     difference for slip reads a slide in every tight turn.
     """
     locked = []
-    for name, own, other in (("front", drive.yaw_front, drive.yaw_rear), ("rear", drive.yaw_rear, drive.yaw_front)):
+    for name, own, other in (
+        ("front", drive.yaw_front, drive.yaw_rear),
+        ("rear", drive.yaw_rear, drive.yaw_front),
+    ):
         good = np.isfinite(own) & np.isfinite(other) & np.isfinite(drive.r) & (drive.moving > 0)
         if good.sum() < 20 * RATE_HZ:
             continue
@@ -104,7 +126,9 @@ def find_followed(drive: EvenDrive) -> BoolArray:
     fast = np.maximum(np.abs(drive.v), 1.0)
     wanted = drive.wheelbase * drive.r / fast
     steered = np.isfinite(drive.delta) & np.isfinite(wanted)
-    return steered & (np.abs(np.tan(np.clip(drive.delta, -1.0, 1.0)) - wanted) < FOLLOWED * np.abs(wanted) + 0.01)
+    return steered & (
+        np.abs(np.tan(np.clip(drive.delta, -1.0, 1.0)) - wanted) < FOLLOWED * np.abs(wanted) + 0.01
+    )
 
 
 def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
@@ -122,7 +146,11 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 def spread_of_parts(beside: FloatArray) -> float:
     """Return by how much the parts of a drive differ in what should be constant: a tilt is in all, a slide is not."""
-    parts = [float(np.nanmedian(part)) for part in np.array_split(beside, RADIUS_PARTS) if np.isfinite(part).any()]
+    parts = [
+        float(np.nanmedian(part))
+        for part in np.array_split(beside, RADIUS_PARTS)
+        if np.isfinite(part).any()
+    ]
     return float(np.std(parts))
 
 
@@ -139,19 +167,29 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
     return float(np.mean(near)) if near else 0.0
 
 
-def measure_lags_twice(t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]) -> dict[str, float]:
+def measure_lags_twice(
+    t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
+) -> dict[str, float]:
     """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all along.
 
     A car that slides answers to its steering later or sooner than its model, and not by the same time again.
     """
     half = len(t) // 2
     whole = lags(t, signals, vehicle)
-    halves = [lags(t[rows], signals[rows], vehicle, HALF_LIKE) for rows in (slice(None, half), slice(half, None))]
+    halves = [
+        lags(t[rows], signals[rows], vehicle, HALF_LIKE)
+        for rows in (slice(None, half), slice(half, None))
+    ]
     parts = [whole, *halves]
     told = {}
     for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering")):
         fit = found[identity]
-        sound = fit.known and fit.correlation > TURNS_LIKE and abs(np.log(abs(fit.gain))) < 0.35 and is_steady(fit)
+        sound = (
+            fit.known
+            and fit.correlation > TURNS_LIKE
+            and abs(np.log(abs(fit.gain))) < 0.35
+            and is_steady(fit)
+        )
         values = [part[name] for part in parts if name in part]
         lag = float(np.median(values)) if values else 0.0
         apart = max(LAGS_APART_S, LAGS_APART * abs(lag))

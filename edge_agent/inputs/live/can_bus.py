@@ -21,12 +21,18 @@ class Decoder:
 
     def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
         elsewhere = {
-            c.message for c in profile.channels.values() if c.message and bus is not None and c.bus not in (None, bus)
+            c.message
+            for c in profile.channels.values()
+            if c.message and bus is not None and c.bus not in (None, bus)
         }
-        self.database = {name: message for name, message in database.items() if name not in elsewhere}
+        self.database = {
+            name: message for name, message in database.items() if name not in elsewhere
+        }
         self.wanted = {name for name in profile.needs() if name.partition(".")[0] in self.database}
         messages = {name.partition(".")[0] for name in self.wanted}
-        self.identifiers = {(self.database[name].identifier, self.database[name].extended) for name in messages}
+        self.identifiers = {
+            (self.database[name].identifier, self.database[name].extended) for name in messages
+        }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
         """The signals of (time, (identifier, extended, data))."""
@@ -49,14 +55,20 @@ class CanFeed(Feed):
         InputError: python-can is not installed.
     """
 
-    def __init__(self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]) -> None:
+    def __init__(
+        self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]
+    ) -> None:
         super().__init__(name, clock)
         self._can, self._decoder, self._options = library("can"), decoder, dict(options)
 
     def listen(self) -> None:
         """Hear frames until the bus fails."""
         filters = [
-            {"can_id": identifier, "can_mask": EXTENDED_MASK if extended else STANDARD_MASK, "extended": extended}
+            {
+                "can_id": identifier,
+                "can_mask": EXTENDED_MASK if extended else STANDARD_MASK,
+                "extended": extended,
+            }
             for identifier, extended in sorted(self._decoder.identifiers)
         ]
         with self._can.Bus(can_filters=filters, **self._options) as bus:

@@ -47,7 +47,9 @@ class DatabrokerFeed(Feed):
             read = {option: Path(file).read_bytes() for option, file in files.items()}
         except OSError as error:
             raise InputError(
-                "source", f"{name!r}: cannot read {error.filename} ({error.strerror})", "correct the path"
+                "source",
+                f"{name!r}: cannot read {error.filename} ({error.strerror})",
+                "correct the path",
             ) from error
         self._authority = read.get("ca")
         token = read.get("token", b"").decode("ascii", errors="replace").strip()
@@ -96,7 +98,9 @@ class DatabrokerFeed(Feed):
     def _channel(self) -> Any:  # noqa: ANN401 grpc has no types
         if self._authority is None:
             return self._grpc.insecure_channel(self._address)
-        return self._grpc.secure_channel(self._address, self._grpc.ssl_channel_credentials(self._authority))
+        return self._grpc.secure_channel(
+            self._address, self._grpc.ssl_channel_credentials(self._authority)
+        )
 
     def _method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
         return kind(

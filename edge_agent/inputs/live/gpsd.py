@@ -46,7 +46,13 @@ class GpsdFeed(Feed):
     def _line(self, line: bytes) -> None:
         try:
             fix = parse_gpsd(line.decode("ascii", errors="replace")) if line.strip() else None
-        except (json.JSONDecodeError, ValueError, RecursionError, OverflowError, TypeError) as error:
+        except (
+            json.JSONDecodeError,
+            ValueError,
+            RecursionError,
+            OverflowError,
+            TypeError,
+        ) as error:
             self.unreadable(f"a report that cannot be read ({type(error).__name__})")
             return
         if fix is not None:
@@ -55,4 +61,7 @@ class GpsdFeed(Feed):
     def series(self, heard: list[Heard]) -> dict[str, Series]:
         """Signals latitude, longitude, speed and course."""
         t = np.array([time for time, _ in heard])
-        return {name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name]) for name in UNITS}
+        return {
+            name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name])
+            for name in UNITS
+        }

@@ -25,9 +25,20 @@ from schemas.thresholds import NS
 
 DDS: Final = "::dds_::"
 ATTACHMENT: Final = struct.Struct("<qq")  # sequence number, ns; the publisher's identity follows
-OLDEST_NS: Final = 946_684_800 * NS  # the year 2000: an earlier stamp counts from the start of a simulation
-CAN_FRAME: Final = (
-    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
+OLDEST_NS: Final = (
+    946_684_800 * NS
+)  # the year 2000: an earlier stamp counts from the start of a simulation
+CAN_FRAME: Final = "\n".join(
+    (
+        "std_msgs/Header header",
+        "uint32 id",
+        "bool is_rtr",
+        "bool is_extended",
+        "bool is_error",
+        "uint8 dlc",
+        "uint8[8] data",
+        "",
+    )
 )
 
 
@@ -57,7 +68,9 @@ class Ros2Feed(Feed):
         self._topics = sorted({signal.partition(".")[0] for signal in self._wanted} | set(buses))
         if not self._topics:
             raise InputError(
-                "profile", "names no topic", "call its signals /topic.field, as import drafts them from a bag"
+                "profile",
+                "names no topic",
+                "call its signals /topic.field, as import drafts them from a bag",
             )
         self._store = _typestore(types)
         self._leaves: dict[str, list[Leaf]] = {}
@@ -70,7 +83,9 @@ class Ros2Feed(Feed):
             return
         with session:
             held = [
-                session.declare_subscriber(f"{self._domain}/{topic.strip('/')}/*/*", self._hearing(topic))
+                session.declare_subscriber(
+                    f"{self._domain}/{topic.strip('/')}/*/*", self._hearing(topic)
+                )
                 for topic in self._topics
             ]
             self.openings += 1
@@ -89,7 +104,9 @@ class Ros2Feed(Feed):
                 for name, value in what.items():
                     times.setdefault(name, []).append(time)
                     values.setdefault(name, []).append(value)
-        return found | {name: Series(np.array(times[name]), np.array(values[name])) for name in times}
+        return found | {
+            name: Series(np.array(times[name]), np.array(values[name])) for name in times
+        }
 
     def _hearing(self, topic: str) -> Any:  # noqa: ANN401
         def heard(sample: Any) -> None:  # noqa: ANN401 the session's type is its library's own
@@ -102,7 +119,9 @@ class Ros2Feed(Feed):
 
     def _sample(self, topic: str, sample: Any) -> None:  # noqa: ANN401
         kind = type_of(str(sample.key_expr))
-        published = self._published(sample.attachment.to_bytes() if sample.attachment is not None else b"")
+        published = self._published(
+            sample.attachment.to_bytes() if sample.attachment is not None else b""
+        )
         message = self._store.deserialize_cdr(sample.payload.to_bytes(), kind)
         stamp = stamp_of(message)
         at = stamp if stamp > OLDEST_NS or not published else published
@@ -147,10 +166,14 @@ def _typestore(folder: Path | None) -> Any:  # noqa: ANN401
     for file in sorted(folder.glob("*/*.msg")) if folder else ():
         texts[f"{file.parent.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
     if folder and len(texts) == 1:
-        raise InputError("source", f"{folder} holds no PACKAGE/NAME.msg", "name a folder of message definitions")
+        raise InputError(
+            "source", f"{folder} holds no PACKAGE/NAME.msg", "name a folder of message definitions"
+        )
     try:
         for kind, text in texts.items():
             store.register(typesys.get_types_from_msg(text, kind))
     except Exception as error:  # what a parser of others raises
-        raise InputError("source", f"a message definition makes no sense ({error})", "correct it") from error
+        raise InputError(
+            "source", f"a message definition makes no sense ({error})", "correct it"
+        ) from error
     return store

@@ -61,8 +61,12 @@ class LiveRows:
         self.feeds, self._profile, self._clock, self._wait = feeds, profile, clock, wait
         self._radius = vehicle.wheel_radius
         self._ratio = vehicle.steering_ratio or profile.steering_ratio
-        if self._ratio is None and any(channel.at == "steering wheel" for channel in profile.channels.values()):
-            raise InputError("steering_ratio", "is not known", "give it in the profile or the vehicle file")
+        if self._ratio is None and any(
+            channel.at == "steering wheel" for channel in profile.channels.values()
+        ):
+            raise InputError(
+                "steering_ratio", "is not known", "give it in the profile or the vehicle file"
+            )
         self.rate_hz = profile.rate_hz or RATE_HZ
         self._readings: list[dict[str, Series]] = [{} for _ in feeds]
         self._context = context_signals(profile)  # their last readings hold, and are kept
@@ -70,7 +74,9 @@ class LiveRows:
         self._next = 0  # row
         self._date_ns: int | None = None
         self.skipped = self.late = 0  # rows left out; readings that came after their row
-        self.ground: FloatArray = np.zeros(0)  # speed over ground of the last block's rows (T,) [m/s]
+        self.ground: FloatArray = np.zeros(
+            0
+        )  # speed over ground of the last block's rows (T,) [m/s]
 
     def blocks(self) -> Generator[Block]:
         """Blocks as time goes, until the caller stops; the sources are closed then."""
@@ -109,7 +115,9 @@ class LiveRows:
     def _block(self, size: int) -> Block:
         t = np.arange(self._next, self._next + size) / self.rate_hz
         self._next += size
-        recordings = [self._recording(place, feed, t[0] - KEPT_S) for place, feed in enumerate(self.feeds)]
+        recordings = [
+            self._recording(place, feed, t[0] - KEPT_S) for place, feed in enumerate(self.feeds)
+        ]
         signals = np.full((size, len(CHANNELS)), np.nan)
         context = np.full((size, len(CONTEXT)), np.nan)
         self.ground = np.full(size, np.nan)
@@ -117,7 +125,13 @@ class LiveRows:
         for name, (place, channel) in found_in(recordings, self._profile).items():
             sparse = name in SPARSE  # a fix has its own date, all else the time at which it came
             try:
-                series, _ = made(name, channel, replace(recordings[place], rows=sparse), self._radius, self._ratio)
+                series, _ = made(
+                    name,
+                    channel,
+                    replace(recordings[place], rows=sparse),
+                    self._radius,
+                    self._ratio,
+                )
             except InputError:  # what says its sign has not come yet
                 continue
             series = Series(series.t - channel.delay_s, series.values)
@@ -131,14 +145,18 @@ class LiveRows:
         self._place(fixes, t, signals)
         self._steer(signals)
         time = self._start_ns() + np.rint(t * NS).astype(np.int64)
-        return Block(t[:, None], time[:, None], signals[:, None], context[:, None] if self._context else None)
+        return Block(
+            t[:, None], time[:, None], signals[:, None], context[:, None] if self._context else None
+        )
 
     def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
         """What a source told lately."""
         kept, fresh_ones = self._readings[place], feed.take()
         if "course" not in fresh_ones:
             passed = oldest + KEPT_S - 1.0 / self.rate_hz
-            self.late += max((int((fresh.t < passed).sum()) for fresh in fresh_ones.values()), default=0)
+            self.late += max(
+                (int((fresh.t < passed).sum()) for fresh in fresh_ones.values()), default=0
+            )
         for name, fresh in fresh_ones.items():
             before = kept.get(name)
             t, values = fresh.t, fresh.values
@@ -161,7 +179,11 @@ class LiveRows:
         half = 0.5 / self.rate_hz
         speed, course = fixes.get(GROUND), fixes.get("yaw")
         for name, series in fixes.items():
-            fresh = (series.t > self._used[name]) & (series.t < t[-1] + half) & np.isfinite(series.values)
+            fresh = (
+                (series.t > self._used[name])
+                & (series.t < t[-1] + half)
+                & np.isfinite(series.values)
+            )
             fresh &= series.t > t[0] - OLDEST_FIX_S
             times, values = series.t[fresh], series.values[fresh]
             if not len(times):
@@ -172,9 +194,13 @@ class LiveRows:
                 values = np.where(np.isnan(v) | (v > COURSE_SPEED), values, np.nan)
             elif name in ("latitude", "longitude") and speed is not None and course is not None:
                 late = np.maximum(t[0] - half - times, 0.0)
-                along = np.nan_to_num(v * late * (np.sin(yaw) if name == "latitude" else np.cos(yaw)))
+                along = np.nan_to_num(
+                    v * late * (np.sin(yaw) if name == "latitude" else np.cos(yaw))
+                )
                 if name == "longitude":
-                    along /= math.cos(math.radians(float(np.mean(_at(fixes.get("latitude"), times)))))
+                    along /= math.cos(
+                        math.radians(float(np.mean(_at(fixes.get("latitude"), times))))
+                    )
                 values = values + np.degrees(along / EARTH_RADIUS_M)
             rows = np.clip(np.searchsorted(t, times - half), 0, len(t) - 1)
             if name == GROUND:
@@ -190,9 +216,13 @@ class LiveRows:
         """The date of the host's start: by a receiver's clock where the host's is off, settled by the first fix."""
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [
-                feed.stamps.lead for feed, kept in zip(self.feeds, self._readings, strict=True) if "course" in kept
+                feed.stamps.lead
+                for feed, kept in zip(self.feeds, self._readings, strict=True)
+                if "course" in kept
             ]
-            self._date_ns = self._clock.start_ns - round(leads[0] * NS) if leads else self._clock.start_ns
+            self._date_ns = (
+                self._clock.start_ns - round(leads[0] * NS) if leads else self._clock.start_ns
+            )
         return self._clock.start_ns if self._date_ns is None else self._date_ns
 
 

@@ -58,7 +58,9 @@ def open_sources(
         profile_name = VSS_PROFILE
     if profile_name is None:
         raise InputError(
-            "profile", "is not given", "say which signal is which channel with --profile (import drafts one)"
+            "profile",
+            "is not given",
+            "say which signal is which channel with --profile (import drafts one)",
         )
     profile, folder = load_profile(profile_name)
     database = database_of(profile, folder, dbc)
@@ -72,7 +74,9 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
     try:
         options = dict(parse_qsl(query, strict_parsing=True)) if query else {}
     except ValueError as error:
-        raise InputError("source", f"{source!r} has odd options ({error})", "write them like ?bus=1&fd=true") from error
+        raise InputError(
+            "source", f"{source!r} has odd options ({error})", "write them like ?bus=1&fd=true"
+        ) from error
     if kind == "can":
         if database is None:
             raise no_database(Path(source))
@@ -94,25 +98,44 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
             clock,
         )
     raise InputError(
-        "source", f"{source!r} is of no known kind", f"begin it with one of {', '.join(KINDS)} and a colon"
+        "source",
+        f"{source!r} is of no known kind",
+        f"begin it with one of {', '.join(KINDS)} and a colon",
     )
 
 
 def _can(
-    source: str, address: str, options: dict[str, str], profile: Profile, database: Database, clock: HostClock
+    source: str,
+    address: str,
+    options: dict[str, str],
+    profile: Profile,
+    database: Database,
+    clock: HostClock,
 ) -> Feed:
     interface, slash, channel = address.partition("/")
     if not slash or not channel:
         raise InputError("source", f"{source!r} has no channel", "write it like can:socketcan/can0")
-    number = re.fullmatch(r"[a-zA-Z]+(\d{1,3})", channel)  # can1 tells its number, an address does not
+    number = re.fullmatch(
+        r"[a-zA-Z]+(\d{1,3})", channel
+    )  # can1 tells its number, an address does not
     given_bus = options.pop("bus", number[1] if number else "")
     bus = int(given_bus) if given_bus.isdigit() else None
     given = {name: _typed(value) for name, value in options.items()}
-    return CanFeed(source, clock, Decoder(profile, database, bus), {"interface": interface, "channel": channel} | given)
+    return CanFeed(
+        source,
+        clock,
+        Decoder(profile, database, bus),
+        {"interface": interface, "channel": channel} | given,
+    )
 
 
 def _ros2(
-    source: str, address: str, options: dict[str, str], profile: Profile, database: Database | None, clock: HostClock
+    source: str,
+    address: str,
+    options: dict[str, str],
+    profile: Profile,
+    database: Database | None,
+    clock: HostClock,
 ) -> Feed:
     settings = ZenohSettings(connect=[address]) if address else ZenohSettings()
     domain, folder = options.get("domain", "0"), options.get("messages")
@@ -138,8 +161,12 @@ def _typed(text: str) -> int | float | bool | str:
 
 
 def _host(source: str, address: str, port: int) -> tuple[str, int]:
-    host, _, number = address.rpartition(":") if ":" in address else (address or "127.0.0.1", "", str(port))
+    host, _, number = (
+        address.rpartition(":") if ":" in address else (address or "127.0.0.1", "", str(port))
+    )
     try:
         return host, int(number)
     except ValueError as error:
-        raise InputError("source", f"{source!r} has no port", f"write it like gpsd:127.0.0.1:{port}") from error
+        raise InputError(
+            "source", f"{source!r} has no port", f"write it like gpsd:127.0.0.1:{port}"
+        ) from error

@@ -55,7 +55,11 @@ Taker: TypeAlias = Callable[[set[int]], tuple[Log, float]]
 
 
 def decoded(
-    take: Taker, name: str, database: Database, wanted: Iterable[str], buses: dict[str, int] | None = None
+    take: Taker,
+    name: str,
+    database: Database,
+    wanted: Iterable[str],
+    buses: dict[str, int] | None = None,
 ) -> Recording:
     """The signals `MESSAGE.SIGNAL` of a log.
 
@@ -73,33 +77,49 @@ def decoded(
             messages[message].append(signal)
     log, first = take({database[message].identifier for message in messages})
     recording = Recording(name, {}, round(first * NS) if first > DATED_S else None)
-    for message, key in _placed(log, [database[message] for message in messages], buses or {}).items():
+    for message, key in _placed(
+        log, [database[message] for message in messages], buses or {}
+    ).items():
         times, data = log[key].columns()
         how = database[message]
-        names = [s for s in messages[message] if how.signals[s].last_byte < max(log[key].shortest, 1)]
+        names = [
+            s for s in messages[message] if how.signals[s].last_byte < max(log[key].shortest, 1)
+        ]
         t = np.rint((times - first) * MICRO) / MICRO
         order = np.argsort(t, kind="stable")
         for signal, values in how.decode(data, names).items():
-            recording.signals[f"{message}.{signal}"] = Series(t[order], values[order], how.signals[signal].unit)
+            recording.signals[f"{message}.{signal}"] = Series(
+                t[order], values[order], how.signals[signal].unit
+            )
     return recording
 
 
 def no_database(path: Path) -> InputError:
     """The error of frames that nothing can decode."""
-    return InputError("dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile")
+    return InputError(
+        "dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile"
+    )
 
 
 def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
     """Frames of the wanted identifiers by python-can, and the time of the log's first frame [s]."""
     log: Log = defaultdict(Frames)
     first = np.inf
-    logging.getLogger("can").setLevel(logging.ERROR)  # it reports versions of traces at INFO and WARNING
+    logging.getLogger("can").setLevel(
+        logging.ERROR
+    )  # it reports versions of traces at INFO and WARNING
     with library("can").LogReader(path) as reader:
         for message in reader:
             time = message.timestamp
             first = min(first, time)
-            if message.arbitration_id in wanted and not message.is_error_frame and not message.is_remote_frame:
-                log[bus_of(message.channel), message.arbitration_id, message.is_extended_id].add(time, message.data)
+            if (
+                message.arbitration_id in wanted
+                and not message.is_error_frame
+                and not message.is_remote_frame
+            ):
+                log[bus_of(message.channel), message.arbitration_id, message.is_extended_id].add(
+                    time, message.data
+                )
     return log, float(first) if np.isfinite(first) else 0.0
 
 

@@ -87,5 +87,9 @@ def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
                 data = bytes.fromhex(found["data"].replace(" ", ""))
                 log[int(found["bus"] or 0), identifier, len(found["id"]) > 4].add(time, data)
     if first is None:
-        raise InputError("source", f"{path} holds no frame that can be read", "save the trace as PCAN 1.1 or later")
+        raise InputError(
+            "source",
+            f"{path} holds no frame that can be read",
+            "save the trace as PCAN 1.1 or later",
+        )
     return log, first

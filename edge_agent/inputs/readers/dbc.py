@@ -48,7 +48,9 @@ class Signal:
     def decode(self, data: Bytes) -> FloatArray:
         """Physical values (n,) of the frames (n, LONGEST)."""
         raw = self._raw(data)
-        number: NDArray[np.int64] | NDArray[np.uint64] = raw.view(np.int64) if self.size < 64 or self.signed else raw
+        number: NDArray[np.int64] | NDArray[np.uint64] = (
+            raw.view(np.int64) if self.size < 64 or self.signed else raw
+        )
         if self.signed and self.size < 64:
             top = np.int64(1) << np.int64(self.size - 1)
             number = (number ^ top) - top
@@ -112,13 +114,19 @@ def read_dbc(path: Path) -> Database:
     """
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise InputError("dbc", f"{path} has more than {MOST_BYTES} bytes", "name a CAN database")
+            raise InputError(
+                "dbc", f"{path} has more than {MOST_BYTES} bytes", "name a CAN database"
+            )
         text = path.read_bytes().decode("utf-8", errors="replace")
     except OSError as error:
-        raise InputError("dbc", f"cannot read {path} ({error.strerror})", "name a CAN database") from error
+        raise InputError(
+            "dbc", f"cannot read {path} ({error.strerror})", "name a CAN database"
+        ) from error
     database = parse_dbc(text)
     if not any(message.signals for message in database.values()):
-        raise InputError("dbc", f"{path} holds no message with signals", "name a CAN database (DBC)")
+        raise InputError(
+            "dbc", f"{path} holds no message with signals", "name a CAN database (DBC)"
+        )
     return database
 
 
@@ -129,7 +137,9 @@ def parse_dbc(text: str) -> Database:
     for line in text.splitlines():
         if found := _MESSAGE.match(line):
             number, length = int(found[1]), int(found[3])
-            message = CanMessage(found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {})
+            message = CanMessage(
+                found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {}
+            )
             database[message.name] = message
         elif message is not None and (found := _SIGNAL.match(line)):
             signal = _signal(found)

@@ -112,9 +112,14 @@ def read_gnss(path: Path) -> Recording:
             if fix is not None and (not fixes or fix.time > fixes[-1].time):
                 fixes.append(fix)
     if not fixes:
-        raise InputError("source", f"{path} holds no position with a time", "record RMC sentences, or gpsd's TPV")
+        raise InputError(
+            "source", f"{path} holds no position with a time", "record RMC sentences, or gpsd's TPV"
+        )
     start = fixes[0].time
     t = np.array([(fix.time - start) / NS for fix in fixes])
-    signals = {name: Series(t, np.array([getattr(fix, name) for fix in fixes]), unit) for name, unit in UNITS.items()}
+    signals = {
+        name: Series(t, np.array([getattr(fix, name) for fix in fixes]), unit)
+        for name, unit in UNITS.items()
+    }
     notes = [f"{path.name}: {broken} broken lines left out"] if broken else []
     return Recording(path.name, signals, start, notes=notes)

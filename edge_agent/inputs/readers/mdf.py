@@ -39,20 +39,31 @@ def check_blocks(path: Path) -> None:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        if file.read(3) not in (b"MDF", b"UnF"):  # a logger that lost its power left "UnFinMF"; asammdf reads that
-            raise InputError("source", f"{path} is not an MDF file", "give a measurement of version 4")
+        if file.read(3) not in (
+            b"MDF",
+            b"UnF",
+        ):  # a logger that lost its power left "UnFinMF"; asammdf reads that
+            raise InputError(
+                "source", f"{path} is not an MDF file", "give a measurement of version 4"
+            )
         file.seek(28)
         version = struct.unpack("<H", file.read(2).ljust(2, b"\0"))[0]
         if version < 400:
-            raise InputError("source", f"{path} is MDF {version / 100:.2f}", "convert it to version 4")
+            raise InputError(
+                "source", f"{path} is MDF {version / 100:.2f}", "convert it to version 4"
+            )
         seen: set[int] = set()
         waiting = [HEADER]
         while waiting:
             address = waiting.pop()
             if address in seen:
-                raise InputError("source", f"{path} has blocks in a circle at byte {address}", "record it anew")
+                raise InputError(
+                    "source", f"{path} has blocks in a circle at byte {address}", "record it anew"
+                )
             if address + 24 > size or len(seen) > MOST_BLOCKS:
-                raise InputError("source", f"{path} points beyond its end, to byte {address}", "record it anew")
+                raise InputError(
+                    "source", f"{path} points beyond its end, to byte {address}", "record it anew"
+                )
             seen.add(address)
             waiting += _onward(file, address, size, path)
 
@@ -66,7 +77,9 @@ def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
     if kind == b"##CG":
         _, cycles = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
         if cycles > 1000 * size:  # deflate makes at most a thousand bytes of one
-            raise InputError("source", f"{path} counts {cycles} records in {size} bytes", "record it anew")
+            raise InputError(
+                "source", f"{path} counts {cycles} records in {size} bytes", "record it anew"
+            )
     return [links[place] for place in LINKS.get(kind, ()) if place < count and links[place]]
 
 
@@ -159,6 +172,8 @@ def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noq
                 values = np.asarray(channel.samples)
                 if values.ndim == 1 and values.dtype.kind in "fiub" and len(values):
                     t = np.asarray(channel.timestamps, dtype=np.float64)
-                    recording.signals[name] = Series(t, values.astype(np.float64), str(channel.unit or ""))
+                    recording.signals[name] = Series(
+                        t, values.astype(np.float64), str(channel.unit or "")
+                    )
                     break
     return recording

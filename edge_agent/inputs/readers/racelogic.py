@@ -34,7 +34,12 @@ def is_vbo(path: Path) -> bool:
 def has_vbo_columns(names: Sequence[str]) -> bool:
     """Return True if a table's columns are those of a VBO."""
     lower = {name.strip().lower() for name in names}
-    return {"sats", "time", "lat", "long"} <= lower or {"satellites", "time", "latitude", "longitude"} <= lower
+    return {"sats", "time", "lat", "long"} <= lower or {
+        "satellites",
+        "time",
+        "latitude",
+        "longitude",
+    } <= lower
 
 
 def read_vbo(path: Path) -> Recording:
@@ -53,10 +58,14 @@ def read_vbo(path: Path) -> Recording:
         table = np.array(numbers)
         units = sections.get("channel units", [])
         own = names[len(names) - len(units) :] if len(units) <= len(names) else []
-        return convert_vbo(path, {n: table[:, i] for i, n in enumerate(names)}, dict(zip(own, units, strict=False)))
+        return convert_vbo(
+            path, {n: table[:, i] for i, n in enumerate(names)}, dict(zip(own, units, strict=False))
+        )
 
 
-def convert_vbo(path: Path, columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Recording:
+def convert_vbo(
+    path: Path, columns: Mapping[str, FloatArray], units: Mapping[str, str]
+) -> Recording:
     """Return a recording of VBO columns (T,) in that format's units."""
     lower = {name.lower(): name for name in columns}
     clock = columns[lower["time"]]
@@ -65,9 +74,15 @@ def convert_vbo(path: Path, columns: Mapping[str, FloatArray], units: Mapping[st
     t = seconds + DAY_S * np.concatenate([[0.0], np.cumsum(np.diff(seconds) < -0.5 * DAY_S)])
     back = np.flatnonzero(~(np.diff(t) >= 0.0))
     if len(back) or not np.isfinite(t[0]):
-        raise InputError("time", f"{path} goes back at row {int(back[0]) + 1 if len(back) else 0}", "sort it by time")
+        raise InputError(
+            "time",
+            f"{path} goes back at row {int(back[0]) + 1 if len(back) else 0}",
+            "sort it by time",
+        )
     recording = Recording(path.name, {}, rows=True)
-    recording.notes.append(f"{path.name}: Racelogic columns: time as hhmmss, places in minutes, west positive")
+    recording.notes.append(
+        f"{path.name}: Racelogic columns: time as hhmmss, places in minutes, west positive"
+    )
     for name, values in columns.items():
         short = name.lower()
         if short == "time":

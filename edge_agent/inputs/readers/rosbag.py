@@ -35,7 +35,9 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path) -> Iterator[Any]:
     """A reader, opened and in the end closed; the folder is taken for a database file that lies in it."""
     highlevel, typesys = library("rosbags.highlevel"), library("rosbags.typesys")
-    inside = path.parent if path.suffix == ".db3" or (path.parent / "metadata.yaml").is_file() else path
+    inside = (
+        path.parent if path.suffix == ".db3" or (path.parent / "metadata.yaml").is_file() else path
+    )
     with foreign(path, "ROS bag"):
         types = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
         reader = highlevel.AnyReader([inside], default_typestore=types)
@@ -70,7 +72,11 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
 
 def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
     """Signals of a bag by name, all of them where none is asked for."""
-    topics = [c for c in reader.connections if wanted is None or any(name.startswith(f"{c.topic}.") for name in wanted)]
+    topics = [
+        c
+        for c in reader.connections
+        if wanted is None or any(name.startswith(f"{c.topic}.") for name in wanted)
+    ]
     times: dict[str, list[int]] = {}
     values: dict[str, list[float]] = {}
     first: int | None = None
@@ -124,7 +130,9 @@ def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:
 
 
 def _elements(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf]:  # noqa: ANN401
-    if not 0 < len(value) <= LONGEST_ARRAY or not all(isinstance(v, int | float | np.number) for v in value):
+    if not 0 < len(value) <= LONGEST_ARRAY or not all(
+        isinstance(v, int | float | np.number) for v in value
+    ):
         return
     labels = getattr(message, "name", None) if not prefix else None
     named = isinstance(labels, list) and len(labels) == len(value)

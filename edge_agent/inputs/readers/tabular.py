@@ -22,7 +22,18 @@ from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 
 SUFFIXES: Final = (".csv", ".tsv", ".txt", ".parquet")
-TIMES: Final = ("t", "timestamp", "time", "time_s", "time_ms", "t_ms", "timestamp_ns", "zeit", "sec", "seconds")
+TIMES: Final = (
+    "t",
+    "timestamp",
+    "time",
+    "time_s",
+    "time_ms",
+    "t_ms",
+    "timestamp_ns",
+    "zeit",
+    "sec",
+    "seconds",
+)
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MOST_NAMES: Final = 20  # in an error
 RACECHRONO: Final = "racechrono"
@@ -50,18 +61,26 @@ def read_table(path: Path, time: str | None = None, time_unit: str | None = None
 def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -> Recording:
     table = pq.ParquetFile(path).read() if kind == "Parquet" else _csv(path)
     if not table.num_rows:
-        raise InputError("source", f"{path} has no rows", "give a recording with at least one sample")
+        raise InputError(
+            "source", f"{path} has no rows", "give a recording with at least one sample"
+        )
     if has_vbo_columns(table.column_names):
         found = {name: _numbers(table[name]) for name in table.column_names}
-        return convert_vbo(path, {name: values for name, values in found.items() if values is not None}, {})
+        return convert_vbo(
+            path, {name: values for name, values in found.items() if values is not None}, {}
+        )
     named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
-    t, start_ns = _seconds(table[named[column]], column, time_unit or (unit["unit"] if unit else None))
+    t, start_ns = _seconds(
+        table[named[column]], column, time_unit or (unit["unit"] if unit else None)
+    )
     back = np.flatnonzero(~(np.diff(t) >= 0.0))
     if len(back) or not np.isfinite(t[:1]).all():
         row = int(back[0]) + 1 if len(back) else 0
-        raise InputError(column, f"is missing or goes back at row {row}", "sort the recording by time")
+        raise InputError(
+            column, f"is missing or goes back at row {row}", "sort the recording by time"
+        )
     recording = Recording(path.name, {}, start_ns, rows=True)
     for name, whole in named.items():
         if name != column and (values := _numbers(table[whole])) is not None:
@@ -72,7 +91,9 @@ def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -
 
 def _csv(path: Path) -> pa.Table:
     with path.open("rb") as file:
-        lines = [file.readline(65_536).decode("utf-8", errors="replace") for _ in range(LONGEST_PREAMBLE)]
+        lines = [
+            file.readline(65_536).decode("utf-8", errors="replace") for _ in range(LONGEST_PREAMBLE)
+        ]
     if RACECHRONO in lines[0].lower():
         return _racechrono(path, lines)
     mark = max(",;\t", key=lines[0].count)
@@ -96,7 +117,9 @@ def _racechrono(path: Path, lines: list[str]) -> pa.Table:
     """
     place = next((k for k, line in enumerate(lines) if line.lower().startswith("timestamp,")), None)
     if place is None or place + 2 >= len(lines):
-        raise InputError("source", f"{path} is RaceChrono's, but not of CSV version 3", "export it as CSV v3")
+        raise InputError(
+            "source", f"{path} is RaceChrono's, but not of CSV version 3", "export it as CSV v3"
+        )
     rows = [line.rstrip("\r\n").split(",") for line in lines[place : place + 3]]
     names = rows[0]
     units = rows[1]
@@ -105,7 +128,11 @@ def _racechrono(path: Path, lines: list[str]) -> pa.Table:
     whole: list[str] = []
     for k, name in enumerate(names):
         unit = units[k].strip() if k < len(units) else ""
-        title = name if all(_plain(other) != name for other in whole) else f"{name} {sources[k].strip()}"
+        title = (
+            name
+            if all(_plain(other) != name for other in whole)
+            else f"{name} {sources[k].strip()}"
+        )
         whole.append(f"{title} [{unit}]" if unit and unit != "unix time" else title)
     options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_distinct(whole))
     return pc_csv.read_csv(path, read_options=options)
@@ -134,7 +161,9 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
         if whole is not None:
             return whole
         if given not in named:
-            raise InputError("time", f"{path} has no column {given}", f"choose of {', '.join(list(named)[:20])}")
+            raise InputError(
+                "time", f"{path} has no column {given}", f"choose of {', '.join(list(named)[:20])}"
+            )
         return given
     lower = {name.lower(): name for name in reversed(named)}
     for name in TIMES:
@@ -144,7 +173,9 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
         if "time" in _WORD.findall(name.lower()):
             return name
     seen = ", ".join(list(named)[:MOST_NAMES])
-    raise InputError("time", f"{path} has no column of time among {seen}", 'name it in the profile as "time"')
+    raise InputError(
+        "time", f"{path} has no column of time among {seen}", 'name it in the profile as "time"'
+    )
 
 
 def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
@@ -166,12 +197,20 @@ def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int 
     first = float(raw[0]) * factor
     exact = (raw - raw[0]) * factor if factor != 1.0 or abs(first) > NS / 10 else raw * 1.0
     dated = 946_684_800.0 < first < 4_102_444_800.0  # between 2000 and 2100, counted from 1970
-    start = int(raw[0]) if dated and unit == "ns" and pa.types.is_integer(column.type) else round(first * NS)
+    start = (
+        int(raw[0])
+        if dated and unit == "ns" and pa.types.is_integer(column.type)
+        else round(first * NS)
+    )
     t: FloatArray = np.asarray(exact, dtype=np.float64)
     return (t - t[0] if dated else t), start if dated else None
 
 
 def _numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow columns are not generic
-    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_boolean(column.type)):
+    if not (
+        pa.types.is_integer(column.type)
+        or pa.types.is_floating(column.type)
+        or pa.types.is_boolean(column.type)
+    ):
         return None
     return np.array(pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)

@@ -35,7 +35,10 @@ ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and
 NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
 BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
-LEAST_CAME, LEAST_KM = 100, 1000.0  # fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
+LEAST_CAME, LEAST_KM = (
+    100,
+    1000.0,
+)  # fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
 START_NS: Final = 1_800_000_000 * NS
 
 
@@ -111,7 +114,8 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
         beside = _least_beside(fleet, float(t[-1, 0]))
         for k, track in enumerate(tracks):
             latitude, longitude, yaw = (
-                float(column[-1, k]) for column in (located.latitude, located.longitude, located.yaw)
+                float(column[-1, k])
+                for column in (located.latitude, located.longitude, located.yaw)
             )
             pose = Pose(latitude, longitude, yaw, float(true.vx[-1, k]), START_NS + second * NS)
             track.metre.append(float(driven[k]))
@@ -128,12 +132,19 @@ def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
     """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it is at t [s]."""
     true, every = fleet.truth, round(RATE_HZ / BESIDE_HZ)
     x, y, yaw = true.x[::every], true.y[::every], true.yaw[::every]
-    lanes = [(x - side * np.sin(yaw), y + side * np.cos(yaw)) for side in (-BESIDE_M, 0.0, BESIDE_M)]
-    found = [fleet.scenario.friction(t, *(column.ravel() for column in lane)).reshape(x.shape) for lane in lanes]
+    lanes = [
+        (x - side * np.sin(yaw), y + side * np.cos(yaw)) for side in (-BESIDE_M, 0.0, BESIDE_M)
+    ]
+    found = [
+        fleet.scenario.friction(t, *(column.ravel() for column in lane)).reshape(x.shape)
+        for lane in lanes
+    ]
     return np.asarray(np.min(found, axis=(0, 1)))
 
 
-def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: LocalMap, *, routed: bool) -> list[Path]:
+def _ways(
+    fleet: SimulatedFleet, k: int, pose: Pose, known: LocalMap, *, routed: bool
+) -> list[Path]:
     length = horizon_length(pose.speed)
     if routed:
         given = GivenRoute(*fleet.route_ahead(k, length + 50.0)).ahead(pose, length)
@@ -155,7 +166,9 @@ def _look(track: _Track, pose: Pose, known: LocalMap, ways: list[Path]) -> None:
 
 
 def _judge(track: _Track, counts: Approaches) -> None:
-    metre, speed, mu, beside = (np.array(column) for column in (track.metre, track.speed, track.mu, track.beside))
+    metre, speed, mu, beside = (
+        np.array(column) for column in (track.metre, track.speed, track.mu, track.beside)
+    )
     slippery = mu < ALERTED
     for look in np.flatnonzero(slippery[1:] & ~slippery[:-1]) + 1:
         far = metre[look] - metre
@@ -163,7 +176,9 @@ def _judge(track: _Track, counts: Approaches) -> None:
         if look < SETTLE_S or not before.any() or (mu[before] < NEAR_SLIPPERY).any():
             continue
         counts.came += 1
-        start = float(metre[look - 1])  # the ice begins after the look before, at the latest by this one
+        start = float(
+            metre[look - 1]
+        )  # the ice begins after the look before, at the latest by this one
         standing = (one.at for one in track.raised.values() if one.at < look < one.ended)
         late = min((_short(metre, speed, mu, at, start) for at in standing), default=float("inf"))
         counts.warned += late <= 0.0

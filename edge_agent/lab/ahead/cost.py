@@ -43,7 +43,10 @@ def streets() -> IntArray:
     found = []
     for offset, sectors in ((2.0, (0, 1)), (-2.0, (2, 3))):
         for along_x, sector in zip((True, False), sectors, strict=True):
-            a, b = (grid_.ravel() for grid_ in np.meshgrid(side, line + (-offset if along_x else offset)))
+            a, b = (
+                grid_.ravel()
+                for grid_ in np.meshgrid(side, line + (-offset if along_x else offset))
+            )
             cell = grid.cell_of(*to_degrees(*((a, b) if along_x else (b, a)), CENTRE))
             found.append(np.unique(cell) * grid.SECTORS + sector)
     return np.unique(np.concatenate(found))
@@ -71,13 +74,20 @@ def figures(seed: int, metres: float) -> list[Figure]:
     for routed, ending in ((True, ""), (False, ".unrouted")):
         megabytes, share = drive(np.random.default_rng(seed), known, metres, routed=routed)
         out += [
-            Figure(f"ahead.mb_per_day{ending}", megabytes * 1e3 * DAY_KM / metres, "MB", 5 if routed else None),
+            Figure(
+                f"ahead.mb_per_day{ending}",
+                megabytes * 1e3 * DAY_KM / metres,
+                "MB",
+                5 if routed else None,
+            ),
             Figure(f"ahead.core_share{ending}", share, "of a core", 0.01 if routed else None),
         ]
     return out
 
 
-def drive(rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool) -> tuple[float, float]:
+def drive(
+    rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
+) -> tuple[float, float]:
     """Megabytes heard, and processor time over time driven."""
     corners = way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
@@ -96,8 +106,14 @@ def drive(rng: np.random.Generator, known: IntArray, metres: float, *, routed: b
         paths: list[Path] = []
         if routed and (given := route.ahead(pose, length + FURTHER_M)) is not None:
             paths = [given]
-        paths = paths or ways_on(pose, heard.keys(), length + FURTHER_M) or [straight_path(pose, length)]
-        active, _ = update_warnings(active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard)
+        paths = (
+            paths
+            or ways_on(pose, heard.keys(), length + FURTHER_M)
+            or [straight_path(pose, length)]
+        )
+        active, _ = update_warnings(
+            active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard
+        )
         tiles.follow([path.near(length) for path in paths], pose)
         boxes = [box for path in paths for box in asked.wanting(path, pose, length)]
         spent += time.process_time() - began

@@ -77,7 +77,13 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     both = np.array([pair for pairs in delays.values() for pair in pairs]).reshape(-1, 2)
     out.append(Figure("prior.wrong_map_delay_ratio", _ratio(both), "", 1.2))
     for name, pairs in delays.items():
-        out.append(Figure(f"prior.wrong_map_delay_ratio.{name}_there", _ratio(np.array(pairs).reshape(-1, 2)), ""))
+        out.append(
+            Figure(
+                f"prior.wrong_map_delay_ratio.{name}_there",
+                _ratio(np.array(pairs).reshape(-1, 2)),
+                "",
+            )
+        )
         out.append(Figure(f"prior.wrong_map.{name}_there", len(pairs), "stretches"))
     return [*out, Figure("prior.evidence_nats", nats, "nat", 0.5)]
 
@@ -99,7 +105,10 @@ def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None)
             raise RuntimeError("the default estimator tells no belief")
         if prior is not None:
             now = START_NS
-            map_beliefs = {k: _belief(prior, int(pipeline.places[k]), now) for k in informed.enters(pipeline.places)}
+            map_beliefs = {
+                k: _belief(prior, int(pipeline.places[k]), now)
+                for k in informed.enters(pipeline.places)
+            }
             informed.step(pipeline.places, *beliefs, map_beliefs)
         columns.append((pipeline.places, *beliefs, fleet.truth.mu_wheel[-1].mean(axis=1)))
     place, own, visit, truth = (np.stack(column) for column in zip(*columns, strict=True))
@@ -115,13 +124,17 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 
-def arrivals(trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int) -> list[tuple[float, float]]:
+def arrivals(
+    trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
+) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
     differ = _differ(trace.place, wrong, right, now)
     with_prior, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
     out = []
     for k in range(trace.place.shape[1]):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8)))
+        edges = np.flatnonzero(
+            np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8))
+        )
         for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             if last - first < RATE_HZ / BLOCK:  # less than a second there
                 continue
@@ -144,7 +157,10 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
     count = min(len(other), len(trace.published))
     if not count:
         return float("nan")
-    pairs = (np.frombuffer(b"".join(rows[:count]), np.uint8).astype(np.float64) for rows in (other, trace.published))
+    pairs = (
+        np.frombuffer(b"".join(rows[:count]), np.uint8).astype(np.float64)
+        for rows in (other, trace.published)
+    )
     a, b = pairs
     return float(np.abs(a - b).max()) / mugrid.STEPS_PER_NAT
 
@@ -195,4 +211,8 @@ def _with_fake_ice(scenario: Scenario, t: float, rng: np.random.Generator) -> Kn
 
 
 def _ratio(pairs: FloatArray) -> float:
-    return float(pairs[:, 0].sum() / pairs[:, 1].sum()) if len(pairs) and pairs[:, 1].sum() > 0.0 else float("nan")
+    return (
+        float(pairs[:, 0].sum() / pairs[:, 1].sum())
+        if len(pairs) and pairs[:, 1].sum() > 0.0
+        else float("nan")
+    )

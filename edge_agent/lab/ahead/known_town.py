@@ -40,11 +40,16 @@ def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None)
     """What a car has heard that was told of all places, by the truth, or off it by chance."""
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)
-    lower, upper = np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER), np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER)
+    lower, upper = (
+        np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER),
+        np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER),
+    )
     slippery = np.clip(0.5 + (SLIPPERY_MU - mu) / (3.0 * SPREAD), 0.0, 1.0)
     belief, cache = belief_of(lower, mu, upper, slippery), LocalMap(most_cells=1 << 20)
     n = len(places.key)
-    cells = ReceivedCells(places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now)))
+    cells = ReceivedCells(
+        places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now))
+    )
     tiles = grid.tile_of(places.key // grid.SECTORS)
     for tile in np.unique(tiles).tolist():
         cache.take(tile, ReceivedCells._make(column[tiles == tile] for column in cells), now)

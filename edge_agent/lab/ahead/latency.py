@@ -70,7 +70,9 @@ def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
 def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[float], float, int]:
     """Seconds of each alert, share of a core per car, and alerts that no warning came of."""
     names = [f"car-{k:04d}" for k in range(vehicles)]
-    warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {name: queue.Queue() for name in names}
+    warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {
+        name: queue.Queue() for name in names
+    }
 
     def hear(name: str, warning: GripWarning) -> None:
         warned[name].put((time.perf_counter(), warning))
@@ -83,7 +85,11 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
 
     waited: list[float] = []
     lost = 0
-    with router() as settings, MadeUpService(settings, time.time_ns()) as service, ExitStack() as stack:
+    with (
+        router() as settings,
+        MadeUpService(settings, time.time_ns()) as service,
+        ExitStack() as stack,
+    ):
         lookout = Lookout(names, hear)
         for name in names:
             session = open_session(settings)
@@ -125,5 +131,16 @@ def _ice(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:
     cell = int(grid.cell_of(latitude, longitude)[0])
     middle = grid.centre(cell)
     return Alert(
-        cell, 0, raised, time.time_ns() - NS, 0.15, 0.1, 0.22, 0.98, 3, float(middle[0]), float(middle[1]), "made up"
+        cell,
+        0,
+        raised,
+        time.time_ns() - NS,
+        0.15,
+        0.1,
+        0.22,
+        0.98,
+        3,
+        float(middle[0]),
+        float(middle[1]),
+        "made up",
     )

@@ -34,9 +34,9 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
         "safe_deceleration": GRAVITY * lower,
     } | changes  # fmt: skip
-    table = pa.table({f.name: pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA}).cast(
-        tables.MAP_SCHEMA
-    )
+    table = pa.table(
+        {f.name: pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA}
+    ).cast(tables.MAP_SCHEMA)
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, tables.MAP_SCHEMA) as writer:
         writer.write_table(table)
@@ -62,8 +62,12 @@ class MadeUpService:
         session = open_session(self.settings)
         assert session is not None
         self.session = session
-        self._map = session.declare_queryable(f"{keys.ROOT}/map/*/*/*/*", self._answer, complete=True)
-        self._alerts = session.declare_queryable(f"{keys.ROOT}/alert/*/*/*/*", self._stand, complete=True)
+        self._map = session.declare_queryable(
+            f"{keys.ROOT}/map/*/*/*/*", self._answer, complete=True
+        )
+        self._alerts = session.declare_queryable(
+            f"{keys.ROOT}/alert/*/*/*/*", self._stand, complete=True
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -72,7 +76,9 @@ class MadeUpService:
     def put(self, alert: Alert) -> None:
         """Raise or end an alert."""
         tile = int(grid.tile_of(alert.cell))
-        self.session.put(keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING)
+        self.session.put(
+            keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING
+        )
 
     def tile(self, key: IntArray, mu: FloatArray) -> bytes:
         """What it answers for places of a tile."""
@@ -84,7 +90,9 @@ class MadeUpService:
             self.asked.append(str(asked.selector))
             box = query.parse(dict(asked.parameters)).bbox  # type: ignore[call-overload]
             for tile, key in _by_tile(np.array(sorted(self.mu), np.int64)).items():
-                inside = key if box is None else key[grid.touches(box, grid.bounds(key // grid.SECTORS))]
+                inside = (
+                    key if box is None else key[grid.touches(box, grid.bounds(key // grid.SECTORS))]
+                )
                 if len(inside) and asked.key_expr.intersects(zenoh.KeyExpr(keys.map_key(tile))):
                     mu = np.array([self.mu[k] for k in inside.tolist()])
                     asked.reply(keys.map_key(tile), self.tile(inside, mu), encoding=wire.ARROW)
@@ -97,7 +105,11 @@ class MadeUpService:
             for tile in {int(grid.tile_of(alert.cell)) for alert in standing}:
                 if asked.key_expr.intersects(zenoh.KeyExpr(keys.alert_key(tile))):
                     there = [alert for alert in standing if int(grid.tile_of(alert.cell)) == tile]
-                    asked.reply(keys.alert_key(tile), wire.encode_standing(there), encoding=wire.STANDING_ENCODING)
+                    asked.reply(
+                        keys.alert_key(tile),
+                        wire.encode_standing(there),
+                        encoding=wire.STANDING_ENCODING,
+                    )
 
 
 def _by_tile(key: IntArray) -> dict[int, IntArray]:

@@ -67,7 +67,9 @@ def false_per_hour(results: Results) -> float:
 
 def both_stops(results: Results) -> float:
     """Coverage over the anti-lock stops on dry road and on snow."""
-    return 0.5 * (of("default.abs.dry", "coverage90")(results) + of("default.abs.snow", "coverage90")(results))
+    return 0.5 * (
+        of("default.abs.dry", "coverage90")(results) + of("default.abs.snow", "coverage90")(results)
+    )
 
 
 def on_foreign_tyres(results: Results) -> float:
@@ -88,7 +90,9 @@ BARS: Final = (
         for name, unit, bar in (("vx", M_S, 0.002), ("vy", M_S, 0.007), ("yaw_rate", RAD_S, 0.002))
     ),
     EstimatorBar("default.dlc.mu_error", of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
-    EstimatorBar("default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"),
+    EstimatorBar(
+        "default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"
+    ),
     EstimatorBar("papers.001.rmse_vx", of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
     EstimatorBar("papers.001.rmse_vy", of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
     EstimatorBar("papers.001.rmse_beta", of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
@@ -99,23 +103,33 @@ BARS: Final = (
     EstimatorBar("papers.003.accel.mu_error", of("003.accel", "mu_error"), SHARE, 0.08, "less"),
     EstimatorBar("papers.003.turn.mu_error", of("003.turn", "mu_error"), SHARE, 0.05, "less"),
     EstimatorBar("papers.003.split.low_error", of("003.split", "low_error"), SHARE, 0.07, "less"),
-    EstimatorBar("papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"),
+    EstimatorBar(
+        "papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"
+    ),
     EstimatorBar("papers.000.coverage90", of("000.jump", "coverage90"), SHARE, 0.87, "more"),
     EstimatorBar("default.jump.accel_s", of("default.jump.accel", "arrival_s"), "s", 0.1, "less"),
     EstimatorBar("default.jump.brake_s", of("default.jump.brake", "arrival_s"), "s", 0.25, "less"),
     EstimatorBar("default.jump.false_per_hour", false_per_hour, "1/h", 1.0, "less"),
     EstimatorBar("default.straight.width_ratio", width_ratio, SHARE, 0.8, "more"),
-    EstimatorBar("default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"),
+    EstimatorBar(
+        "default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"
+    ),
     EstimatorBar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
     EstimatorBar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
     EstimatorBar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
-    EstimatorBar("real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"),
+    EstimatorBar(
+        "real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"
+    ),
     EstimatorBar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
-    EstimatorBar("real_world.false_ice.of_all", in_the_world("false_ice.of_all"), SHARE, 0.002, "less"),
+    EstimatorBar(
+        "real_world.false_ice.of_all", in_the_world("false_ice.of_all"), SHARE, 0.002, "less"
+    ),
     EstimatorBar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),
     EstimatorBar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
     *(
-        EstimatorBar(f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more")
+        EstimatorBar(
+            f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more"
+        )
         for name in (*SURFACES, "excited")
     ),
     EstimatorBar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
@@ -143,7 +157,11 @@ def unit_of(measure: str) -> str:
     """Unit of a measure, by the end of its name."""
     if measure.startswith("coverage90"):
         return SHARE
-    whole = (unit for end, unit in UNITS.items() if measure == end or measure.endswith((f"_{end}", f".{end}")))
+    whole = (
+        unit
+        for end, unit in UNITS.items()
+        if measure == end or measure.endswith((f"_{end}", f".{end}"))
+    )
     return next(whole, SHARE)
 
 
@@ -162,10 +180,14 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
     for name, errors in results.oracle.items():
         listed.append(Figure(f"oracle.{name}", mean(errors), unit_of(name)))
     for estimator, values in results.world.items():
-        listed += [Figure(f"world.{estimator}.{name}", value, unit_of(name)) for name, value in values.items()]
+        listed += [
+            Figure(f"world.{estimator}.{name}", value, unit_of(name))
+            for name, value in values.items()
+        ]
     listed += _consistency(results)
     return listed + [
-        Figure(f"foreign.{kind}.coverage90", mean(value), SHARE) for kind, value in results.foreign.items()
+        Figure(f"foreign.{kind}.coverage90", mean(value), SHARE)
+        for kind, value in results.foreign.items()
     ]
 
 
@@ -177,7 +199,9 @@ def _consistency(results: Results) -> list[Figure]:
             listed.append(Figure(f"bounds.{measure}.{end}", value, SHARE))
     for estimator, parts in results.ranks.items():
         for level, share in zip(LEVELS, shares(np.concatenate(parts)), strict=True):
-            listed.append(Figure(f"reliability.{estimator}.below_{100 * level:02.0f}", float(share), SHARE))
+            listed.append(
+                Figure(f"reliability.{estimator}.below_{100 * level:02.0f}", float(share), SHARE)
+            )
     return listed
 
 
@@ -186,5 +210,7 @@ def _context(prefix: str, found: dict[str, FloatArray]) -> list[Figure]:
     for measure, values in found.items():
         listed.append(Figure(f"{prefix}.{measure}", mean(values), unit_of(measure)))
         if len(values) > 1:
-            listed.append(Figure(f"{prefix}.{measure}.sd", float(np.std(values, ddof=1)), unit_of(measure)))
+            listed.append(
+                Figure(f"{prefix}.{measure}.sd", float(np.std(values, ddof=1)), unit_of(measure))
+            )
     return listed

@@ -17,8 +17,12 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
-USUAL = "mems-leak"  # accelerometers are fixed to the body, and feel gravity when it rolls and pitches
-FINE_HZ = 500.0  # steering is held over a sample of the simulator; a slow sensor must not see it as steps
+USUAL = (
+    "mems-leak"  # accelerometers are fixed to the body, and feel gravity when it rolls and pitches
+)
+FINE_HZ = (
+    500.0  # steering is held over a sample of the simulator; a slow sensor must not see it as steps
+)
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,9 @@ class DriveSet:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL) -> DriveSet:
+def realistic(
+    scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
+) -> DriveSet:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
 
@@ -75,7 +81,9 @@ def ideal(scenario: DriveSpec) -> DriveSet:
     return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
 
 
-def _drive(scenario: DriveSpec, seed: int, sensors: str | Sensors, step: int) -> tuple[pa.Table, Vehicle]:
+def _drive(
+    scenario: DriveSpec, seed: int, sensors: str | Sensors, step: int
+) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
         scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
         duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,
@@ -88,18 +96,28 @@ def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
     """Drives of one length side by side."""
 
     def column(name: str) -> FloatArray:
-        return np.stack([log[name].to_numpy(zero_copy_only=False) for log, _ in drives], axis=1).astype(float)
+        return np.stack(
+            [log[name].to_numpy(zero_copy_only=False) for log, _ in drives], axis=1
+        ).astype(float)
 
     names = [name for name in drives[0][0].column_names if name.startswith("true_")]
     signals = np.stack([column(name) for name in CHANNELS], axis=-1)
-    return DriveSet(column("t"), signals, {name: column(name) for name in names}, [vehicle for _, vehicle in drives])
+    return DriveSet(
+        column("t"),
+        signals,
+        {name: column(name) for name in names},
+        [vehicle for _, vehicle in drives],
+    )
 
 
 def repeated(batch: DriveSet, count: int) -> DriveSet:
     """The one drive of a batch `count` times, for noise to be laid on it."""
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
     return DriveSet(
-        np.repeat(batch.t, count, axis=1), np.repeat(batch.signals, count, axis=1), truth, batch.vehicles * count
+        np.repeat(batch.t, count, axis=1),
+        np.repeat(batch.signals, count, axis=1),
+        truth,
+        batch.vehicles * count,
     )
 
 

@@ -76,17 +76,25 @@ def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
     size = len(t) // DRIVES
     parts = [slice(k * size, (k + 1) * size) for k in range(DRIVES)]
     learned = [
-        vehicle.model_copy(update={"calibration": learn([(t[p, n], signals[p, n]) for p in parts], vehicle)})
+        vehicle.model_copy(
+            update={"calibration": learn([(t[p, n], signals[p, n]) for p in parts], vehicle)}
+        )
         for n, vehicle in enumerate(fleet.vehicles)
     ]
     t, signals, mu = _driven(fleet, judged_s)
     judged = slice(round(SETTLED_S * RATE_HZ), None)
     found = []
     for vehicles in (fleet.vehicles, learned):
-        mended = np.stack([corrected(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)], axis=1)
+        mended = np.stack(
+            [corrected(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)],
+            axis=1,
+        )
         estimated = bank_of(ESTIMATOR, vehicles).advance(t, mended)
         inside = (estimated.mu_lower <= mu) & (mu <= estimated.mu_upper)
-        found += [float((estimated.mu_upper - estimated.mu_lower)[judged].mean()), float(inside[judged].mean())]
+        found += [
+            float((estimated.mu_upper - estimated.mu_lower)[judged].mean()),
+            float(inside[judged].mean()),
+        ]
     return Narrowed(*found)
 
 
@@ -102,8 +110,13 @@ def _driven(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
     """Width with calibration over without, and both coverages."""
-    groups = [narrowed(min(CARS_AT_ONCE, cars - k), seed + k, judged_s) for k in range(0, cars, CARS_AT_ONCE)]
-    plain, plain_coverage, width, coverage = (float(np.mean(column)) for column in zip(*groups, strict=True))
+    groups = [
+        narrowed(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
+        for k in range(0, cars, CARS_AT_ONCE)
+    ]
+    plain, plain_coverage, width, coverage = (
+        float(np.mean(column)) for column in zip(*groups, strict=True)
+    )
     return [
         Figure("calibration.width_ratio", width / plain, "1", 0.8), Figure("calibration.width", width, "1"),
         Figure("calibration.coverage", coverage, "1", 0.88, "more"),
@@ -116,7 +129,9 @@ def figures(cars: int, seed: int) -> list[Figure]:
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):
         at = seed + first // CARS_AT_ONCE
-        for car, drive in enumerate(drives(min(CARS_AT_ONCE, cars - first), at, rough=True, seconds=DRIVES * DRIVE_S)):
+        for car, drive in enumerate(
+            drives(min(CARS_AT_ONCE, cars - first), at, rough=True, seconds=DRIVES * DRIVE_S)
+        ):
             size = len(drive.t) // DRIVES
             parts = [slice(k * size, (k + 1) * size) for k in range(DRIVES)]
             learned = learn([(drive.t[part], drive.signals[part]) for part in parts], drive.vehicle)
@@ -125,6 +140,12 @@ def figures(cars: int, seed: int) -> list[Figure]:
                     key = "radius" if name.startswith("radius") else name
                     away.setdefault(key, []).append((estimate[0] - value) / estimate[1])
     return [
-        Figure(f"calibration.errors.{name}", float(np.sqrt(np.mean(np.square(values)))), "1", (0.7, 1.3), "within")
+        Figure(
+            f"calibration.errors.{name}",
+            float(np.sqrt(np.mean(np.square(values)))),
+            "1",
+            (0.7, 1.3),
+            "within",
+        )
         for name, values in away.items()
     ]

@@ -8,7 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
+from edge_agent.estimators import (
+    ESTIMATORS,
+    Estimates,
+    EstimatorBank,
+    adaptive_federated_ckf,
+    compensated_wckf,
+)
 from edge_agent.lab.evaluation import faults, oracle, real_world, worth
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeated
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
@@ -39,14 +45,26 @@ class Results:
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
-    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # paper 004's experiments
-    foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
-    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
-    world: dict[str, dict[str, float]] = field(default_factory=dict)  # the rough one: by estimator and "baseline"
-    oracle: dict[str, FloatArray] = field(default_factory=dict)  # errors that an oracle makes, by figure
+    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(
+        default_factory=dict
+    )  # paper 004's experiments
+    foreign: dict[str, FloatArray] = field(
+        default_factory=dict
+    )  # coverage of the default, by kind of tyre
+    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(
+        default_factory=dict
+    )  # by (fault, estimator)
+    world: dict[str, dict[str, float]] = field(
+        default_factory=dict
+    )  # the rough one: by estimator and "baseline"
+    oracle: dict[str, FloatArray] = field(
+        default_factory=dict
+    )  # errors that an oracle makes, by figure
     worth: worth.Scores = field(default_factory=dict)  # of fuzzy inference and the ants
     rough: RealWorldResults | None = None  # its first town, kept for plots
-    ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
+    ranks: dict[str, list[FloatArray]] = field(
+        default_factory=dict
+    )  # of the truth in the posterior, by estimator
     seeds: int = 0
     drives: dict[tuple[str, str], PlottedDrive] = field(default_factory=dict)
 
@@ -66,22 +84,31 @@ def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -
         exact = repeated(ideal(scenario), 1) if name in PAPERS and not quick else None
         for estimator in names if name in PAPERS else (DEFAULT,):
             reported, ranks = watched(bank_of(estimator, batch.vehicles), batch)
-            results.real[name, estimator] = _all(name, batch, reported) | consistency(batch, reported)
+            results.real[name, estimator] = _all(name, batch, reported) | consistency(
+                batch, reported
+            )
             results.ranks.setdefault(estimator, []).append(ranks.ravel())
             results.drives[name, estimator] = PlottedDrive(batch, reported)
             if exact is not None:
-                results.ideal[name, estimator] = _all(name, exact, estimates(_as_in_paper(estimator, exact), exact))
+                results.ideal[name, estimator] = _all(
+                    name, exact, estimates(_as_in_paper(estimator, exact), exact)
+                )
         log_line(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
     manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
     results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
     log_line(f"{len(faults.CASES) - 1} sensor faults")
     results.rough = real_world.campaign(seeds, names, quick=quick)
     results.world = results.rough.found
-    log_line(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
+    log_line(
+        f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes"
+    )
     results.worth = worth.campaign(seeds, quick=quick)
     log_line("what fuzzy inference and the ant colony bring")
     if not quick:
-        results.oracle = {"002.sine.rmse_vx": oracle.speed(seeds), "003.accel.mu_error": oracle.friction(seeds)[0]}
+        results.oracle = {
+            "002.sine.rmse_vx": oracle.speed(seeds),
+            "003.accel.mu_error": oracle.friction(seeds)[0],
+        }
         log_line("what an oracle makes of two of the papers' manoeuvres")
         results.foreign = _foreign_tyres(seeds, log_line)
     return results

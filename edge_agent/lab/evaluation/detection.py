@@ -87,11 +87,17 @@ class DetectionTally:
 
     def rate(self, over: str, under: str) -> float:
         """Return the sum of one name over that of another; NaN without the other."""
-        return self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
+        return (
+            self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
+        )
 
     def quantile(self, name: str, share: float) -> float:
         """Return a quantile of the seconds by name; NaN of nothing."""
-        return float(np.quantile(self.seconds[name], share)) if self.seconds.get(name) else float("nan")
+        return (
+            float(np.quantile(self.seconds[name], share))
+            if self.seconds.get(name)
+            else float("nan")
+        )
 
 
 def runs_of(on: NDArray[np.bool_]) -> Stretches:
@@ -146,7 +152,9 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
         among = (mu > above) & (mu <= most)
         tally.add(f"coverage90.{name}", inside[among & apart])
         tally.add(f"coverage90.{name}.stood", inside[among & ~apart])
-        score = interval_score(drive.lower.astype(np.float64), drive.upper.astype(np.float64), mu.astype(np.float64))
+        score = interval_score(
+            drive.lower.astype(np.float64), drive.upper.astype(np.float64), mu.astype(np.float64)
+        )
         tally.add(f"score.{name}", score[among & apart])
     ice, called, grips = (mu <= ICE_MU) & apart, drive.upper < SLIPPERY_MU, mu > SNOW_MU
     tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
@@ -179,12 +187,18 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
                 continue
             tally.note(f"passes.{kind}", holds=bool(called.any()))
             tally.note(f"flag.passes.{kind}", holds=bool(flag.any()))
-            tally.note(f"controller.passes.{kind}", holds=bool(drive.controlled[first:end, n].any()))
+            tally.note(
+                f"controller.passes.{kind}", holds=bool(drive.controlled[first:end, n].any())
+            )
             tally.note(f"either.passes.{kind}", holds=bool(flag.any() or called.any()))
             for nats in ROC_NATS:
-                tally.note(f"roc.{nats:g}.{kind}", holds=bool((drive.favoured[first:end, n] > nats).any()))
+                tally.note(
+                    f"roc.{nats:g}.{kind}", holds=bool((drive.favoured[first:end, n] > nats).any())
+                )
             for mu in ROC_FLAG_MU:
-                tally.note(f"flag.{mu:g}.{kind}", holds=bool((drive.flagged[first:end, n] < mu).any()))
+                tally.note(
+                    f"flag.{mu:g}.{kind}", holds=bool((drive.flagged[first:end, n] < mu).any())
+                )
             slid = next(((max(a, first), b) for a, b in slides if b > first and a < end), None)
             if slid is None:
                 continue
@@ -212,7 +226,9 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
         tally.note("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
 
 
-def _judge_contradictions(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches) -> None:
+def _judge_contradictions(
+    tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
+) -> None:
     """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds of each without it."""
     sliding, extended = np.zeros(len(drive.mu), np.bool_), np.zeros(len(drive.mu), np.bool_)
     for first, end in slides:
@@ -234,7 +250,10 @@ def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) ->
     """Settled false events of the estimator, of its belief at each threshold, and of the slip flag."""
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~lately(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
-    ways = {"false_events": drive.upper[:, n] < SLIPPERY_MU, "flag.false_events": drive.flagged[:, n] < FLAGGED_MU}
+    ways = {
+        "false_events": drive.upper[:, n] < SLIPPERY_MU,
+        "flag.false_events": drive.flagged[:, n] < FLAGGED_MU,
+    }
     ways |= {f"roc.{nats:g}.false_events": drive.favoured[:, n] > nats for nats in ROC_NATS}
     ways |= {f"flag.{mu:g}.false_events": drive.flagged[:, n] < mu for mu in ROC_FLAG_MU}
     for name, called in ways.items():
@@ -242,7 +261,9 @@ def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) ->
         tally.add(name, np.array([float(len(events))]))
 
 
-def _judge_visits(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches, *, oracle: bool) -> None:
+def _judge_visits(
+    tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches, *, oracle: bool
+) -> None:
     visits = drive.visits
     for v in np.flatnonzero(visits.vehicle == n):
         now = slice(int(visits.first[v]), int(visits.last[v]) + 1)
@@ -255,7 +276,9 @@ def _judge_visits(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
         if float(np.ptp(mu)) >= MOVES or float(mu.mean()) > SNOW_MU:
             continue
         kind = "ice" if float(mu.mean()) <= ICE_MU else "snow"
-        slid = any(min(b, now.stop) - max(a, now.start) >= round(SLIDE_S * RATE_HZ) for a, b in slides)
+        slid = any(
+            min(b, now.stop) - max(a, now.start) >= round(SLIDE_S * RATE_HZ) for a, b in slides
+        )
         if not slid and float(drive.used[now, n].max()) <= EXCITED_SHARE:
             continue
         apart = ".stood" if drive.stood[now, n].any() else ""
@@ -268,7 +291,9 @@ def _judge_visits(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
             _note_visit(tally, f"oracle.{kind}.", found, (slid, apart))
 
 
-def _note_visit(tally: DetectionTally, kind: str, likelihood: FloatArray, slid: tuple[bool, str]) -> None:
+def _note_visit(
+    tally: DetectionTally, kind: str, likelihood: FloatArray, slid: tuple[bool, str]
+) -> None:
     value = bool(likelihood.max() - likelihood[-1] >= VALUE_NATS)
     favoured = bool(slippery_favoured(likelihood) >= FAVOURED_NATS)
     for among in ("", ".slide") if slid[0] else ("", ".calm"):
@@ -293,7 +318,9 @@ class DetectionResults:
         """Add a town."""
         self.towns.setdefault((length, kind), []).append(town)
 
-    def pool_towns(self, lengths: Sequence[str], kind: str, *, winter: bool | None = None) -> DetectionTally:
+    def pool_towns(
+        self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
+    ) -> DetectionTally:
         """Return all towns of a kind together, or the winter towns, or the others."""
         found = DetectionTally()
         for length in lengths:

@@ -56,14 +56,42 @@ PER_1000_KM, PER_1000_S = "per 1000 km", "per 1000 s"
 DETECTION: Final = (
     DetectionBar("ice.yield.long", "long", mean_of("ice.yield"), SHARE, (0.60, 0.58)),
     DetectionBar("ice.yield.slide.long", "long", mean_of("ice.yield.slide"), SHARE, (0.80, 0.90)),
-    DetectionBar("ice.favoured.slide.short", "short", mean_of("ice.favoured.slide"), SHARE, (0.86, 0.90)),
-    DetectionBar("ice.passes.long", "long", mean_of("passes.ice"), SHARE, (0.80, 0.80)),
-    DetectionBar("ice.seconds.median", "short", seconds_of("seconds.ice.braking", 0.5), "s", (0.20, 0.20), "less"),
-    DetectionBar("ice.seconds.p90", "short", seconds_of("seconds.ice.braking", 0.9), "s", (0.6, 0.6), "less"),
-    DetectionBar("slide.told.short.all_wheels", "short", mean_of("slide.told.all_wheels"), SHARE, (0.92, 0.92)),
-    DetectionBar("slide.told.short.some_wheels", "short", mean_of("slide.told.some_wheels"), SHARE, (0.72, 0.72)),
     DetectionBar(
-        "contradiction.per_1000s_slide", "", rate_of("contradictions.slide", "s.slide"), PER_1000_S, (10, 10), "less"
+        "ice.favoured.slide.short", "short", mean_of("ice.favoured.slide"), SHARE, (0.86, 0.90)
+    ),
+    DetectionBar("ice.passes.long", "long", mean_of("passes.ice"), SHARE, (0.80, 0.80)),
+    DetectionBar(
+        "ice.seconds.median",
+        "short",
+        seconds_of("seconds.ice.braking", 0.5),
+        "s",
+        (0.20, 0.20),
+        "less",
+    ),
+    DetectionBar(
+        "ice.seconds.p90", "short", seconds_of("seconds.ice.braking", 0.9), "s", (0.6, 0.6), "less"
+    ),
+    DetectionBar(
+        "slide.told.short.all_wheels",
+        "short",
+        mean_of("slide.told.all_wheels"),
+        SHARE,
+        (0.92, 0.92),
+    ),
+    DetectionBar(
+        "slide.told.short.some_wheels",
+        "short",
+        mean_of("slide.told.some_wheels"),
+        SHARE,
+        (0.72, 0.72),
+    ),
+    DetectionBar(
+        "contradiction.per_1000s_slide",
+        "",
+        rate_of("contradictions.slide", "s.slide"),
+        PER_1000_S,
+        (10, 10),
+        "less",
     ),
     DetectionBar(
         "contradiction.elsewhere",
@@ -80,7 +108,9 @@ DETECTION: Final = (
     DetectionBar("coverage90.dry.short", "short", mean_of("coverage90.dry"), SHARE, (0.87, 0.87)),
     DetectionBar("false_ice.short", "short", mean_of("false_ice"), SHARE, (0.0015, 0.0015), "less"),
     DetectionBar("false_ice.long", "long", mean_of("false_ice"), SHARE),
-    DetectionBar("false_events.short", "short", rate_of("false_events", "km"), PER_1000_KM, (70, 70), "less"),
+    DetectionBar(
+        "false_events.short", "short", rate_of("false_events", "km"), PER_1000_KM, (70, 70), "less"
+    ),
     DetectionBar("false_events.long", "long", rate_of("false_events", "km"), PER_1000_KM),
     DetectionBar("false_grip.short", "short", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
     DetectionBar("false_grip.long", "long", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
@@ -128,17 +158,28 @@ DETECTION: Final = (
     *(
         DetectionBar(f"{name}.short", "short", mean_of(name), SHARE)
         for name in (
-            *(f"oracle.ice.{what}{among}" for what in ("yield", "favoured") for among in ("", ".slide", ".calm")),
+            *(
+                f"oracle.ice.{what}{among}"
+                for what in ("yield", "favoured")
+                for among in ("", ".slide", ".calm")
+            ),
             *(f"flag.passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
         )
     ),
     *(
-        DetectionBar(f"ice.seconds.{activity}.{end}", "short", seconds_of(f"seconds.ice.{activity}", share), "s")
+        DetectionBar(
+            f"ice.seconds.{activity}.{end}",
+            "short",
+            seconds_of(f"seconds.ice.{activity}", share),
+            "s",
+        )
         for activity in ACTIVITIES
         for end, share in (("median", 0.5), ("p90", 0.9))
     ),
     *(
-        DetectionBar(f"flag.seconds.{end}", "short", seconds_of("flag.seconds.ice.braking", share), "s")
+        DetectionBar(
+            f"flag.seconds.{end}", "short", seconds_of("flag.seconds.ice.braking", share), "s"
+        )
         for end, share in (("median", 0.5), ("p90", 0.9))
     ),
     DetectionBar("flag.false_events", "", rate_of("flag.false_events", "km"), PER_1000_KM),

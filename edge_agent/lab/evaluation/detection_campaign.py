@@ -20,7 +20,12 @@ from typing import Final, NamedTuple
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.lab.evaluation.detection import KINDS, DetectionResults, TownTally, judge_drive
 from edge_agent.lab.evaluation.detection_bars import detection_figures
-from edge_agent.lab.evaluation.detection_drives import RATE_HZ, BankMaker, DetectionDrive, drive_fleet
+from edge_agent.lab.evaluation.detection_drives import (
+    RATE_HZ,
+    BankMaker,
+    DetectionDrive,
+    drive_fleet,
+)
 from edge_agent.lab.evaluation.real_world import in_winter
 from edge_agent.lab.evaluation.report import detection_table
 from edge_agent.lab.simulation import SimulatedFleet
@@ -60,22 +65,35 @@ def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
     Towns with an odd seed are winter towns.
     """
     if quick:
-        return [DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS, winter=kind == "plain") for kind in KINDS]
+        return [
+            DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS, winter=kind == "plain")
+            for kind in KINDS
+        ]
     short, long = seeds[:SHORT_TOWNS], seeds[SHORT_TOWNS:][:LONG_TOWNS] or seeds[:LONG_TOWNS]
     lengths = [(seed, SHORT_S) for seed in short] + [(seed, LONG_S) for seed in long]
-    return [DetectionTown(seed, kind, s, winter=in_winter(seed)) for kind in KINDS for seed, s in lengths]
+    return [
+        DetectionTown(seed, kind, s, winter=in_winter(seed))
+        for kind in KINDS
+        for seed, s in lengths
+    ]
 
 
 def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
     """Drive and estimate a town."""
     scenario = winter(town.seed) if town.winter else drawn(town.seed)
     rough = float(town.kind == "rough")
-    fleet = SimulatedFleet(scenario, town.cars, town.seed, RATE_HZ, rough=rough, winter=float(town.winter))
+    fleet = SimulatedFleet(
+        scenario, town.cars, town.seed, RATE_HZ, rough=rough, winter=float(town.winter)
+    )
     return drive_fleet(fleet, make_bank(fleet.vehicles), town.seconds)
 
 
 def judge_towns(
-    chosen: Sequence[DetectionTown], make_bank: BankMaker, log_line: Callable[[str], None], *, oracle: bool = True
+    chosen: Sequence[DetectionTown],
+    make_bank: BankMaker,
+    log_line: Callable[[str], None],
+    *,
+    oracle: bool = True,
 ) -> DetectionResults:
     """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line per town."""
     results = DetectionResults()
@@ -94,7 +112,9 @@ def campaign(
     seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
 ) -> DetectionResults:
     """Judge an estimator in all towns."""
-    return judge_towns(towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line)
+    return judge_towns(
+        towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
+    )
 
 
 def town_named(text: str) -> DetectionTown:
@@ -106,16 +126,27 @@ def town_named(text: str) -> DetectionTown:
     usual = ("", "rough", "120", "")
     given = text.split(":")
     seed, kind, seconds, season = [*given, *usual[len(given) :]][:4]
-    sound = seed.isdecimal() and kind in KINDS and seconds.replace(".", "", 1).isdecimal() and season in ("", "winter")
+    sound = (
+        seed.isdecimal()
+        and kind in KINDS
+        and seconds.replace(".", "", 1).isdecimal()
+        and season in ("", "winter")
+    )
     if len(given) > len(usual) or not sound:
-        raise InputError("town", f"{text!r} is no town", "give SEED, SEED:plain:900 or SEED:plain:900:winter")
+        raise InputError(
+            "town", f"{text!r} is no town", "give SEED, SEED:plain:900 or SEED:plain:900:winter"
+        )
     return DetectionTown(int(seed), kind, float(seconds), winter=season == "winter")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Judge the named towns and print a table."""
-    parse = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parse.add_argument("towns", nargs="+", type=town_named, help="SEED, SEED:KIND, SEED:KIND:SECONDS[:winter]")
+    parse = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parse.add_argument(
+        "towns", nargs="+", type=town_named, help="SEED, SEED:KIND, SEED:KIND:SECONDS[:winter]"
+    )
     parse.add_argument("--estimator", default=DEFAULT)
     parse.add_argument("--cars", type=int, default=CARS)
     parse.add_argument("--no-oracle", action="store_true")
@@ -125,13 +156,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = judge_towns(
         [town._replace(cars=args.cars) for town in args.towns],
         lambda vehicles: bank_of(args.estimator, vehicles),
-        lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+        lambda line: print(
+            f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True
+        ),
         oracle=not args.no_oracle,
     )
     figures: list[Figure] = detection_figures(results)
     print(detection_table(figures))
     if args.json:
-        args.json.write_text(json.dumps({figure.name: figure.value for figure in figures}, indent=1))
+        args.json.write_text(
+            json.dumps({figure.name: figure.value for figure in figures}, indent=1)
+        )
 
 
 if __name__ == "__main__":

@@ -93,7 +93,9 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
         tracks, located = locate(tracks, t, signals)
         estimates, favoured = _estimate_chunk(bank, t, signals, located.closes)
         time = np.rint(t * NS).astype(np.int64)
-        open_visits, observations, _ = observe(open_visits, time, located, estimates, config, signals)
+        open_visits, observations, _ = observe(
+            open_visits, time, located, estimates, config, signals
+        )
         columns = observations.columns
         visits.append(
             DetectionVisits(
@@ -115,7 +117,12 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
     values = {name: value.astype(np.float32) for name, value in joined.items()}
     stood = stood_where_it_appeared(values["mu"], values["speed"], starts)
     return DetectionDrive(
-        **values, health=health, flagged=flagged, controlled=controlled, stood=stood, visits=_joined(visits)
+        **values,
+        health=health,
+        flagged=flagged,
+        controlled=controlled,
+        stood=stood,
+        visits=_joined(visits),
     )
 
 
@@ -164,10 +171,14 @@ def _estimate_chunk(
 def slippery_favoured(log_likelihood: FloatArray) -> FloatArray:
     """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) of (…, 32)."""
     low = mugrid.CENTRES < SLIPPERY_MU
-    return np.asarray(log_likelihood[..., low].max(axis=-1) - log_likelihood[..., ~low].max(axis=-1))
+    return np.asarray(
+        log_likelihood[..., low].max(axis=-1) - log_likelihood[..., ~low].max(axis=-1)
+    )
 
 
-def _samples_of(fleet: SimulatedFleet, estimates: Estimates, favoured: FloatArray) -> dict[str, FloatArray]:
+def _samples_of(
+    fleet: SimulatedFleet, estimates: Estimates, favoured: FloatArray
+) -> dict[str, FloatArray]:
     true = fleet.truth
     return {
         "speed": true.vx,

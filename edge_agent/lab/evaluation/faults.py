@@ -26,7 +26,9 @@ BEGINS, ENDS = 2.0, 5.0  # [s]
 DRIVES: Final = {
     "slalom": DriveSpec("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
     "lane change": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
-    "braking": DriveSpec("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
+    "braking": DriveSpec(
+        "moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0
+    ),
 }
 
 
@@ -105,7 +107,10 @@ CASES: Final = {
 
 def harmed(batch: DriveSet, case: Case) -> DriveSet:
     """The drives with the fault in their signals and on their clock."""
-    each = [apply_faults(batch.t[:, n], batch.signals[:, n], case.faults) for n in range(batch.t.shape[1])]
+    each = [
+        apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
+        for n in range(batch.t.shape[1])
+    ]
     return replace(batch, t=case.clock(batch.t), signals=np.stack(each, axis=1))
 
 
@@ -136,6 +141,10 @@ def campaign(
             parts = []
             for batch in batches:
                 broken = harmed(batch, case)
-                parts.append(outcome(broken, estimates(bank_of(estimator, broken.vehicles), broken), case))
-            found[name, estimator] = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+                parts.append(
+                    outcome(broken, estimates(bank_of(estimator, broken.vehicles), broken), case)
+                )
+            found[name, estimator] = {
+                key: np.concatenate([part[key] for part in parts]) for key in parts[0]
+            }
     return found

@@ -37,7 +37,14 @@ def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
     for place, message in enumerate(messages):
         size = len(message.data)
         data = np.frombuffer(bytes(message.data).ljust(64, b"\0"), np.uint8)
-        rows[place] = (message.channel, message.arbitration_id, message.is_extended_id, size, size, data)
+        rows[place] = (
+            message.channel,
+            message.arbitration_id,
+            message.is_extended_id,
+            size,
+            size,
+            data,
+        )
     t = np.array([message.timestamp for message in messages])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -52,7 +59,9 @@ def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path
     rosbag2, typesys = library("rosbags.rosbag2"), library("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types.register(typesys.get_types_from_msg(CAN_FRAME, FRAME))
-    kind, header, time = (types.types[name] for name in (FRAME, "std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    kind, header, time = (
+        types.types[name] for name in (FRAME, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
     plugin = rosbag2.StoragePlugin[storage.upper()]
     with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:
         connection = writer.add_connection("/can1", FRAME, typestore=types)
@@ -75,5 +84,7 @@ def as_csv(path: Path, log: Path, *, mark: str = ",") -> Path:
         writer = csv.writer(file, delimiter=mark)
         writer.writerow(names)
         for row in zip(*columns, strict=True):
-            writer.writerow([int(row[0]), *("" if np.isnan(v) else repr(float(v)) for v in row[1:])])
+            writer.writerow(
+                [int(row[0]), *("" if np.isnan(v) else repr(float(v)) for v in row[1:])]
+            )
     return path

@@ -49,7 +49,10 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
             read_dbc(folder / profile.dbc),
             library("cantools", "dev").database.load_file(folder / profile.dbc),
         )
-        frames = {message.name: [rng.bytes(message.length) for _ in range(MADE)] for message in oracle.messages}
+        frames = {
+            message.name: [rng.bytes(message.length) for _ in range(MADE)]
+            for message in oracle.messages
+        }
         if recorded is not None:
             log, _ = log_frames(recorded, {message.identifier for message in ours.values()})
             for message in oracle.messages:
@@ -64,7 +67,9 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
 
 
 def _against(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types
-    table = np.frombuffer(b"".join(frame.ljust(LONGEST, b"\0") for frame in frames), np.uint8).reshape(-1, LONGEST)
+    table = np.frombuffer(
+        b"".join(frame.ljust(LONGEST, b"\0") for frame in frames), np.uint8
+    ).reshape(-1, LONGEST)
     oracle = [message.decode(frame, decode_choices=False) for frame in frames]
     decoded = ours[message.name].decode(table, list(ours[message.name].signals))
     pairs = [
@@ -100,7 +105,9 @@ def a_minute(path: Path) -> Path:
     chosen = np.concatenate([np.tile(np.arange(256, 260), 6000), others])
     rng.shuffle(chosen)
     data = rng.bytes(8)
-    return as_log(path, [_frame(60.0 * k / len(chosen), int(one), data) for k, one in enumerate(chosen)])
+    return as_log(
+        path, [_frame(60.0 * k / len(chosen), int(one), data) for k, one in enumerate(chosen)]
+    )
 
 
 def imported(path: Path, profile: Profile, out: Path) -> Path:
@@ -124,7 +131,9 @@ def import_s(folder: Path) -> float:
 def estimates_of(log: Path, drive: Recorded) -> FloatArray:
     """Everything that the default estimator says of a log."""
     read = read_log(log)
-    return np.asarray(bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values)
+    return np.asarray(
+        bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values
+    )
 
 
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:

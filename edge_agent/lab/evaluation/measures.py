@@ -17,7 +17,10 @@ LAST_S = 1.0  # "the last second"
 NEAR = 0.1  # of friction: arrived, or wrong
 HOLD_S = 0.2  # a wrong interval that lasts so long is a false change
 SLOWEST_M_S = 1.0
-COMPONENTS = {"nees": 2, "nis": 3}  # independent squares in each; no estimator measures fewer than three rows
+COMPONENTS = {
+    "nees": 2,
+    "nis": 3,
+}  # independent squares in each; no estimator measures fewer than three rows
 
 
 def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
@@ -58,7 +61,9 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
     off = errors(batch, reported)
-    return np.asarray(0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2))
+    return np.asarray(
+        0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2)
+    )
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:

@@ -42,7 +42,9 @@ PITCH_LEAK_STD: Final = 0.005  # of .03
 ROLL_LAG_STD: Final = 0.03  # [s] of .1
 START_STD: Final = 0.05  # [m/s] of the speed at the start, as the wheels know it
 LIKELY: Final = np.linspace(0.62, UPPER, 59)  # frictions that are weighed; .6 g leaves none below
-SHAPES: Final = tuple(product(np.linspace(1.38, 1.62, 5), np.linspace(-0.5, 0.1, 5)))  # as `one_of_a_fleet` draws them
+SHAPES: Final = tuple(
+    product(np.linspace(1.38, 1.62, 5), np.linspace(-0.5, 0.1, 5))
+)  # as `one_of_a_fleet` draws them
 THETA: Final = np.linspace(0.0, 4.0, 2001)
 LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
@@ -78,7 +80,9 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
     none, one = np.zeros_like(v), np.ones_like(v)
     rolling = (heard.rolled, car.roll_leak * np.gradient(heard.rolled, dt))
     sideways = np.stack([-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1)
-    ahead = np.stack([-np.gradient(wheels, dt), none, none, r * slipping, none, heard.pitched, one], axis=1)
+    ahead = np.stack(
+        [-np.gradient(wheels, dt), none, none, r * slipping, none, heard.pitched, one], axis=1
+    )
     white, offset = SENSORS[USUAL].acceleration
     std = np.array([
         KNOWN["wheel_radius"], ROLL_LEAK_STD, ROLL_LAG_STD, KNOWN["cornering_stiffness"], offset, PITCH_LEAK_STD, offset
@@ -114,7 +118,9 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     for n, vehicle in enumerate(batch.vehicles):
         measured = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
         stiff = float(np.log(vehicle.longitudinal_stiffness / car.vehicle.longitudinal_stiffness))
-        cost = np.array([_cost(measured, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()])
+        cost = np.array(
+            [_cost(measured, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()]
+        )
         weight = np.exp(cost.min() - cost).reshape(len(LIKELY), -1).sum(axis=1)
         median = float(np.interp(0.5, np.cumsum(weight) / weight.sum(), LIKELY))
         errors.append(abs(median - truth))
@@ -135,7 +141,9 @@ def _curve(shape: float, curvature: float) -> FloatArray:
     return curve[: int(np.argmax(curve)) + 1]
 
 
-def _cost(measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float) -> float:
+def _cost(
+    measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
+) -> float:
     """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated out (Laplace)."""
     t = np.arange(len(v)) / 100.0
     std = np.array([
@@ -149,12 +157,15 @@ def _cost(measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, 
         ground, turned = v + offset * t + leak * (v - v[0]) + start, 1.0 + slip * np.exp(-k)
         off = measured - (1.0 + rho) * ground * turned
         slopes = np.stack(
-            [-ground * slip * np.exp(-k), ground * turned, t * turned, (v - v[0]) * turned, turned], axis=1
+            [-ground * slip * np.exp(-k), ground * turned, t * turned, (v - v[0]) * turned, turned],
+            axis=1,
         )
         information = slopes.T @ slopes / white**2 + np.diag(std**-2)
         step = np.linalg.solve(information, slopes.T @ off / white**2 + (centre - z) / std**2)
         z = z + step
     k, rho, offset, leak, start = z
-    off = measured - (1.0 + rho) * (v + offset * t + leak * (v - v[0]) + start) * (1.0 + slip * np.exp(-k))
+    off = measured - (1.0 + rho) * (v + offset * t + leak * (v - v[0]) + start) * (
+        1.0 + slip * np.exp(-k)
+    )
     squares = float((off @ off) / white**2 + (((z - centre) / std) ** 2).sum())
     return 0.5 * (squares + float(np.linalg.slogdet(information)[1]))

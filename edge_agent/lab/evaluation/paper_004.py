@@ -56,7 +56,11 @@ def experiments(
     found, drives = {}, {}
     for name, vehicle in EXPERIMENTS.items():
         exact = ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
-        batch = noisy(exact, variances(exact.t[:, 0], "variable" if name.endswith("variable") else "constant"), seeds)
+        batch = noisy(
+            exact,
+            variances(exact.t[:, 0], "variable" if name.endswith("variable") else "constant"),
+            seeds,
+        )
         for estimator, sets in (
             ("paper-ckf", STILL), ("paper-fckf", Memberships()), ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"]))
         ):  # fmt: skip

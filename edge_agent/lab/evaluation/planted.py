@@ -165,10 +165,14 @@ PLANTED: Final = {
     "compass for yaw": Planted(compass, "yaw", "compass"),
     "yaw in deg": Planted(scaled([S.YAW], 1.0 / DEG), "yaw", "deg"),
 }  # fmt: skip
-RADII_ALIKE: Final = ({"km/h", "radius", "mph", "kn"},)  # factors near one: no drive tells a unit from another tyre
+RADII_ALIKE: Final = (
+    {"km/h", "radius", "mph", "kn"},
+)  # factors near one: no drive tells a unit from another tyre
 
 
-def drives(count: int, seed: int, *, rough: bool, winter: bool = False, seconds: int = DRIVE_S) -> list[Recorded]:
+def drives(
+    count: int, seed: int, *, rough: bool, winter: bool = False, seconds: int = DRIVE_S
+) -> list[Recorded]:
     """Drive through the demonstration's town; rough: on its hills, with the devices of real cars.
 
     winter: in a winter town that the seed draws, with winter equipment.
@@ -206,20 +210,32 @@ def figures(count: int, seed: int) -> list[Figure]:
     In winter, smooth and rough cars drive in a winter town.
     """
     cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
-    cold = [*drives(count, seed + 2, rough=False, winter=True), *drives(count, seed + 3, rough=True, winter=True)]
+    cold = [
+        *drives(count, seed + 2, rough=False, winter=True),
+        *drives(count, seed + 3, rough=True, winter=True),
+    ]
     tries = [named(planted, drive) for planted in PLANTED.values() for drive in cars]
     cold_tries = [named(planted, drive) for planted in PLANTED.values() for drive in cold]
     clean = [diagnose(*drive) for drive in cars]
     cold_clean = [diagnose(*drive) for drive in cold]
     return [
         Figure("doctor.faults_named", _share(hit for hit, _ in tries), "1", 0.95, "more"),
-        Figure("doctor.faults_named.winter", _share(hit for hit, _ in cold_tries), "1", 0.95, "more"),
+        Figure(
+            "doctor.faults_named.winter", _share(hit for hit, _ in cold_tries), "1", 0.95, "more"
+        ),
         Figure("doctor.false_accusations", _accusations(clean), "1", 0.01),
         Figure("doctor.false_accusations.winter", _accusations(cold_clean), "1", 0.0),
         Figure("doctor.clean_passed", _share(diagnosis.passed for diagnosis in clean), "1"),
-        Figure("doctor.clean_passed.winter", _share(diagnosis.passed for diagnosis in cold_clean), "1"),
+        Figure(
+            "doctor.clean_passed.winter", _share(diagnosis.passed for diagnosis in cold_clean), "1"
+        ),
         Figure("doctor.published_wrong", float(sum(passed for _, passed in tries)), "drives", 0.0),
-        Figure("doctor.published_wrong.winter", float(sum(passed for _, passed in cold_tries)), "drives", 0.0),
+        Figure(
+            "doctor.published_wrong.winter",
+            float(sum(passed for _, passed in cold_tries)),
+            "drives",
+            0.0,
+        ),
         Figure("doctor.tries", float(len(tries)), "drives", 150.0, "more"),
     ]
 
@@ -231,5 +247,8 @@ def _share(held: Iterable[bool]) -> float:
 
 def _accusations(clean: Sequence[Diagnosis]) -> float:
     """Return the share of channels of sound drives that the doctor accuses."""
-    channels = sum(len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings) for diagnosis in clean)
+    channels = sum(
+        len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings)
+        for diagnosis in clean
+    )
     return sum(len(diagnosis.findings) for diagnosis in clean) / channels

@@ -31,7 +31,9 @@ NEARLY_ALIKE: Final = 0.02  # of mu: one road
 FORMS: Final = ("png", "svg", "pdf")
 
 
-def draw(results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png") -> list[Path]:
+def draw(
+    results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png"
+) -> list[Path]:
     """Write the plots into `folder`; returns their paths. `seed`: of the drive that is shown; `form`: one of FORMS."""
     import matplotlib as mpl
 
@@ -58,7 +60,9 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
     first = next(iter(drives.values()))
     t = first.batch.t[:, 0]
     for axis, (name, label) in zip(
-        axes, (("vx", "v_x [m/s]"), ("vy", "v_y [m/s]"), ("yaw_rate", "yaw rate [rad/s]")), strict=False
+        axes,
+        (("vx", "v_x [m/s]"), ("vy", "v_y [m/s]"), ("yaw_rate", "yaw rate [rad/s]")),
+        strict=False,
     ):
         axis.plot(t, first.batch.truth[f"true_{name}"][:, 0], **_true(), label="true")
         for estimator, drive in drives.items():
@@ -69,7 +73,12 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
         reported, style = drive.reported, _line(estimator)
         axes[3].plot(t, reported.mu[:, 0], **style)
         if estimator == DEFAULT or len(drives) == 1:
-            band = {"color": style["color"], "alpha": 0.2, "lw": 0, "label": f"90 % band of {estimator}"}
+            band = {
+                "color": style["color"],
+                "alpha": 0.2,
+                "lw": 0,
+                "label": f"90 % band of {estimator}",
+            }
             axes[3].fill_between(t, reported.mu_lower[:, 0], reported.mu_upper[:, 0], **band)
         axes[4].plot(t, reported.adaptation[:, 0], **style)
         axes[5].semilogy(t, nees(drive.batch, reported).mean(axis=1), **style)
@@ -112,9 +121,13 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     batch, car = world.batch, int(np.argmax(np.ptp(world.batch.truth["true_slope"], axis=0)))
     t, first = batch.t[:, car], next(iter(world.reported.values()))
     figure, axes = plt.subplots(5, 1, figsize=(9, 12), sharex=True, layout="constrained")
-    wheels = batch.vehicles[car].wheel_radius * np.nanmean(batch.signals[:, car, S.OMEGA : S.OMEGA + 4], axis=-1)
+    wheels = batch.vehicles[car].wheel_radius * np.nanmean(
+        batch.signals[:, car, S.OMEGA : S.OMEGA + 4], axis=-1
+    )
     axes[0].plot(t, batch.truth["true_vx"][:, car], "k", label="true")
-    axes[1].plot(t, wheels - batch.truth["true_vx"][:, car], color="0.7", lw=0.8, label="mean of the wheels")
+    axes[1].plot(
+        t, wheels - batch.truth["true_vx"][:, car], color="0.7", lw=0.8, label="mean of the wheels"
+    )
     for name, reported in world.reported.items():
         axes[0].plot(t, reported.vx[:, car], **_line(name), label=name)
         axes[1].plot(t, reported.vx[:, car] - batch.truth["true_vx"][:, car], **_line(name))
@@ -130,7 +143,8 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
         if flag and (when := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
             axes[4].plot(t[when], [flag.name] * int(when.sum()), "|")
     axes[0].set(
-        ylabel="v_x [m/s]", title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.reported))}"
+        ylabel="v_x [m/s]",
+        title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.reported))}",
     )
     axes[1].set(ylabel="error of v_x [m/s]", ylim=(-2.0, 2.0))
     axes[2].set(ylabel="slope [%]")
@@ -147,7 +161,9 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
     from matplotlib import pyplot as plt
 
     values = {figure.name: figure.value for figure in figures if figure.name.startswith("world.")}
-    names = list(dict.fromkeys(name.split(".")[1] for name in values if name.endswith(".coverage90")))
+    names = list(
+        dict.fromkeys(name.split(".")[1] for name in values if name.endswith(".coverage90"))
+    )
     drawn, axis = plt.subplots(figsize=(9, 4), layout="constrained")
     for k, name in enumerate(names):
         shares = [values.get(f"world.{name}.coverage90.{surface}", np.nan) for surface in SURFACES]
@@ -160,7 +176,10 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
         )
     axis.axhline(0.9, color="k", ls=":")
     axis.set(
-        xticks=range(len(SURFACES)), xticklabels=list(SURFACES), ylabel="coverage of the 90 % interval", ylim=(0, 1)
+        xticks=range(len(SURFACES)),
+        xticklabels=list(SURFACES),
+        ylabel="coverage of the 90 % interval",
+        ylim=(0, 1),
     )
     axis.legend(fontsize="x-small", ncols=4)
     drawn.savefig(path, dpi=DPI)
@@ -178,11 +197,25 @@ def _consistency(figures: Sequence[Figure], path: Path) -> Path:
         found: dict[str, dict[str, float]] = {}
         for figure in figures:
             if figure.name.startswith("real.") and figure.name.endswith(f".{measure}"):
-                scenario, _, estimator = figure.name[len("real.") : -len(f".{measure}")].rpartition(".")
+                scenario, _, estimator = figure.name[len("real.") : -len(f".{measure}")].rpartition(
+                    "."
+                )
                 found.setdefault(estimator, {})[scenario] = figure.value
         for estimator, values in found.items():
-            axis.plot(list(values), list(values.values()), "o", color=line_of(estimator).colour, label=estimator)
-        axis.axhspan(ends[f"bounds.{measure}.lower"], ends[f"bounds.{measure}.upper"], color="k", alpha=0.15, lw=0)
+            axis.plot(
+                list(values),
+                list(values.values()),
+                "o",
+                color=line_of(estimator).colour,
+                label=estimator,
+            )
+        axis.axhspan(
+            ends[f"bounds.{measure}.lower"],
+            ends[f"bounds.{measure}.upper"],
+            color="k",
+            alpha=0.15,
+            lw=0,
+        )
         axis.set(ylabel=measure.upper(), yscale="log")
     axes[0].legend(fontsize="x-small", ncols=3)
     axes[1].tick_params(axis="x", rotation=90)
@@ -198,7 +231,12 @@ def _memberships(path: Path) -> Path:
     figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
     tuned = ((f"after, {name}", shipped(file)) for name, file in TUNED.items())
     for row, (name, sets) in enumerate((("before", Memberships()), *tuned)):
-        _triangles(axes[row, 0], sets.inputs, f"{name}: sets of the mismatch", "mismatch of the innovations [1]")
+        _triangles(
+            axes[row, 0],
+            sets.inputs,
+            f"{name}: sets of the mismatch",
+            "mismatch of the innovations [1]",
+        )
         _triangles(axes[row, 1], sets.outputs, f"{name}: sets of the step", "step of ln R [1]")
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
@@ -207,7 +245,12 @@ def _memberships(path: Path) -> Path:
 
 def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> None:
     for k, style in zip(range(len(peaks)), ESTIMATORS.values(), strict=False):
-        axis.plot(peaks, np.eye(len(peaks))[k], color=style.colour, label=f"set {k + 1}, peak {peaks[k]:.2g}")
+        axis.plot(
+            peaks,
+            np.eye(len(peaks))[k],
+            color=style.colour,
+            label=f"set {k + 1}, peak {peaks[k]:.2g}",
+        )
     axis.set(title=title, xlabel=name, ylabel="membership [1]")
     axis.legend(fontsize="xx-small")
 
@@ -224,7 +267,14 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
     drawn, axis = plt.subplots(figsize=(5, 5), layout="constrained")
     axis.plot([0, 1], [0, 1], "k:")
     for estimator, levels in found.items():
-        axis.plot(list(levels), list(levels.values()), marker="o", ms=3, **_line(estimator), label=estimator)
+        axis.plot(
+            list(levels),
+            list(levels.values()),
+            marker="o",
+            ms=3,
+            **_line(estimator),
+            label=estimator,
+        )
     axis.set(xlabel="stated", ylabel="share of truths below", title="reliability of friction")
     axis.legend(fontsize="x-small")
     drawn.savefig(path, dpi=DPI)
@@ -249,21 +299,47 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
                 ("flag", ROC_FLAG_MU, TRUTH.colour, "slip flag"),
             ):
                 found = [
-                    (values.get(f"{way}.{limit:g}.false_events.{kind}"), values.get(f"{way}.{limit:g}.{road}.{kind}"))
+                    (
+                        values.get(f"{way}.{limit:g}.false_events.{kind}"),
+                        values.get(f"{way}.{limit:g}.{road}.{kind}"),
+                    )
                     for limit in limits
                 ]
-                known = [(events, share) for events, share in found if events is not None and share is not None]
+                known = [
+                    (events, share)
+                    for events, share in found
+                    if events is not None and share is not None
+                ]
                 if known:
                     axis.plot(
-                        *zip(*known, strict=True), marker="o", ms=3, ls=dash, color=colour, label=f"{name}, {road}"
+                        *zip(*known, strict=True),
+                        marker="o",
+                        ms=3,
+                        ls=dash,
+                        color=colour,
+                        label=f"{name}, {road}",
                     )
-            told = values.get(f"passes.{road}.short.{kind}"), values.get(f"false_events.short.{kind}")
+            told = (
+                values.get(f"passes.{road}.short.{kind}"),
+                values.get(f"false_events.short.{kind}"),
+            )
             if None not in told:
-                axis.plot(told[1], told[0], "*", ms=11, color=estimator.colour, label=f"reported, {road}, short drives")
+                axis.plot(
+                    told[1],
+                    told[0],
+                    "*",
+                    ms=11,
+                    color=estimator.colour,
+                    label=f"reported, {road}, short drives",
+                )
         oracle = values.get(f"oracle.ice.favoured.short.{kind}")
         if oracle is not None:
             axis.axhline(oracle, color="0.5", ls=":", label="oracle, excited visits on ice")
-        axis.set(xlabel="false events per 1000 km of wet and dry road", title=f"{kind} cars", ylim=(0.0, 1.02))
+        axis.set(
+            xlabel="false events per 1000 km of wet and dry road",
+            title=f"{kind} cars",
+            ylim=(0.0, 1.02),
+        )
         axis.set_xscale("symlog", linthresh=10.0)
         axis.set_xlim(left=-1.0)
         if axis.lines:

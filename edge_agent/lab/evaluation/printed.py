@@ -32,7 +32,9 @@ PRINTED_001: Final = {"MAE": (".0009", ".0024", ".0002"), "RMSE": (".0012", ".00
 PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 
 
-def printed(paper: str, scenario: str, estimator: str, measure: str, what: str, value: str) -> Printed:
+def printed(
+    paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
+) -> Printed:
     """A row whose own figure comes from sensors without error."""
     same, real = f"ideal.{scenario}.{estimator}.{measure}", f"real.{scenario}.ESTIMATOR.{measure}"
     return Printed(paper, what, value, same, real)

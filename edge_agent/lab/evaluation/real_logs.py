@@ -53,7 +53,17 @@ USED_SHARE: Final = 99.5  # percentile of the grip in use that a surface surely 
 LOOK_S: Final = 0.2  # between two looks at P(slippery)
 SMOOTH_S: Final = 0.25
 TRUTH: Final = ("vx", "vy", "mu")
-HEAD: Final = ("informative", "right", "ice", "contradicted", "urgent_per_hour", "used", "vx", "vy", "sideslip")
+HEAD: Final = (
+    "informative",
+    "right",
+    "ice",
+    "contradicted",
+    "urgent_per_hour",
+    "used",
+    "vx",
+    "vy",
+    "sideslip",
+)
 
 
 @dataclass(frozen=True)
@@ -74,7 +84,9 @@ class LogFigures:
     sideslip: float
 
 
-def judge_folder(folder: Path, log_line: Callable[[str], None] = lambda _: None) -> list[LogFigures]:
+def judge_folder(
+    folder: Path, log_line: Callable[[str], None] = lambda _: None
+) -> list[LogFigures]:
     """Judge every log of a folder that has a vehicle file.
 
     Raises:
@@ -86,7 +98,11 @@ def judge_folder(folder: Path, log_line: Callable[[str], None] = lambda _: None)
         if not path.name.endswith(".truth.parquet") and path.with_suffix(".json").exists()
     ]
     if not paths:
-        raise InputError("logs", f"{folder} has no LOG.parquet with LOG.json", "put each log next to its vehicle file")
+        raise InputError(
+            "logs",
+            f"{folder} has no LOG.parquet with LOG.json",
+            "put each log next to its vehicle file",
+        )
     found = []
     for path in paths:
         found.append(judge_log(path))
@@ -135,7 +151,11 @@ def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
     if not file.exists():
         return {name: np.full(len(t), np.nan) for name in TRUTH}
     table = pq.read_table(file)
-    at = np.asarray(table["t"].to_numpy(zero_copy_only=False), float) if "t" in table.column_names else t
+    at = (
+        np.asarray(table["t"].to_numpy(zero_copy_only=False), float)
+        if "t" in table.column_names
+        else t
+    )
     found: dict[str, FloatArray] = {}
     for name in TRUTH:
         if name in table.column_names:
@@ -156,20 +176,29 @@ def judge_estimates(
     """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and what is known of it."""
     t, signals = adopted.log.t, adopted.log.signals
     values, slippery = estimates
-    wheels = np.where(np.isfinite(signals[:, S.OMEGA : S.OMEGA + 4]), signals[:, S.OMEGA : S.OMEGA + 4], 0.0)
-    moving = (t - t[0] > BEGIN_S) & (adopted.vehicle.wheel_radius * np.median(wheels, axis=1) > MOVING_M_S)
+    wheels = np.where(
+        np.isfinite(signals[:, S.OMEGA : S.OMEGA + 4]), signals[:, S.OMEGA : S.OMEGA + 4], 0.0
+    )
+    moving = (t - t[0] > BEGIN_S) & (
+        adopted.vehicle.wheel_radius * np.median(wheels, axis=1) > MOVING_M_S
+    )
     width = values[:, Column.MU_UPPER] - values[:, Column.MU_LOWER]
     told = moving & (width < INFORMATIVE * float(width[0]))
     least = known_friction(t, signals, moving, known)
     met = values[:, Column.MU_UPPER] >= least - MARGIN
     exact = np.isfinite(truth["mu"])
-    inside = (values[:, Column.MU_LOWER] <= truth["mu"]) & (truth["mu"] <= values[:, Column.MU_UPPER])
+    inside = (values[:, Column.MU_LOWER] <= truth["mu"]) & (
+        truth["mu"] <= values[:, Column.MU_UPPER]
+    )
     right = np.where(exact, inside, met)
     grips = np.where(exact, truth["mu"] >= GRIPS, known is None or known >= GRIPS)
     contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0
     fast = (t - t[0] > BEGIN_S) & (truth["vx"] > FAST_M_S)
     hours = float(moving.sum()) * float(np.median(np.diff(t))) / 3600.0
-    slip = np.degrees(np.arctan2(values[:, Column.VY], values[:, Column.VX]) - np.arctan2(truth["vy"], truth["vx"]))
+    slip = np.degrees(
+        np.arctan2(values[:, Column.VY], values[:, Column.VX])
+        - np.arctan2(truth["vy"], truth["vx"])
+    )
     return LogFigures(
         name=name,
         seconds=float(t[-1] - t[0]),
@@ -179,14 +208,20 @@ def judge_estimates(
         ice=share_of(slippery > ICE, moving & grips),
         contradicted=share_of(contradicted, moving),
         urgent_per_hour=math.nan if urgent is None or hours == 0.0 else urgent / hours,
-        used=float(np.percentile(values[moving, Column.MU_UTILISED], 99)) if moving.any() else math.nan,
-        vx=root_mean_square(values[:, Column.VX] - truth["vx"], (t - t[0] > BEGIN_S) & (truth["vx"] > 1.0)),
+        used=float(np.percentile(values[moving, Column.MU_UTILISED], 99))
+        if moving.any()
+        else math.nan,
+        vx=root_mean_square(
+            values[:, Column.VX] - truth["vx"], (t - t[0] > BEGIN_S) & (truth["vx"] > 1.0)
+        ),
         vy=root_mean_square(values[:, Column.VY] - truth["vy"], fast),
         sideslip=root_mean_square(slip, fast),
     )
 
 
-def known_friction(t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None) -> float:
+def known_friction(
+    t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
+) -> float:
     """Return the friction that the surface of a log had at least: what is known of it, or what the car used."""
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (smooth(even(t, signals[:, channel], at), SMOOTH_S) for channel in (S.AX, S.AY))
@@ -236,7 +271,10 @@ def summarise(found: Sequence[LogFigures]) -> list[Figure]:
 
 def table_row(log: LogFigures) -> str:
     """Return the figures of one log as a row of a Markdown table."""
-    cells = [f"{value:.3g}" if math.isfinite(value) else "–" for value in (asdict(log)[name] for name in HEAD)]
+    cells = [
+        f"{value:.3g}" if math.isfinite(value) else "–"
+        for value in (asdict(log)[name] for name in HEAD)
+    ]
     return f"| {log.name} | {log.seconds:.0f} | {'yes' if log.passed else 'no'} | {' | '.join(cells)} |"
 
 

@@ -34,7 +34,14 @@ from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import Health, S, per_wheel
-from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, SURFACES, UTILISED_WINDOW_S, Z_95
+from schemas.thresholds import (
+    EXCITED_SHARE,
+    GRAVITY,
+    SLIPPERY_MU,
+    SURFACES,
+    UTILISED_WINDOW_S,
+    Z_95,
+)
 
 LOST_M_S: Final = 1.0
 FALSE_GRIP: Final = 0.05
@@ -66,9 +73,14 @@ class Tally:
 
     def means(self) -> dict[str, float]:
         """Mean by name; NaN of nothing. What ends in "_squared" is reported as its root, without that end."""
-        found = {name: total / self.count[name] if self.count[name] else np.nan for name, total in self.total.items()}
+        found = {
+            name: total / self.count[name] if self.count[name] else np.nan
+            for name, total in self.total.items()
+        }
         return {
-            name.removesuffix("_squared"): float(np.sqrt(mean)) if name.endswith("_squared") else mean
+            name.removesuffix("_squared"): float(np.sqrt(mean))
+            if name.endswith("_squared")
+            else mean
             for name, mean in found.items()
         }
 
@@ -84,10 +96,15 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
     In winter towns all cars have winter equipment.
     """
     cold = in_winter(seed)
-    fleet = SimulatedFleet(winter(seed) if cold else drawn(seed), cars, seed, RATE_HZ, rough=1.0, winter=float(cold))
+    fleet = SimulatedFleet(
+        winter(seed) if cold else drawn(seed), cars, seed, RATE_HZ, rough=1.0, winter=float(cold)
+    )
     t, signals = fleet.step(round(seconds * RATE_HZ))
     true = fleet.truth
-    truth = {f"true_{name}": getattr(true, name) for name in ("vx", "vy", "yaw_rate", "ax", "ay", "slope")}
+    truth = {
+        f"true_{name}": getattr(true, name)
+        for name in ("vx", "vy", "yaw_rate", "ax", "ay", "slope")
+    }
     truth |= {name: true.mu_wheel[..., i] for i, name in enumerate(per_wheel("true_mu"))}
     return DriveSet(t, signals, truth, fleet.vehicles), true.utilisation.max(axis=-1)
 
@@ -104,12 +121,16 @@ def lately(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> 
     """Largest value of the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0).max(axis=-1))
+    return np.asarray(
+        np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0).max(axis=-1)
+    )
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
     """Width and MISS times how far the truth lies outside; the only way to lower it is to be sharp and right."""
-    return np.asarray(upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)))
+    return np.asarray(
+        upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
+    )
 
 
 def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
@@ -124,8 +145,14 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
     tally.add("contradiction_share", contradicted)
     for name, (above, most) in SURFACES.items():
         for kind, among in (("excited", excited), ("calm", ~excited)):
-            tally.add(f"contradiction_share.{name}.{kind}", contradicted, (mu > above) & (mu <= most) & among)
-    tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
+            tally.add(
+                f"contradiction_share.{name}.{kind}",
+                contradicted,
+                (mu > above) & (mu <= most) & among,
+            )
+    tally.add(
+        "coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)]
+    )
     icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
     ice = mu <= SURFACES["ice"][1]
     tally.add("missed_ice", ~icy, ice & excited)
@@ -147,7 +174,10 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
 def baseline(tally: Tally, batch: DriveSet) -> None:
     """What the prior scores, and what the mean of four wheels makes of v_x."""
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
-    off = radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1) - batch.truth["true_vx"]
+    off = (
+        radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1)
+        - batch.truth["true_vx"]
+    )
     tally.add("rmse_vx_squared", off**2)
     tally.add("lost", np.abs(off) > LOST_M_S)
     lower, upper = (np.full(batch.mu.shape, end) for end in PRIOR)
@@ -159,7 +189,9 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
     batches = []
     for sensors in (USUAL, "rough"):
         for k, preset in enumerate(PRESETS.values()):
-            drive = DriveSpec("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
+            drive = DriveSpec(
+                "standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL
+            )
             batches.append(realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors))
     return batches
 

@@ -46,9 +46,15 @@ def _rank(bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates) -
     """Share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)
-    likelihood = copy.deepcopy(bank).advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes).evidence
+    likelihood = (
+        copy.deepcopy(bank)
+        .advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes)
+        .evidence
+    )
     if likelihood is None:
-        return between_quantiles(truth, reported.mu_lower[-1], reported.mu[-1], reported.mu_upper[-1])
+        return between_quantiles(
+            truth, reported.mu_lower[-1], reported.mu[-1], reported.mu_upper[-1]
+        )
     return on_the_grid(truth, likelihood[0])
 
 
@@ -56,10 +62,14 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
     """Share below the truth (N,) of posteriors with log-likelihoods (N, 32) upon the uniform prior, (N,)."""
     weight = np.exp(log_likelihood)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
-    return np.array([np.interp(mu, EDGES, [0.0, *row]) for mu, row in zip(truth, below, strict=True)])
+    return np.array(
+        [np.interp(mu, EDGES, [0.0, *row]) for mu, row in zip(truth, below, strict=True)]
+    )
 
 
-def between_quantiles(truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray) -> FloatArray:
+def between_quantiles(
+    truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
+) -> FloatArray:
     """The same of Gaussians with these 5, 50 and 95 % quantiles, one of which may be cut off; of the prior, uniform."""
     from scipy.stats import norm
 

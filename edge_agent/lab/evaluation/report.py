@@ -71,7 +71,11 @@ equipment); their figure stands in brackets. Definitions: `edge_agent/lab/evalua
 error over towns. `flag`: ordinary ABS and ESC logic on the same signals (`slip_flag.py`); `oracle`: an observer who
 knows motion and forces (`slide_oracle.py`); `roc`: the estimator's belief at other thresholds. Cars under which ice
 appeared while they stood are counted as `stood` and nowhere else."""
-FRICTION: Final = ("paper-aco-fckf", "federated-ckf", "sr-ukf")  # papers' estimators that estimate friction
+FRICTION: Final = (
+    "paper-aco-fckf",
+    "federated-ckf",
+    "sr-ukf",
+)  # papers' estimators that estimate friction
 SHOWN_LEVELS: Final = LEVELS[::2]
 
 
@@ -93,14 +97,18 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
         WORLD_HEAD,
         world(by_name),
         VEHICLES_HEAD,
-        scenarios(by_name, "real.default.", ("coverage90", "width", "mae_mu", "rmse_vx", "rmse_vy")),
+        scenarios(
+            by_name, "real.default.", ("coverage90", "width", "mae_mu", "rmse_vx", "rmse_vy")
+        ),
         FAULTS_HEAD,
         faults(by_name),
         CONSISTENCY_HEAD,
         consistency(by_name),
         reliability(by_name),
         ALL_HEAD,
-        scenarios(by_name, "real.", ("rmse_vx", "rmse_vy", "mae_mu", "coverage90", "width", "nees", "nis")),
+        scenarios(
+            by_name, "real.", ("rmse_vx", "rmse_vy", "mae_mu", "coverage90", "width", "nees", "nis")
+        ),
     )
     return "\n\n".join(parts) + "\n"
 
@@ -109,7 +117,11 @@ def table(values: dict[str, float]) -> str:
     """Printed figures beside ours."""
     rows = []
     for row in PRINTED:
-        cells = (row.same, row.real.replace("ESTIMATOR", OWN[row.paper]), row.real.replace("ESTIMATOR", DEFAULT))
+        cells = (
+            row.same,
+            row.real.replace("ESTIMATOR", OWN[row.paper]),
+            row.real.replace("ESTIMATOR", DEFAULT),
+        )
         rows.append([row.paper, row.what, row.value, *(number(values, name) for name in cells)])
     return grid(("paper", "figure", "printed", "ours", "realistic", "default, realistic"), rows)
 
@@ -122,7 +134,11 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
     """Mean, ± sd if wanted and known, or a dash where it was not measured."""
     value, sd = values.get(name, math.nan), values.get(f"{name}.sd")
-    return "–" if math.isnan(value) else f"{value:.3g}" + (f" ± {sd:.2g}" if spread and sd is not None else "")
+    return (
+        "–"
+        if math.isnan(value)
+        else f"{value:.3g}" + (f" ± {sd:.2g}" if spread and sd is not None else "")
+    )
 
 
 def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
@@ -167,7 +183,11 @@ def world(values: dict[str, float]) -> str:
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
     """Names between a prefix and a suffix of figures, in their order."""
-    found = [name[len(prefix) : -len(suffix)] for name in values if name.startswith(prefix) and name.endswith(suffix)]
+    found = [
+        name[len(prefix) : -len(suffix)]
+        for name in values
+        if name.startswith(prefix) and name.endswith(suffix)
+    ]
     return list(dict.fromkeys(found))
 
 
@@ -187,10 +207,14 @@ def faults(values: dict[str, float]) -> str:
     rows = []
     for name, case in CASES.items():
         recognised = [
-            value for key, value in values.items() if key.startswith(f"faults.{name}.") and key.endswith(".told")
+            value
+            for key, value in values.items()
+            if key.startswith(f"faults.{name}.") and key.endswith(".told")
         ]
         whole = [
-            value for key, value in values.items() if key.startswith(f"faults.{name}.") and key.endswith(".finite")
+            value
+            for key, value in values.items()
+            if key.startswith(f"faults.{name}.") and key.endswith(".finite")
         ]
         rows.append([
             name, case.expected,
@@ -214,18 +238,37 @@ def consistency(values: dict[str, float]) -> str:
     for name in names:
         cells = []
         for measure in ("nees", "nees_within", "nis", "nis_within"):
-            found = [v for key, v in values.items() if key.startswith("real.") and key.endswith(f".{name}.{measure}")]
+            found = [
+                v
+                for key, v in values.items()
+                if key.startswith("real.") and key.endswith(f".{name}.{measure}")
+            ]
             cells.append(f"{sum(found) / len(found):.3g}" if found else "–")
         rows.append([name, *cells])
-    ends = {m: " to ".join(number(values, f"bounds.{m}.{end}") for end in ("lower", "upper")) for m in ("nees", "nis")}
-    head = ("estimator", f"NEES (bounds {ends['nees']})", "within", f"NIS (bounds {ends['nis']})", "within")
+    ends = {
+        m: " to ".join(number(values, f"bounds.{m}.{end}") for end in ("lower", "upper"))
+        for m in ("nees", "nis")
+    }
+    head = (
+        "estimator",
+        f"NEES (bounds {ends['nees']})",
+        "within",
+        f"NIS (bounds {ends['nis']})",
+        "within",
+    )
     return grid(head, rows)
 
 
 def reliability(values: dict[str, float]) -> str:
     """One row per estimator: share of truths below each stated quantile."""
     rows = [
-        [name, *(number(values, f"reliability.{name}.below_{100 * level:02.0f}") for level in SHOWN_LEVELS)]
+        [
+            name,
+            *(
+                number(values, f"reliability.{name}.below_{100 * level:02.0f}")
+                for level in SHOWN_LEVELS
+            ),
+        ]
         for name in estimators(values, "reliability.", ".below_05")
     ]
     return grid(("estimator", *(f"{100 * level:.0f} %" for level in SHOWN_LEVELS)), rows)
@@ -239,7 +282,9 @@ def detection_report(figures: Sequence[Figure]) -> str:
 def detection_table(figures: Sequence[Figure]) -> str:
     """Return one row per figure of the detection judge: rough and plain cars with standard errors, and the bars."""
     by_name = {figure.name: figure for figure in figures}
-    names = dict.fromkeys(name.rpartition(".")[0] for name in by_name if name.endswith((".rough", ".plain")))
+    names = dict.fromkeys(
+        name.rpartition(".")[0] for name in by_name if name.endswith((".rough", ".plain"))
+    )
     rows = []
     for name in names:
         cells, limits, held = [], [], []

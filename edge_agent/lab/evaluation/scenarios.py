@@ -18,17 +18,38 @@ SLOPES: Final = ("longitudinal_stiffness", "cornering_stiffness")
 SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
 # papers 000 and 001, table 2
 LIGHT: Final = TrueVehicle(
-    car("light", 830.0, 1110.0, (1.17, 1.17), (1.416, 1.416), cg_height=0.54, radius=0.278, drive_front=0.5), power=60e3
+    car(
+        "light",
+        830.0,
+        1110.0,
+        (1.17, 1.17),
+        (1.416, 1.416),
+        cg_height=0.54,
+        radius=0.278,
+        drive_front=0.5,
+    ),
+    power=60e3,
 )
 # paper 002, table 1; the height of the centre of gravity is not given
 SMALL: Final = TrueVehicle(
-    car("in-wheel", 710.0, 1000.0, (0.795, 0.975), (1.55, 1.55), cg_height=0.50, radius=0.245, drive_front=0.5),
+    car(
+        "in-wheel",
+        710.0,
+        1000.0,
+        (0.795, 0.975),
+        (1.55, 1.55),
+        cg_height=0.50,
+        radius=0.245,
+        drive_front=0.5,
+    ),
     power=60e3,
 )
 STRONG: Final = replace(SEDAN, power=400e3)  # .6 g at 25 m/s
 LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control: wheels spin
 
-MATCHED: Final = matched(SEDAN)  # the vehicle of 004, whose tyres are not given, as its model has it
+MATCHED: Final = matched(
+    SEDAN
+)  # the vehicle of 004, whose tyres are not given, as its model has it
 
 
 def steered_behind(speed: float) -> TrueVehicle:
@@ -59,34 +80,75 @@ LOADED: Final = replace(
 )  # fmt: skip
 
 PAPERS: Final = {
-    "004.dlc": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), 50.0, about="double lane change, 80 km/h"),
-    "000.jump": DriveSpec("two-lane-changes", steered_behind(kmh(30)), about="lane changes at 30 km/h, .5 to .3"),
-    "001.dlc": DriveSpec(
-        "double-lane-change", steered_behind(kmh(40)), 0.85, kmh(40), 50.0, 14.0, "double lane change, 40 km/h"
+    "004.dlc": DriveSpec(
+        "double-lane-change", SEDAN, 0.85, kmh(80), 50.0, about="double lane change, 80 km/h"
     ),
-    "001.sine": DriveSpec("sine", steered_behind(kmh(70)), 0.50, kmh(70), 50.0, about="sine steering, 70 km/h"),
-    "001.slalom": DriveSpec("slalom", steered_behind(kmh(30)), 0.30, kmh(30), 50.0, about="slalom, 30 km/h"),
-    "001.gaining.dlc": DriveSpec("gaining-lane-changes", LIGHT, 0.90, rate_hz=50.0, about="lane changes, 4 to 40 km/h"),
-    "001.gaining.slalom": DriveSpec("gaining-slalom", LIGHT, 0.90, rate_hz=50.0, about="slalom, 5 to 30 km/h"),
-    "002.sine": DriveSpec("accelerating-sine", SMALL, 0.70, 20.0, about="sine steering, 20 to 25 m/s"),
+    "000.jump": DriveSpec(
+        "two-lane-changes", steered_behind(kmh(30)), about="lane changes at 30 km/h, .5 to .3"
+    ),
+    "001.dlc": DriveSpec(
+        "double-lane-change",
+        steered_behind(kmh(40)),
+        0.85,
+        kmh(40),
+        50.0,
+        14.0,
+        "double lane change, 40 km/h",
+    ),
+    "001.sine": DriveSpec(
+        "sine", steered_behind(kmh(70)), 0.50, kmh(70), 50.0, about="sine steering, 70 km/h"
+    ),
+    "001.slalom": DriveSpec(
+        "slalom", steered_behind(kmh(30)), 0.30, kmh(30), 50.0, about="slalom, 30 km/h"
+    ),
+    "001.gaining.dlc": DriveSpec(
+        "gaining-lane-changes", LIGHT, 0.90, rate_hz=50.0, about="lane changes, 4 to 40 km/h"
+    ),
+    "001.gaining.slalom": DriveSpec(
+        "gaining-slalom", LIGHT, 0.90, rate_hz=50.0, about="slalom, 5 to 30 km/h"
+    ),
+    "002.sine": DriveSpec(
+        "accelerating-sine", SMALL, 0.70, 20.0, about="sine steering, 20 to 25 m/s"
+    ),
     "002.jturn": DriveSpec("j-turn", SMALL, 1.00, 15.0, about="J-turn, 15 m/s"),
-    "002.serpentine": DriveSpec("slalom", SMALL, 0.85, about="serpentine of the road test, speed not given"),
+    "002.serpentine": DriveSpec(
+        "slalom", SMALL, 0.85, about="serpentine of the road test, speed not given"
+    ),
     "003.accel": DriveSpec("firm-acceleration", STRONG, 0.85, about="acceleration of .6 g"),
     "003.turn": DriveSpec("low-turn", SEDAN, 0.35, about="turn on snow, 40 km/h"),
-    "003.split": DriveSpec("firm-acceleration", STRONG, split(0.30, 0.85), about="acceleration on split friction"),
-    "003.straight.split": DriveSpec(
-        "straight", SEDAN, split(0.30, 0.85), kmh(40), duration_s=10.0, about="split friction, constant speed"
+    "003.split": DriveSpec(
+        "firm-acceleration", STRONG, split(0.30, 0.85), about="acceleration on split friction"
     ),
-    "003.straight.low": DriveSpec("straight", SEDAN, 0.30, kmh(40), duration_s=10.0, about="snow, constant speed"),
-    "003.jump": DriveSpec("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about="acceleration, .85 to .5"),
+    "003.straight.split": DriveSpec(
+        "straight",
+        SEDAN,
+        split(0.30, 0.85),
+        kmh(40),
+        duration_s=10.0,
+        about="split friction, constant speed",
+    ),
+    "003.straight.low": DriveSpec(
+        "straight", SEDAN, 0.30, kmh(40), duration_s=10.0, about="snow, constant speed"
+    ),
+    "003.jump": DriveSpec(
+        "brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about="acceleration, .85 to .5"
+    ),
 }
 
 OTHERS: Final = {
     "default.dlc": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), about="as 004, realistic"),
-    "default.jump.accel": DriveSpec("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about=".85 to .5 at .45 g"),
-    "default.jump.brake": DriveSpec("moderate-braking", SEDAN, jump(0.85, 0.30, 60.0), about=".85 to .3 at .28 g"),
-    "default.steady": DriveSpec("pulses", SEDAN, 0.60, duration_s=90.0, about="town traffic, one road"),
-    "default.straight": DriveSpec("straight", SEDAN, 0.85, kmh(60), duration_s=20.0, about="19 s at constant speed"),
+    "default.jump.accel": DriveSpec(
+        "brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about=".85 to .5 at .45 g"
+    ),
+    "default.jump.brake": DriveSpec(
+        "moderate-braking", SEDAN, jump(0.85, 0.30, 60.0), about=".85 to .3 at .28 g"
+    ),
+    "default.steady": DriveSpec(
+        "pulses", SEDAN, 0.60, duration_s=90.0, about="town traffic, one road"
+    ),
+    "default.straight": DriveSpec(
+        "straight", SEDAN, 0.85, kmh(60), duration_s=20.0, about="19 s at constant speed"
+    ),
     "default.abs.dry": DriveSpec("braking", SEDAN, 0.85, about="anti-lock stop, dry"),
     "default.abs.snow": DriveSpec("braking", SEDAN, 0.30, about="anti-lock stop, snow"),
     "default.spin": DriveSpec("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),

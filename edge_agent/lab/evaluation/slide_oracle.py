@@ -24,7 +24,9 @@ from schemas.runtime.jit import compiled
 
 FORCE_STD: Final = 0.02
 SPEED_STD: Final = 0.03  # [m/s] of a wheel, as a filter takes it: noise, steps and unlike radii
-STIFF: Final = 20.0  # stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
+STIFF: Final = (
+    20.0  # stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
+)
 SLOWEST: Final = 0.5  # [m/s]
 EACH: Final = 4
 TYRES: Final = 128
@@ -43,20 +45,26 @@ def tyres_drawn() -> FloatArray:
     return np.stack([shape, curvature, np.exp(rng.normal(0.0, STIFFNESS_STD, TYRES))], axis=1)
 
 
-def visit_evidence(force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator) -> FloatArray:
+def visit_evidence(
+    force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
+) -> FloatArray:
     """Return ln L (BINS,) of a visit, maximum 0: true f and q (T, 4) [1], speed (T,) [m/s]; rng draws the noise."""
     picked = slice(None, None, EACH)
     noise = STIFF * SPEED_STD / np.maximum(speed[picked], SLOWEST)
     read_force = force[picked] + FORCE_STD * rng.standard_normal(force[picked].shape)
     read_slip = slip[picked] + noise[:, None] * rng.standard_normal(force[picked].shape)
-    rows = _evidence(np.ascontiguousarray(read_force), np.ascontiguousarray(read_slip), noise, tyres_drawn())
+    rows = _evidence(
+        np.ascontiguousarray(read_force), np.ascontiguousarray(read_slip), noise, tyres_drawn()
+    )
     top = rows.max()
     found = top + np.log(np.exp(np.maximum(rows - top, -LEAST_NATS)).mean(axis=0))
     return np.asarray(found - found.max())
 
 
 @compiled
-def _evidence(force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray) -> FloatArray:
+def _evidence(
+    force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
+) -> FloatArray:
     """Return ln L (TYRES, BINS) for each tyre by itself; noise: standard deviation of the slip (T,)."""
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):
@@ -69,7 +77,9 @@ def _evidence(force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: Flo
                     here = magic_formula(x, shape, curvature)
                     slope = (magic_formula(x + 0.05, shape, curvature) - here) / 0.05 * stiffness
                     variance = FORCE_STD**2 + (slope * noise[k]) ** 2
-                    total -= 0.5 * ((force[k, i] - CENTRES[b] * here) ** 2 / variance + np.log(variance))
+                    total -= 0.5 * (
+                        (force[k, i] - CENTRES[b] * here) ** 2 / variance + np.log(variance)
+                    )
                     total += np.log(max(abs(slope), LEAST_SLOPE))
             out[j, b] = total
     return out

@@ -100,7 +100,9 @@ def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
         if not begun:
             speed, begun = middle, True
         speed = min(max(wanted, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
-        alike = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(speed, SLOWEST)
+        alike = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(
+            speed, SLOWEST
+        )
         agreed = agreed + period if alike else 0.0
         if agreed > AGREE_S:
             speed = middle

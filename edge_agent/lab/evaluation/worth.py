@@ -51,15 +51,24 @@ def campaign(seeds: Sequence[int], *, quick: bool) -> Scores:
     for seed in chosen:
         batches = [town(seed, cars, seconds)[0], manoeuvres(seed, 2.0 if quick else DRIVE_S)]
         for way, sets in found.items():
-            parts = [_scored(batches, memberships, adaptive=adaptive) for memberships, adaptive in sets]
+            parts = [
+                _scored(batches, memberships, adaptive=adaptive) for memberships, adaptive in sets
+            ]
             for name in parts[0]:
-                scores[way].setdefault(name, []).append(float(np.mean([part[name] for part in parts])))
-    return {way: {name: np.array(values) for name, values in each.items()} for way, each in scores.items()}
+                scores[way].setdefault(name, []).append(
+                    float(np.mean([part[name] for part in parts]))
+                )
+    return {
+        way: {name: np.array(values) for name, values in each.items()}
+        for way, each in scores.items()
+    }
 
 
 def ways() -> dict[str, list[tuple[Memberships, bool]]]:
     """Memberships, and whether rules are applied, by way."""
-    searched = {way: [(one, True) for one in sets] for way, sets in search_results(ESTIMATOR).items()}
+    searched = {
+        way: [(one, True) for one in sets] for way, sets in search_results(ESTIMATOR).items()
+    }
     tuned, untuned = shipped(ESTIMATOR), Memberships()
     given = {
         "fuzzy": (tuned, True),
@@ -84,11 +93,15 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
     return joined(drives)
 
 
-def _scored(batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: bool) -> dict[str, float]:
+def _scored(
+    batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: bool
+) -> dict[str, float]:
     """Mean interval score over the drives, and over all samples of each surface (NaN where none is met)."""
     drives, samples = [], []
     for batch in batches:
-        bank = mixture_bank(parameter_table(batch.vehicles), design_of(memberships, adaptive=adaptive))
+        bank = mixture_bank(
+            parameter_table(batch.vehicles), design_of(memberships, adaptive=adaptive)
+        )
         estimates = bank.advance(batch.t, batch.signals)
         settled = batch.t[:, 0] >= SETTLED_S
         score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)[settled]
@@ -123,7 +136,11 @@ def figures(scores: Scores) -> list[Figure]:
             if key != "all" and _met(found)
         ]
     for way, found in scores.items():
-        listed += [Figure(f"worth.{way}.{key}", float(np.nanmean(v)), "1") for key, v in found.items() if _met(v)]
+        listed += [
+            Figure(f"worth.{way}.{key}", float(np.nanmean(v)), "1")
+            for key, v in found.items()
+            if _met(v)
+        ]
     return listed
 
 

@@ -32,16 +32,24 @@ class Databroker:
         self._server = grpc.server(ThreadPoolExecutor(8))
         asked = {
             "GetValue": grpc.unary_unary_rpc_method_handler(
-                self._get, messages.GetValueRequest.FromString, messages.GetValueResponse.SerializeToString
+                self._get,
+                messages.GetValueRequest.FromString,
+                messages.GetValueResponse.SerializeToString,
             ),
             "PublishValue": grpc.unary_unary_rpc_method_handler(
-                self._take, messages.PublishValueRequest.FromString, messages.PublishValueResponse.SerializeToString
+                self._take,
+                messages.PublishValueRequest.FromString,
+                messages.PublishValueResponse.SerializeToString,
             ),
             "Subscribe": grpc.unary_stream_rpc_method_handler(
-                self._subscribe, messages.SubscribeRequest.FromString, messages.SubscribeResponse.SerializeToString
+                self._subscribe,
+                messages.SubscribeRequest.FromString,
+                messages.SubscribeResponse.SerializeToString,
             ),
         }
-        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("kuksa.val.v2.VAL", asked),))
+        self._server.add_generic_rpc_handlers(
+            (grpc.method_handlers_generic_handler("kuksa.val.v2.VAL", asked),)
+        )
         self.port = self._server.add_insecure_port(address)
 
     def __enter__(self) -> Self:

@@ -68,7 +68,15 @@ def _lines(stream: IO[str] | None) -> Iterator[str]:
 @contextmanager
 def peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
     """A peer in a process of its own, ended at the end."""
-    words = [sys.executable, "-m", "edge_agent.lab.live.peers", kind, address, str(samples), str(rate)]
+    words = [
+        sys.executable,
+        "-m",
+        "edge_agent.lab.live.peers",
+        kind,
+        address,
+        str(samples),
+        str(rate),
+    ]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     running = Peer(process)
     try:
@@ -131,7 +139,10 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
             parts.append(block.signals[:, 0])
             if feeds[0].heard > heard:
                 heard, quiet_since = feeds[0].heard, time.monotonic()
-            if time.monotonic() > quiet_since + SETTLED_S or time.monotonic() > began + seconds + PATIENCE_S:
+            if (
+                time.monotonic() > quiet_since + SETTLED_S
+                or time.monotonic() > began + seconds + PATIENCE_S
+            ):
                 break
         blocks.close()
         running.go()
@@ -149,22 +160,46 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     """Agents that did not notice a loss or a return of their source, or did not end as they should: why; losses."""
     vehicle = folder / "car.json"
-    vehicle.write_text(Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True))
+    vehicle.write_text(
+        Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True)
+    )
     bad: list[str] = []
     losses = 0
     for kind in (*COUNTED, "gpsd"):
         place, source = addresses(kind)
         name, dbc = written("can" if kind == "gpsd" else kind, folder)
         config, port = folder / f"{kind}.agent.json", free_port()
-        settings = {"spool": str(folder / f"{kind}.sqlite"), "estimator": "ckf", "metrics_port": port}
-        config.write_text(json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **settings}), encoding="utf-8")
-        words = ["run", "--source", source, "--profile", name, "--vehicle", str(vehicle), "--name", "car-one"]
+        settings = {
+            "spool": str(folder / f"{kind}.sqlite"),
+            "estimator": "ckf",
+            "metrics_port": port,
+        }
+        config.write_text(
+            json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **settings}), encoding="utf-8"
+        )
+        words = [
+            "run",
+            "--source",
+            source,
+            "--profile",
+            name,
+            "--vehicle",
+            str(vehicle),
+            "--name",
+            "car-one",
+        ]
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
         if kind == "gpsd":  # positions beside a bus
             words += ["--source", addresses("can")[1]]
         command = [sys.executable, "-m", "edge_agent.cli"]
-        agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-        missed = [] if _shows(agent, port, source, silent=True, patience_s=START_S) else ["no source at the start"]
+        agent = subprocess.Popen(
+            [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        )
+        missed = (
+            []
+            if _shows(agent, port, source, silent=True, patience_s=START_S)
+            else ["no source at the start"]
+        )
         for kill in range(kills):
             with peer(kind, place, 100_000) as running:
                 running.go()
@@ -179,18 +214,29 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         output, _ = agent.communicate(timeout=PATIENCE_S)
         if missed or agent.returncode or not output.strip().endswith("}"):
             unseen = f"did not see {', '.join(missed)}" if missed else "saw all"
-            bad.append(f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {output[-200:]!r}")
+            bad.append(
+                f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {output[-200:]!r}"
+            )
     return bad, losses
 
 
 def _shows(
-    agent: subprocess.Popen[str], port: int, source: str, *, silent: bool, patience_s: float = PATIENCE_S
+    agent: subprocess.Popen[str],
+    port: int,
+    source: str,
+    *,
+    silent: bool,
+    patience_s: float = PATIENCE_S,
 ) -> bool:
     """Whether the health of a running agent comes to say that a source is silent, or no longer says so."""
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
         troubles = _troubles(port)
-        if "the agent is starting" not in troubles and troubles and silent == any(source in line for line in troubles):
+        if (
+            "the agent is starting" not in troubles
+            and troubles
+            and silent == any(source in line for line in troubles)
+        ):
             return True  # its router is away: something troubles it all the time
         time.sleep(0.1)
     return False
@@ -199,7 +245,9 @@ def _shows(
 def _troubles(port: int) -> list[str]:
     """What an agent's `/healthz` says is wrong, nothing while it does not answer."""
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S) as answer:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S
+        ) as answer:
             return list(json.load(answer)["troubles"])
     except urllib.error.HTTPError as answer:
         return list(json.load(answer)["troubles"])

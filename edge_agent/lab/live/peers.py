@@ -31,7 +31,10 @@ CHANNELS: Final = ("ax", "ay", "yaw_rate", "delta_fl", *per_wheel("omega"))
 STEP: Final = 1e-6  # of a number on the bus
 DBC: Final = "".join(
     f"BO_ {256 + k} M{k}: 8 X\n"
-    + "".join(f' SG_ {name} : {32 * n}|32@1- ({STEP},0) [0|0] "" X\n' for n, name in enumerate(CHANNELS[2 * k :][:2]))
+    + "".join(
+        f' SG_ {name} : {32 * n}|32@1- ({STEP},0) [0|0] "" X\n'
+        for n, name in enumerate(CHANNELS[2 * k :][:2])
+    )
     for k in range(len(CHANNELS) // 2)
 )
 TOPIC: Final = "/car/imu"
@@ -50,11 +53,20 @@ def drive_at(t: float) -> dict[str, float]:
 def profile_of(kind: str) -> Profile:
     """The profile of a peer; a databroker's is the shipped one."""
     if kind == "can":
-        return Profile(name=kind, channels={n: Channel(signal=n, message=f"M{k // 2}") for k, n in enumerate(CHANNELS)})
-    fields = {"ax": ".linear_acceleration.x", "ay": ".linear_acceleration.y", "yaw_rate": ".angular_velocity.z"}
+        return Profile(
+            name=kind,
+            channels={n: Channel(signal=n, message=f"M{k // 2}") for k, n in enumerate(CHANNELS)},
+        )
+    fields = {
+        "ax": ".linear_acceleration.x",
+        "ay": ".linear_acceleration.y",
+        "yaw_rate": ".angular_velocity.z",
+    }
     wheels = {name: f"/car/joints.velocity[{name}]" for name in CHANNELS if name not in fields}
     named = {name: f"{TOPIC}{field}" for name, field in fields.items()} | wheels
-    return Profile(name=kind, channels={name: Channel(signal=signal) for name, signal in named.items()})
+    return Profile(
+        name=kind, channels={name: Channel(signal=signal) for name, signal in named.items()}
+    )
 
 
 def paced(samples: int, rate: float) -> Iterator[float]:
@@ -81,7 +93,9 @@ def can(address: str, samples: int, rate: float) -> int:
 
 def ros2(address: str, samples: int, rate: float) -> int:
     """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a router is opened."""
-    session = open_session(ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]}))
+    session = open_session(
+        ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
+    )
     assert session is not None
     typesys = library("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
@@ -109,7 +123,10 @@ def ros2(address: str, samples: int, rate: float) -> int:
         for k, t in enumerate(paced(samples, rate)):
             now, values = time.time_ns(), drive_at(t)
             head = header(stamp(now // NS, now % NS), "")
-            turn, pull = vector(0.0, 0.0, values["yaw_rate"]), vector(values["ax"], values["ay"], 9.8)
+            turn, pull = (
+                vector(0.0, 0.0, values["yaw_rate"]),
+                vector(values["ax"], values["ay"], 9.8),
+            )
             speeds = np.array([values[name] for name in names])
             messages = (
                 imu(head, turned(0, 0, 0, 1), none, turn, none, pull, none),
@@ -117,7 +134,9 @@ def ros2(address: str, samples: int, rate: float) -> int:
             )
             for number, (publisher, message) in enumerate(zip(put, messages, strict=True)):
                 attachment = struct.pack("<qqB", k, now, 16) + bytes([number] * 16)
-                publisher.put(bytes(store.serialize_cdr(message, message.__msgtype__)), attachment=attachment)
+                publisher.put(
+                    bytes(store.serialize_cdr(message, message.__msgtype__)), attachment=attachment
+                )
         wait()  # what is under way arrives before the session closes
     return 2 * samples
 
@@ -127,14 +146,18 @@ def vss(address: str, samples: int, rate: float) -> int:
     from edge_agent.inputs.live.sources import VSS_PROFILE
     from edge_agent.inputs.profile import load_profile
 
-    paths = {name: channel.signals[0] for name, channel in load_profile(VSS_PROFILE)[0].channels.items()}
+    paths = {
+        name: channel.signals[0] for name, channel in load_profile(VSS_PROFILE)[0].channels.items()
+    }
     published = [name for name in CHANNELS if name in paths]
     degrees = [name for name in published if name not in ("ax", "ay")]
     with Databroker(address, [paths[name] for name in published]) as broker:
         ready()
         for t in paced(samples, rate):
             now, values = time.time_ns(), drive_at(t)
-            broker.publish({paths[n]: values[n] / (DEG if n in degrees else 1.0) for n in published}, now)
+            broker.publish(
+                {paths[n]: values[n] / (DEG if n in degrees else 1.0) for n in published}, now
+            )
         wait()
     return samples * len(published)
 
@@ -150,7 +173,12 @@ def gpsd(address: str, samples: int, rate: float) -> int:
         with connection:
             ready()
             for t in paced(samples, rate):
-                place = {"lat": 57.7, "lon": 11.9 + t * SPEED / 59_500.0, "speed": SPEED, "track": 90.0}
+                place = {
+                    "lat": 57.7,
+                    "lon": 11.9 + t * SPEED / 59_500.0,
+                    "speed": SPEED,
+                    "track": 90.0,
+                }
                 report = {"class": "TPV", "mode": 3, "time": datetime.now(UTC).isoformat(), **place}
                 connection.sendall(json.dumps(report).encode() + b"\n")
             wait()
@@ -168,7 +196,12 @@ def wait() -> None:
     sys.stdin.readline()
 
 
-PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {"can": can, "ros2": ros2, "vss": vss, "gpsd": gpsd}
+PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {
+    "can": can,
+    "ros2": ros2,
+    "vss": vss,
+    "gpsd": gpsd,
+}
 
 
 def main(words: Any) -> None:  # noqa: ANN401

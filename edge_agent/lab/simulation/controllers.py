@@ -23,7 +23,9 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
-SHOWN_S: Final = 0.25  # a controller counts as active so long after it acted: its lamp blinks no faster
+SHOWN_S: Final = (
+    0.25  # a controller counts as active so long after it acted: its lamp blinks no faster
+)
 ABS_SLOWEST: Final = 1.5  # [m/s] below it brakes may lock the wheels
 DUMP: Final = 22.0  # [1/s] rates of ln of the brake torque, at USUAL_HZ
 BUILD_FAST: Final = 35.0
@@ -32,7 +34,9 @@ NEARLY: Final = 0.88
 USUAL_HZ: Final = 8.0
 LEAST_SHARE: Final = 0.02  # of the brake torque that was asked for
 TCS_SLOWEST: Final = 2.5  # [m/s] slip of slower cars is taken of this speed
-CUT_RATE: Final = 5.0  # [1/s] of the share of the engine's torque that is taken away, and given back
+CUT_RATE: Final = (
+    5.0  # [1/s] of the share of the engine's torque that is taken away, and given back
+)
 GIVE_RATE: Final = 0.8
 MOST_CUT: Final = 0.95
 MUCH: Final = 2.0  # times the limit of traction control: the brake helps
@@ -82,7 +86,11 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
     """Move the brake torque that ABS lets through at wheel `i` on by `dt` [s]."""
-    asked, limit, slip = u[Control.BRAKE, i] + x[Motion.HELD + i], slip_limit(p, i), w[Wheel.SLIP, i]
+    asked, limit, slip = (
+        u[Control.BRAKE, i] + x[Motion.HELD + i],
+        slip_limit(p, i),
+        w[Wheel.SLIP, i],
+    )
     pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
     if asked <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
         x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
@@ -114,7 +122,9 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
     acts = drags = False
     for i in range(4):
         spin = spins(x, p, w, i)
-        if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (u[Control.DRIVE, i] < 0.0 and spin < -1.0):
+        if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (
+            u[Control.DRIVE, i] < 0.0 and spin < -1.0
+        ):
             acts = True
         drags = drags or u[Control.DRIVE, i] < 0.0
     acts = acts and p[TrueParameter.TCS] > 0.0

@@ -69,7 +69,9 @@ ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
 PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
-WARNED_BRAKES: Final = 1.0  # [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
+WARNED_BRAKES: Final = (
+    1.0  # [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
+)
 # Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the pedals alone. An axle
 # that brakes alone, or its share of the brakes, meets its limit at half of what the road bears.
 CAREFUL: Final = 0.5
@@ -83,13 +85,17 @@ STOP_LENGTH_S: Final = 5.0  # braking and waiting, within an ALERT_S
 STOPPING: Final = 0.6  # share of his budget that he stops with
 RESTING: Final = 0.3  # [m/s] slower than this he stands on the brake, whatever the slope
 LEAST_BRAKING: Final = 0.35  # share of the budget that is left for the brakes in the tightest bend
-FRIGHT: Final = 2.5  # [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
+FRIGHT: Final = (
+    2.5  # [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
+)
 TOO_FAST: Final = 1.4  # this many times the square of the speed he aims at
 PULL: Final = 0.85  # share of the grip of the driven wheels that he dares to use for driving
 WOBBLE_HZ: Final = 0.11
 ROUTE_STREAM: Final = 10
 ALERT_STREAM: Final = 11
-STOP_DRAW: Final = 1 << 32  # counters from here on, in the stream of alerts, say in which ALERT_S he stops
+STOP_DRAW: Final = (
+    1 << 32
+)  # counters from here on, in the stream of alerts, say in which ALERT_S he stops
 
 
 @compiled
@@ -111,9 +117,9 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     while True:
         lane, point = g[Route.LANE], g[Route.POINT]
         row = points[first[lane] + point]
-        along = (x[Motion.X] - row[LanePoint.X]) * row[LanePoint.COS] + (x[Motion.Y] - row[LanePoint.Y]) * row[
-            LanePoint.SIN
-        ]
+        along = (x[Motion.X] - row[LanePoint.X]) * row[LanePoint.COS] + (
+            x[Motion.Y] - row[LanePoint.Y]
+        ) * row[LanePoint.SIN]
         if not along > 0.0:
             return float(min(-along, spacing[lane]))
         if point + 1 < size[lane]:
@@ -195,7 +201,11 @@ def alerted(t: float, key: Key) -> float:
 def stops(t: float, share: float, key: Key) -> bool:
     """Whether he is stopping or waiting now; he does so in this share of the ALERT_S."""
     window = int(t / ALERT_S)
-    return bool(share > 0.0 and t - window * ALERT_S < STOP_LENGTH_S and uniform(key, STOP_DRAW + window) < share)
+    return bool(
+        share > 0.0
+        and t - window * ALERT_S < STOP_LENGTH_S
+        and uniform(key, STOP_DRAW + window) < share
+    )
 
 
 @compiled
@@ -208,7 +218,10 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     lane = g[Route.LANE]
     stays = lanes[1][lane] <= row < lanes[1][lane] + lanes[2][lane]
     profile = lanes[0][row, LanePoint.PROFILE + (g[Route.WAY] if stays else 0)]
-    q = min(CAREFUL * d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY, d[Driver.COMFORT])
+    q = min(
+        CAREFUL * d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY,
+        d[Driver.COMFORT],
+    )
     return float(max(min(d[Driver.WARNED_SPEED] ** 2, q * profile), SLOWEST**2))
 
 
@@ -224,12 +237,22 @@ def wished_acceleration(
     last = lanes[1][lane] + lanes[2][lane] - 1
     stays = lanes[1][lane] <= row <= last
     here = lanes[0][lanes[1][lane] + g[Route.POINT], LanePoint.PROFILE + g[Route.WAY]]
-    there = lanes[0][row, LanePoint.PROFILE + g[Route.WAY]] if stays else min(here, lanes[0][row, LanePoint.PROFILE])
+    there = (
+        lanes[0][row, LanePoint.PROFILE + g[Route.WAY]]
+        if stays
+        else min(here, lanes[0][row, LanePoint.PROFILE])
+    )
     if stays and row < last:
-        there += (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
+        there += (
+            (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
+        )
     aim = min(q * there, cruise(d) ** 2)
     if heeds(d):
-        aim = min(aim, warned_square(d, g, lanes) + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0))
+        aim = min(
+            aim,
+            warned_square(d, g, lanes)
+            + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0),
+        )
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     longitudinal = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
@@ -237,7 +260,9 @@ def wished_acceleration(
         p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT]
     )  # share of the pull on an axle that carries half the vehicle
     gas = min(
-        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[Parameter.MASS]
+        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
+        0.8 * q,
+        strongest_pull(p, vx) / p[Parameter.MASS],
     )
     alarm = alerted(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
@@ -249,15 +274,22 @@ def wished_acceleration(
 
 
 @compiled
-def wished_force(p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float) -> float:
+def wished_force(
+    p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
+) -> float:
     """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as tyres and engine can."""
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
-    most = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[Parameter.MASS])
+    most = min(
+        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
+        strongest_pull(p, vx) / p[Parameter.MASS],
+    )
     return float(p[Parameter.MASS] * min(acceleration - along, max(most, acceleration)))
 
 
 @compiled
-def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float) -> float:
+def wished_steer(
+    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
+) -> float:
     """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
     vx, base = max(x[Motion.VX], SLOWEST), p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
@@ -301,4 +333,6 @@ def drive(
     if x[Motion.VX] < RESTING and stops(t, d[Driver.STOPS], keys[1]):
         force = -p[Parameter.MASS] * (STOPPING * budget(d) + abs(along))
     d[Driver.FORCE] += (force - d[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
-    d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(-dt / ARMS_S)
+    d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(
+        -dt / ARMS_S
+    )

@@ -29,9 +29,15 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in FAULTS:
-            raise InputError("fault", f"there is no fault {self.kind!r}", f"choose one of {', '.join(FAULTS)}")
+            raise InputError(
+                "fault", f"there is no fault {self.kind!r}", f"choose one of {', '.join(FAULTS)}"
+            )
         if not self.indices:
-            raise InputError("channel", f"there is no channel {self.channel!r}", f"choose one of {', '.join(CHANNELS)}")
+            raise InputError(
+                "channel",
+                f"there is no channel {self.channel!r}",
+                f"choose one of {', '.join(CHANNELS)}",
+            )
 
     @property
     def indices(self) -> list[int]:

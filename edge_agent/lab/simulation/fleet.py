@@ -8,10 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
-from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive, ways_of
+from edge_agent.lab.simulation.driver import (
+    ALERT_STREAM,
+    ROUTE_STREAM,
+    Driver,
+    KeyArray,
+    Lanes,
+    Route,
+    drive,
+    ways_of,
+)
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.misaligned import memory_of
-from edge_agent.lab.simulation.plant import advance, command, gravity, regenerate, start_at, substeps_of, wheel_place
+from edge_agent.lab.simulation.plant import (
+    advance,
+    command,
+    gravity,
+    regenerate,
+    start_at,
+    substeps_of,
+    wheel_place,
+)
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet, winter_equipped
 from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
 from edge_agent.lab.simulation.relief import cross_slope, gradient, tilt
@@ -34,9 +51,13 @@ from schemas.runtime.jit import compiled
 TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
 WINTER_STREAM = 4
-STOPS = 0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
+STOPS = (
+    0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
+)
 TOLD_S = 1.5  # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
-GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
+GOLDEN = (
+    math.sqrt(5.0) - 1.0
+) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
 
 
 @dataclass(frozen=True)
@@ -90,9 +111,13 @@ def run(
             t = (first + k) * period
             lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
             turned = -math.expm1(-abs(x[Motion.VX]) * period / TURN_OVER_M)
-            d[Driver.CROSS_SLOPE] += (cross_slope(relief, lane[LanePoint.CURVATURE]) - d[Driver.CROSS_SLOPE]) * turned
+            d[Driver.CROSS_SLOPE] += (
+                cross_slope(relief, lane[LanePoint.CURVATURE]) - d[Driver.CROSS_SLOPE]
+            ) * turned
             heading = (math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW]))
-            east, north = gradient(relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.CROSS_SLOPE])
+            east, north = gradient(
+                relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.CROSS_SLOPE]
+            )
             u[Control.TILT, 0], u[Control.TILT, 1] = tilt(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
@@ -128,7 +153,9 @@ class SimulatedFleet:
         sensors: str | Sensors = "mems-patchy", rough: float = 0.0, winter: float = 0.0,
     ) -> None:  # fmt: skip
         if vehicles < 1:
-            raise InputError("vehicles", f"{vehicles} vehicles cannot drive", "give a positive number")
+            raise InputError(
+                "vehicles", f"{vehicles} vehicles cannot drive", "give a positive number"
+            )
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
             raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
         for name, share in (("rough", rough), ("winter", winter)):
@@ -139,11 +166,16 @@ class SimulatedFleet:
         self.rate_hz = rate_hz
         self.names = [f"sim-{k + 1:03d}" for k in range(vehicles)]
         rngs = [np.random.default_rng([seed, k, VEHICLE_STREAM]) for k in range(vehicles)]
-        truths = [one_of_a_fleet(k, name, rng) for k, (name, rng) in enumerate(zip(self.names, rngs, strict=True))]
+        truths = [
+            one_of_a_fleet(k, name, rng)
+            for k, (name, rng) in enumerate(zip(self.names, rngs, strict=True))
+        ]
         self.vehicles = [nominal(truth, rng) for truth, rng in zip(truths, rngs, strict=True)]
         self.winter = winter_ones(vehicles, winter)
         for k in np.flatnonzero(self.winter):
-            truths[k] = winter_equipped(truths[k], np.random.default_rng([seed, int(k), WINTER_STREAM]))
+            truths[k] = winter_equipped(
+                truths[k], np.random.default_rng([seed, int(k), WINTER_STREAM])
+            )
         self._parameters = np.stack([truth.row() for truth in truths])
         self.rough = rough_ones(vehicles, rough)
         ordinary, origin = sensors_named(sensors), self.scenario.origin
@@ -151,7 +183,10 @@ class SimulatedFleet:
             error_row(ROUGH_FLEET if self.rough[k] else ordinary, origin, seed, k) for k in range(vehicles)
         ])  # fmt: skip
         noise = [noise_keys(seed, k) for k in range(vehicles)]
-        self._noise = (np.array([white for white, _ in noise]), np.array([silence for _, silence in noise]))
+        self._noise = (
+            np.array([white for white, _ in noise]),
+            np.array([silence for _, silence in noise]),
+        )
         self._keys = (
             np.array([key_of(seed, k, ROUTE_STREAM) for k in range(vehicles)]),
             np.array([key_of(seed, k, ALERT_STREAM) for k in range(vehicles)]),
@@ -180,7 +215,11 @@ class SimulatedFleet:
         signals = sense(known, self._errors, self._wander, place, self._noise, clock)
         memory = memory_of(self._errors[:, ErrorColumn.MOUNTED :], self.rate_hz)
         self._before = known[len(known) - min(memory, len(known)) :]
-        t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)
+        t = np.repeat(
+            (np.arange(self._next, self._next + steps) / self.rate_hz)[:, None],
+            len(self.names),
+            axis=1,
+        )
         self._next += steps
         self.truth = _truth(records, self.scenario.air_temperature)
         return t, signals
@@ -222,7 +261,13 @@ def winter_ones(vehicles: int, share: float) -> BoolArray:
 def _truth(records: FloatArray, air_temperature: float) -> Truth:
     x, y, yaw, vx, vy = (
         records[..., column]
-        for column in (RecordColumn.X, RecordColumn.Y, RecordColumn.YAW, RecordColumn.VX, RecordColumn.VY)
+        for column in (
+            RecordColumn.X,
+            RecordColumn.Y,
+            RecordColumn.YAW,
+            RecordColumn.VX,
+            RecordColumn.VY,
+        )
     )
     return Truth(
         x,
@@ -262,7 +307,11 @@ def _start(
         start_at(
             vehicles[k],
             parameters[k],
-            (point[LanePoint.X], point[LanePoint.Y], math.atan2(point[LanePoint.SIN], point[LanePoint.COS])),
+            (
+                point[LanePoint.X],
+                point[LanePoint.Y],
+                math.atan2(point[LanePoint.SIN], point[LanePoint.COS]),
+            ),
             5.0,
         )
         drivers[k, Driver.BELIEF] = 0.3

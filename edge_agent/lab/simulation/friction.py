@@ -42,9 +42,13 @@ class Patch:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mu <= 2.0:
-            raise InputError("mu", f"patch {self.name} has friction {self.mu}", "give a number in (0, 2]")
+            raise InputError(
+                "mu", f"patch {self.name} has friction {self.mu}", "give a number in (0, 2]"
+            )
         if not (self.length > 0.0 and self.width > 0.0 and self.start < self.end):
-            raise InputError("patch", f"{self.name} covers nothing", "give positive sizes, and start before end")
+            raise InputError(
+                "patch", f"{self.name} covers nothing", "give positive sizes, and start before end"
+            )
 
 
 class PatchColumn(IntEnum):
@@ -85,13 +89,18 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
             dx * row[PatchColumn.COS] + dy * row[PatchColumn.SIN],
             dy * row[PatchColumn.COS] - dx * row[PatchColumn.SIN],
         )
-        if abs(along) <= row[PatchColumn.HALF_LENGTH] and abs(across) <= row[PatchColumn.HALF_WIDTH]:
+        if (
+            abs(along) <= row[PatchColumn.HALF_LENGTH]
+            and abs(across) <= row[PatchColumn.HALF_WIDTH]
+        ):
             return float(row[column])
     return float(table[0, column])
 
 
 @compiled
-def look_up_many(table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+def look_up_many(
+    table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray
+) -> FloatArray:
     """`look_up` for arrays of one length."""
     values = np.empty(x.size)
     for i in range(x.size):

@@ -61,7 +61,9 @@ class WarnedDrivers:
         """A warning for a driver; from any thread. He acts on it from the next block on, after his reaction."""
         self._warnings.put((self._number[name], warning))
 
-    def heeding(self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None) -> Iterator[Block]:
+    def heeding(
+        self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
+    ) -> Iterator[Block]:
         """The blocks, with the drivers told between them what was heard; `hear` is called before each."""
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
@@ -80,5 +82,8 @@ class WarnedDrivers:
         while not self._warnings.empty():
             k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself
-                start, end = warning.distance_m - AROUND_M, warning.distance_m + warning.length_m + AROUND_M
+                start, end = (
+                    warning.distance_m - AROUND_M,
+                    warning.distance_m + warning.length_m + AROUND_M,
+                )
                 self._fleet.warn(k, (start, end), warning.safe_speed, warning.mu_lower)

@@ -120,7 +120,9 @@ def double_lane_change(now: Moment) -> tuple[float, float]:
 def slalom(now: Moment) -> tuple[float, float]:
     """Around cones 18 m apart."""
     ahead = now.x + preview(now)
-    return steer_to(now, ahead, 1.2 * math.sin(math.pi * ahead / 18.0) * smooth_step(ahead / 18.0)), hold(now)
+    return steer_to(
+        now, ahead, 1.2 * math.sin(math.pi * ahead / 18.0) * smooth_step(ahead / 18.0)
+    ), hold(now)
 
 
 def sine(now: Moment) -> tuple[float, float]:
@@ -136,7 +138,9 @@ def acceleration(now: Moment) -> tuple[float, float]:
 
 def braking(now: Moment) -> tuple[float, float]:
     """A stop with anti-lock control after one second, down to walking pace."""
-    return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(now, now.speed if now.t < 1.0 else 1.5)
+    return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
+        now, now.speed if now.t < 1.0 else 1.5
+    )
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
@@ -146,7 +150,9 @@ def split_braking(now: Moment) -> tuple[float, float]:
 
 def gentle_braking(now: Moment) -> tuple[float, float]:
     """2 m/s^2 after one second, down to walking pace."""
-    return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(now, now.speed if now.t < 1.0 else 1.5)
+    return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
+        now, now.speed if now.t < 1.0 else 1.5
+    )
 
 
 def constant_radius(now: Moment) -> tuple[float, float]:
@@ -169,7 +175,9 @@ def j_turn(now: Moment) -> tuple[float, float]:
 def two_lane_changes(now: Moment) -> tuple[float, float]:
     """A double lane change, and another from 110 m on."""
     ahead = now.x + preview(now)
-    return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(now)
+    return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(
+        now
+    )
 
 
 def accelerating_sine(now: Moment) -> tuple[float, float]:
@@ -179,7 +187,9 @@ def accelerating_sine(now: Moment) -> tuple[float, float]:
 
 def gaining_lane_changes(now: Moment) -> tuple[float, float]:
     """Lane changes while gaining 10 m/s within fifteen seconds."""
-    return two_lane_changes(now)[0], min(hold(now, now.speed + 10.0 * smooth_step(now.t / 15.0)), 2.0)
+    return two_lane_changes(now)[0], min(
+        hold(now, now.speed + 10.0 * smooth_step(now.t / 15.0)), 2.0
+    )
 
 
 def gaining_slalom(now: Moment) -> tuple[float, float]:
@@ -204,15 +214,17 @@ def brisk_acceleration(now: Moment) -> tuple[float, float]:
 
 def moderate_braking(now: Moment) -> tuple[float, float]:
     """0.28 g after one second, down to walking pace."""
-    return steer_to(now, now.x + preview(now), 0.0), -0.28 * GRAVITY if now.t >= 1.0 and now.vx > 2.0 else min(
-        hold(now), 1.0
-    )
+    return steer_to(
+        now, now.x + preview(now), 0.0
+    ), -0.28 * GRAVITY if now.t >= 1.0 and now.vx > 2.0 else min(hold(now), 1.0)
 
 
 def pulses(now: Moment) -> tuple[float, float]:
     """Two seconds of throttle, two of brakes, in a gentle weave: town traffic in short."""
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
-    return 0.03 * math.sin(2.0 * now.t), wanted if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
+    return 0.03 * math.sin(
+        2.0 * now.t
+    ), wanted if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
 
 
 def standing(_now: Moment) -> tuple[float, float]:
@@ -237,27 +249,53 @@ def kmh(speed: float) -> float:
 
 
 MANOEUVRES: Final = {
-    "double-lane-change": Manoeuvre(double_lane_change, kmh(80), 10.0, 0.85, "double lane change, ISO 3888-1 in kind"),
+    "double-lane-change": Manoeuvre(
+        double_lane_change, kmh(80), 10.0, 0.85, "double lane change, ISO 3888-1 in kind"
+    ),
     "slalom": Manoeuvre(slalom, kmh(30), 15.0, 0.30, "slalom around cones 18 m apart"),
     "sine": Manoeuvre(sine, kmh(70), 12.0, 0.50, "sine steering of half a hertz"),
     "acceleration": Manoeuvre(acceleration, kmh(20), 8.0, 0.85, "full throttle in a straight line"),
-    "braking": Manoeuvre(braking, kmh(80), 8.0, 0.85, "stop with anti-lock control, ISO 21994 in kind"),
-    "jump-braking": Manoeuvre(braking, kmh(80), 8.0, jump(0.85, 0.30, 45.0), "the same stop from dry onto snow"),
-    "split-braking": Manoeuvre(split_braking, kmh(60), 8.0, split(0.80, 0.30), "stop with one side on snow, ISO 14512"),
+    "braking": Manoeuvre(
+        braking, kmh(80), 8.0, 0.85, "stop with anti-lock control, ISO 21994 in kind"
+    ),
+    "jump-braking": Manoeuvre(
+        braking, kmh(80), 8.0, jump(0.85, 0.30, 45.0), "the same stop from dry onto snow"
+    ),
+    "split-braking": Manoeuvre(
+        split_braking, kmh(60), 8.0, split(0.80, 0.30), "stop with one side on snow, ISO 14512"
+    ),
     "gentle-braking": Manoeuvre(gentle_braking, kmh(60), 10.0, 0.85, "braking with 2 m/s^2"),
-    "constant-radius": Manoeuvre(constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, ISO 4138 in kind"),
-    "straight": Manoeuvre(straight, kmh(60), 20.0, 0.85, "straight on at constant speed: unexcited"),
+    "constant-radius": Manoeuvre(
+        constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, ISO 4138 in kind"
+    ),
+    "straight": Manoeuvre(
+        straight, kmh(60), 20.0, 0.85, "straight on at constant speed: unexcited"
+    ),
     "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, ISO 7401 in kind"),
-    "two-lane-changes": Manoeuvre(two_lane_changes, kmh(30), 25.0, jump(0.5, 0.3, 110.0), "wet, then snow: paper 000"),
-    "accelerating-sine": Manoeuvre(accelerating_sine, 20.0, 13.0, 0.70, "sine, then faster: paper 002"),
-    "gaining-lane-changes": Manoeuvre(gaining_lane_changes, kmh(4), 20.0, 0.90, "lane changes, faster: paper 001"),
+    "two-lane-changes": Manoeuvre(
+        two_lane_changes, kmh(30), 25.0, jump(0.5, 0.3, 110.0), "wet, then snow: paper 000"
+    ),
+    "accelerating-sine": Manoeuvre(
+        accelerating_sine, 20.0, 13.0, 0.70, "sine, then faster: paper 002"
+    ),
+    "gaining-lane-changes": Manoeuvre(
+        gaining_lane_changes, kmh(4), 20.0, 0.90, "lane changes, faster: paper 001"
+    ),
     "gaining-slalom": Manoeuvre(gaining_slalom, kmh(4.68), 20.0, 0.90, "slalom, faster: paper 001"),
     "low-turn": Manoeuvre(low_turn, kmh(40), 8.0, 0.35, "a turn on snow: paper 003"),
     "firm-acceleration": Manoeuvre(firm_acceleration, kmh(20), 5.0, 0.85, "0.6 g: paper 003"),
     "throttle": Manoeuvre(throttle, kmh(20), 10.0, 0.85, "3 m/s^2 from the start: paper 003"),
-    "brisk-acceleration": Manoeuvre(brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"),
-    "moderate-braking": Manoeuvre(moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"),
-    "standing": Manoeuvre(standing, 0.0, 60.0, 0.85, "at rest, the foot on the brake: level or on a slope"),
-    "stop-and-go": Manoeuvre(stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, stand, start again"),
+    "brisk-acceleration": Manoeuvre(
+        brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"
+    ),
+    "moderate-braking": Manoeuvre(
+        moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"
+    ),
+    "standing": Manoeuvre(
+        standing, 0.0, 60.0, 0.85, "at rest, the foot on the brake: level or on a slope"
+    ),
+    "stop-and-go": Manoeuvre(
+        stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, stand, start again"
+    ),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

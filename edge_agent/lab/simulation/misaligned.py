@@ -50,7 +50,9 @@ class Misalignment:
 
 
 ALIGNED: Final = Misalignment()
-ROUGH: Final = Misalignment(tilt=(0.035, 0.015, 0.01), steering=(0.003, 0.03, 0.05), radius=0.004, step=0.1, lag_s=0.06)
+ROUGH: Final = Misalignment(
+    tilt=(0.035, 0.015, 0.01), steering=(0.003, 0.03, 0.05), radius=0.004, step=0.1, lag_s=0.06
+)
 MISALIGNED: Final = {
     "rough": ROUGH, "rough-coarse": replace(ROUGH, step=KMH), "rough-late": replace(ROUGH, lag_s=0.4),
 }  # fmt: skip
@@ -76,7 +78,12 @@ def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
     """Misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
     key, row = key_of(seed, index, MOUNT_STREAM), np.zeros(COLUMNS)
     row[Misaligned.ROUGH] = float(size != ALIGNED)
-    stds = (*(GRAVITY * tilt for tilt in size.tilt[:2]), size.tilt[2], *size.steering, *[size.radius] * 4)
+    stds = (
+        *(GRAVITY * tilt for tilt in size.tilt[:2]),
+        size.tilt[2],
+        *size.steering,
+        *[size.radius] * 4,
+    )
     for k, std in enumerate(stds):
         row[Misaligned.AX + k] = std * normal(key, k)
     row[Misaligned.STEP] = size.step * uniform(key, 100)

@@ -92,7 +92,11 @@ def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: 
         if share == 1.0:  # an integral that grows while the voltage is at its limit would overshoot
             state[D_SUM] += step * error_d
             state[Q_SUM] += step * error_q
-        state[D] += step * (share * voltage_d - motor.resistance * state[D] + back_d) / motor.inductance_d
-        state[Q] += step * (share * voltage_q - motor.resistance * state[Q] - back_q) / motor.inductance_q
+        state[D] += (
+            step * (share * voltage_d - motor.resistance * state[D] + back_d) / motor.inductance_d
+        )
+        state[Q] += (
+            step * (share * voltage_q - motor.resistance * state[Q] - back_q) / motor.inductance_q
+        )
     reluctance = (motor.inductance_d - motor.inductance_q) * state[D] * state[Q]
     return float(motor.gear * 1.5 * motor.pole_pairs * (motor.flux * state[Q] + reluctance))

@@ -29,10 +29,14 @@ class Origin:
         north, east = self.per_metre
         return self.latitude + np.asarray(y) * north, self.longitude + np.asarray(x) * east
 
-    def from_latlon(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def from_latlon(
+        self, latitude: FloatArray, longitude: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """(x, y) [m] of the points given in degrees."""
         north, east = self.per_metre
-        return (np.asarray(longitude) - self.longitude) / east, (np.asarray(latitude) - self.latitude) / north
+        return (np.asarray(longitude) - self.longitude) / east, (
+            np.asarray(latitude) - self.latitude
+        ) / north
 
 
 GOTHENBURG: Final = Origin(57.70, 11.97)

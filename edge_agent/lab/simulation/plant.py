@@ -45,13 +45,22 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
-SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
+SOFTEST: Final = (
+    0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
+)
 FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
 STANDING: Final = 1.0  # [rad/s] below it rolling resistance fades
 DIRECT: Final = 0.2  # share of the slip that a relaxing tyre takes at once
-FREE_SPIN: Final = (6.0, 12.0)  # [m/s] that driven wheels may be faster than the car: from there the engine gives less
-BRAKED: Final = 0.1  # [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
-STILL: Final = 0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
+FREE_SPIN: Final = (
+    6.0,
+    12.0,
+)  # [m/s] that driven wheels may be faster than the car: from there the engine gives less
+BRAKED: Final = (
+    0.1  # [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
+)
+STILL: Final = (
+    0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
+)
 
 
 @compiled
@@ -75,7 +84,9 @@ def allowed(slip: float, limit: float) -> float:
 
 
 @compiled
-def wheel_torques(x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float) -> tuple[float, float]:
+def wheel_torques(
+    x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
+) -> tuple[float, float]:
     """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its slip."""
     drive, brake = u[Control.DRIVE, i], u[Control.BRAKE, i]
     if p[TrueParameter.ABS_HZ] > 0.0:
@@ -99,7 +110,9 @@ def wheel_torques(x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: flo
 def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """Let the tyres build up slip for `dt` [s] over their relaxation length, after the wheels have turned."""
     for i in range(4):
-        along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
+        along, across = wheel_velocity(
+            p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
+        )
         slip_x, slip_y = slips(p[Parameter.RADIUS], x[Motion.OMEGA + i], along, across)
         rolled = max(abs(along), abs(p[Parameter.RADIUS] * x[Motion.OMEGA + i]), SLOWEST_M_S)
         share = -math.expm1(-dt * rolled / p[TrueParameter.RELAXATION])
@@ -115,14 +128,20 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
     _, _, share = gravity(u)
     for i in range(4):
         load, omega = share * loads[i], x[Motion.OMEGA + i]
-        along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
+        along, across = wheel_velocity(
+            p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
+        )
         slip_x, slip_y = slips(p[Parameter.RADIUS], omega, along, across)
         raw_slip = slip_x
         if p[TrueParameter.RELAXATION] > 0.0:
             slip_x = DIRECT * slip_x + (1.0 - DIRECT) * x[Motion.SLIP_X + i]
             slip_y = DIRECT * slip_y + (1.0 - DIRECT) * x[Motion.SLIP_Y + i]
-        slope_x = stiffness_per_load(p[Parameter.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
-        slope_y = stiffness_per_load(p[Parameter.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        slope_x = stiffness_per_load(
+            p[Parameter.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i]
+        )
+        slope_y = stiffness_per_load(
+            p[Parameter.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i]
+        )
         if i >= 2:
             slope_y *= p[Parameter.REAR_SLOPE]
         if p[TrueParameter.SOFTENING] > 0.0:
@@ -141,25 +160,39 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         drive, brake = wheel_torques(x, p, u, i, raw_slip)
         w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
         w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, raw_slip, theta
-        w[Wheel.SLOPE, i] = secant * slope_x * load * p[Parameter.RADIUS] / max(abs(along), SLOWEST_M_S)
+        w[Wheel.SLOPE, i] = (
+            secant * slope_x * load * p[Parameter.RADIUS] / max(abs(along), SLOWEST_M_S)
+        )
         if p[TrueParameter.RELAXATION] > 0.0:
             w[Wheel.SLOPE, i] *= DIRECT
         w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
 @compiled
-def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> tuple[float, float, float]:
+def body_accelerations(
+    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray
+) -> tuple[float, float, float]:
     """(a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw acceleration [rad/s^2].
 
     `w` is filled.
     """
     ax, ay, yaw_acceleration = accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
-    return ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[Parameter.MASS], ay, yaw_acceleration
+    return (
+        ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[Parameter.MASS],
+        ay,
+        yaw_acceleration,
+    )
 
 
 @compiled
 def turn_wheels(
-    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, gain: float, yaw_acceleration: float
+    x: FloatArray,
+    p: FloatArray,
+    u: FloatArray,
+    w: FloatArray,
+    dt: float,
+    gain: float,
+    yaw_acceleration: float,
 ) -> None:
     """One linearly implicit Euler step of the wheel speeds in `x`: every torque that falls with ω damps it.
 
@@ -171,12 +204,19 @@ def turn_wheels(
         omega, slip = x[Motion.OMEGA + i], abs(w[Wheel.SLIP, i])
         slow = max(abs(omega), STANDING)
         resistance = p[TrueParameter.ROLLING] * radius * w[Wheel.FZ, i] * omega / slow
-        excess = w[Wheel.TORQUE, i] - resistance - radius * w[Wheel.FX, i] + dt * w[Wheel.SLOPE, i] * ground
+        excess = (
+            w[Wheel.TORQUE, i]
+            - resistance
+            - radius * w[Wheel.FX, i]
+            + dt * w[Wheel.SLOPE, i] * ground
+        )
         damping = radius * w[Wheel.SLOPE, i]
         smooth = p[TrueParameter.ABS_HZ] <= 0.0
         if smooth and slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
             asked = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
-            damping += asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+            damping += (
+                asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+            )
         if abs(omega) < BRAKED:
             damping += u[Control.BRAKE, i] / BRAKED
         x[Motion.OMEGA + i] = omega + dt * excess / (p[Parameter.WHEEL_INERTIA] + dt * damping)
@@ -194,7 +234,9 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
         pull += u[Control.DRIVE, i] / p[Parameter.RADIUS]
         grip += 0.25 * u[Control.MU, i] * p[Parameter.MASS] * GRAVITY * share
     pull += p[Parameter.MASS] * along
-    return bool(brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[Parameter.MASS] * across) <= grip)
+    return bool(
+        brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[Parameter.MASS] * across) <= grip
+    )
 
 
 @compiled
@@ -210,7 +252,9 @@ def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 
 
 @compiled
-def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int) -> None:
+def advance(
+    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
+) -> None:
     """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is scratch."""
     along, across, _ = gravity(u)
     for _ in range(substeps):
@@ -251,7 +295,9 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
         side = 1.0 if i % 2 == 0 else -1.0
         inner = 1.0 - side * 0.5 * p[Parameter.TRACK_FRONT] * curvature
         u[Control.STEER, i] = (
-            math.atan(front / inner) if i < 2 else p[TrueParameter.REAR_STEER] * math.atan(front / inner)
+            math.atan(front / inner)
+            if i < 2
+            else p[TrueParameter.REAR_STEER] * math.atan(front / inner)
         )
         drive_share = p[Parameter.DRIVE_FRONT] if i < 2 else 1.0 - p[Parameter.DRIVE_FRONT]
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]

@@ -40,12 +40,22 @@ class TrueVehicle:
     power: float = 90e3
     curve: str = "magic-formula"  # a key of CURVES
     softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
-    stiffness: str = "similarity"  # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
-    rear_slope: float = 1.0  # cornering stiffness per load of the rear tyres over that of the front ones
-    motors: Pmsm | None = None  # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
-    rear_steer: float = 0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
+    stiffness: str = (
+        "similarity"  # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
+    )
+    rear_slope: float = (
+        1.0  # cornering stiffness per load of the rear tyres over that of the front ones
+    )
+    motors: Pmsm | None = (
+        None  # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
+    )
+    rear_steer: float = (
+        0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
+    )
     relaxation: float = 0.0  # [m] in which the tyres build up slip
-    abs_hz: float = 0.0  # cycles per second of anti-lock control; 0: smooth slip control that is not reported
+    abs_hz: float = (
+        0.0  # cycles per second of anti-lock control; 0: smooth slip control that is not reported
+    )
     tcs: float = 0.0  # 1: traction control, of vehicles with abs_hz
     esc: float = 0.0  # 1: stability control, likewise
     regeneration: float = 0.0  # [m/s^2] of braking by engine or generator, at the driven wheels
@@ -53,16 +63,31 @@ class TrueVehicle:
     def __post_init__(self) -> None:
         for field, known in (("curve", CURVES), ("stiffness", ("similarity", *STIFFNESSES))):
             if getattr(self, field) not in known:
-                raise InputError(field, f"there is no {getattr(self, field)!r}", f"choose one of {', '.join(known)}")
+                raise InputError(
+                    field,
+                    f"there is no {getattr(self, field)!r}",
+                    f"choose one of {', '.join(known)}",
+                )
         if self.stiffness != "similarity" and self.softening:
-            raise InputError("softening", "the stiffness is proportional to friction", "leave one of them out")
+            raise InputError(
+                "softening", "the stiffness is proportional to friction", "leave one of them out"
+            )
 
     def row(self) -> FloatArray:
         """The parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and `TrueParameter`."""
         drive = self.vehicle.drive_split_front
-        nominal = parameter_row(self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive}))
+        nominal = parameter_row(
+            self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive})
+        )
         nominal[Parameter.REAR_SLOPE] = self.rear_slope
-        own = (self.shape, self.curvature, self.degression, self.lag, self.roll_leak, self.pitch_leak)
+        own = (
+            self.shape,
+            self.curvature,
+            self.degression,
+            self.lag,
+            self.roll_leak,
+            self.pitch_leak,
+        )
         return np.array([
             *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
             CURVES[self.curve], STIFFNESSES.get(self.stiffness, self.softening), self.rear_steer,
@@ -123,7 +148,11 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
     if isinstance(vehicle, Vehicle):
         return TrueVehicle(vehicle)
     if vehicle not in PRESETS:
-        raise InputError("vehicle", f"there is no vehicle preset {vehicle!r}", f"choose one of {', '.join(PRESETS)}")
+        raise InputError(
+            "vehicle",
+            f"there is no vehicle preset {vehicle!r}",
+            f"choose one of {', '.join(PRESETS)}",
+        )
     return PRESETS[vehicle]
 
 
@@ -132,7 +161,9 @@ def matched(vehicle: TrueVehicle) -> TrueVehicle:
 
     The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
     """
-    return replace(vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0)
+    return replace(
+        vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0
+    )
 
 
 def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
@@ -143,7 +174,10 @@ def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehic
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
     """What the vehicle file says: the true parameters, each off by a normal error of the size in KNOWN."""
-    file_values = {name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std)) for name, std in KNOWN.items()}
+    file_values = {
+        name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std))
+        for name, std in KNOWN.items()
+    }
     return truth.vehicle.model_copy(update=file_values)
 
 

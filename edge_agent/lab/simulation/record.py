@@ -56,9 +56,17 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
         x[Motion.VX],
         x[Motion.VY],
     )
-    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = x[Motion.X], x[Motion.Y], x[Motion.YAW]
+    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = (
+        x[Motion.X],
+        x[Motion.Y],
+        x[Motion.YAW],
+    )
     for i in range(4):
-        record[RecordColumn.DELTA + i], record[RecordColumn.OMEGA + i], record[RecordColumn.TORQUE + i] = (
+        (
+            record[RecordColumn.DELTA + i],
+            record[RecordColumn.OMEGA + i],
+            record[RecordColumn.TORQUE + i],
+        ) = (
             u[Control.STEER, i],
             x[Motion.OMEGA + i],
             w[Wheel.TORQUE, i],
@@ -88,5 +96,9 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
         record[RecordColumn.OMEGA + i] = 0.0
         record[RecordColumn.THETA + i] = 0.0
-        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
-        record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
+        record[RecordColumn.TORQUE + i] = (
+            -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
+        )
+        record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (
+            u[Control.MU, i] * GRAVITY * share
+        )

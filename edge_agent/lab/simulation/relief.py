@@ -41,7 +41,9 @@ class Wave:
 
     def __post_init__(self) -> None:
         if not (abs(self.peak) <= STEEPEST and self.length > 0.0):
-            raise InputError("slope", f"{self.peak} over {self.length} m", f"give at most {STEEPEST} either way")
+            raise InputError(
+                "slope", f"{self.peak} over {self.length} m", f"give at most {STEEPEST} either way"
+            )
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,14 @@ class Relief:
         table[0, :2] = self.crossfall, self.banking
         for row, wave in zip(table[1:], self.waves, strict=True):
             number = 2.0 * math.pi / wave.length
-            row[:] = (wave.peak, math.cos(wave.towards), math.sin(wave.towards), number, wave.phase, wave.stepped)
+            row[:] = (
+                wave.peak,
+                math.cos(wave.towards),
+                math.sin(wave.towards),
+                number,
+                wave.phase,
+                wave.stepped,
+            )
         return table
 
 
@@ -118,7 +127,9 @@ def level(_seed: int) -> Relief:
 def rolling(seed: int) -> Relief:
     """Waves of 3 % along the road, 300 and 120 m long."""
     key = key_of(seed, RELIEF_STREAM)
-    return Relief(tuple(Wave(0.03, length, 0.0, _turn(key, k)) for k, length in enumerate((300.0, 120.0))))
+    return Relief(
+        tuple(Wave(0.03, length, 0.0, _turn(key, k)) for k, length in enumerate((300.0, 120.0)))
+    )
 
 
 def stepped(seed: int) -> Relief:
@@ -157,7 +168,9 @@ def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
     """
     if isinstance(name, str):
         if name not in ROADS:
-            raise InputError("road", f"there is no road {name!r}", f"choose one of {', '.join(ROADS)}")
+            raise InputError(
+                "road", f"there is no road {name!r}", f"choose one of {', '.join(ROADS)}"
+            )
         name = ROADS[name](checked_seed(seed))
     return replace(name, waves=(*name.waves, Wave(slope))) if slope else name
 

@@ -20,7 +20,9 @@ from schemas.numeric import FloatArray, IntArray
 
 SPACING_M: Final = 1.0
 LANE_OFFSET_M: Final = 2.0  # lanes of opposite directions are 4 m apart
-SETBACK_M: Final = 12.0  # where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
+SETBACK_M: Final = (
+    12.0  # where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
+)
 SMOOTHING_M: Final = 5.0  # a driver opens his path where arcs meet straights
 BRAKING: Final = 0.8  # share of the budget that is used to slow down
 STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] no road is straighter than this to a driver's speed
@@ -91,10 +93,17 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
     for number, road in enumerate(roads):
         for name in (road.start, road.end):
             if name not in junctions:
-                raise InputError("roads", f"road {number} leads to {name!r}", f"use one of {', '.join(junctions)}")
+                raise InputError(
+                    "roads",
+                    f"road {number} leads to {name!r}",
+                    f"use one of {', '.join(junctions)}",
+                )
         centre = rounded([junctions[road.start], *road.bends, junctions[road.end]], road.radius)
         centre = centre[_within(centre, SETBACK_M)]
-        for line, start, end in ((centre, road.start, road.end), (centre[::-1], road.end, road.start)):
+        for line, start, end in (
+            (centre, road.start, road.end),
+            (centre[::-1], road.end, road.start),
+        ):
             lanes.append(resampled(shifted_right(line, LANE_OFFSET_M)))
             leaves.append((start, number))
             arrives.append(end)
@@ -107,7 +116,11 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
                 lanes.append(connector(lanes[k], lanes[j]))
                 ways.append([j])
         if not 1 <= len(ways[k]) <= MOST_WAYS:
-            raise InputError("roads", f"lane {k} has {len(ways[k])} ways to go on", f"join 2 to {MOST_WAYS + 1} roads")
+            raise InputError(
+                "roads",
+                f"lane {k} has {len(ways[k])} ways to go on",
+                f"join 2 to {MOST_WAYS + 1} roads",
+            )
     return network_of(lanes, ways, count)
 
 
@@ -125,7 +138,9 @@ def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
         spoke = start - centre
         for angle in np.linspace(0.0, swept * turn, max(2, round(radius * swept / 0.25))):
             c, s = math.cos(angle), math.sin(angle)
-            line.append(centre + np.array([c * spoke[0] - s * spoke[1], s * spoke[0] + c * spoke[1]]))
+            line.append(
+                centre + np.array([c * spoke[0] - s * spoke[1], s * spoke[0] + c * spoke[1]])
+            )
         line[-1] = end
     line.append(np.array(corners[-1]))
     return resampled(np.array(line), 0.25)
@@ -149,9 +164,14 @@ def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
     """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other without a kink."""
     p0, p3 = arriving[-1], leaving[0]
     handle = HANDLE * float(np.linalg.norm(p3 - p0))
-    p1, p2 = p0 + handle * _unit(arriving[-1] - arriving[-2]), p3 - handle * _unit(leaving[1] - leaving[0])
+    p1, p2 = (
+        p0 + handle * _unit(arriving[-1] - arriving[-2]),
+        p3 - handle * _unit(leaving[1] - leaving[0]),
+    )
     u = np.linspace(0.0, 1.0, 200)[:, None]
-    return resampled((1 - u) ** 3 * p0 + 3 * (1 - u) ** 2 * u * p1 + 3 * (1 - u) * u**2 * p2 + u**3 * p3)
+    return resampled(
+        (1 - u) ** 3 * p0 + 3 * (1 - u) ** 2 * u * p1 + 3 * (1 - u) * u**2 * p2 + u**3 * p3
+    )
 
 
 def _unit(v: FloatArray) -> FloatArray:
@@ -171,7 +191,10 @@ def _within(line: FloatArray, setback: float) -> IntArray:
 
 
 def network_of(
-    lanes: list[FloatArray], ways: list[list[int]], roads: int, allowed: list[FloatArray] | None = None
+    lanes: list[FloatArray],
+    ways: list[list[int]],
+    roads: int,
+    allowed: list[FloatArray] | None = None,
 ) -> Network:
     """Lanes with headings, curvatures and profiles.
 
@@ -186,7 +209,9 @@ def network_of(
     for k, targets in enumerate(ways):
         onward[k, : len(targets)] = targets
     tables = [_lane_table(lane) for lane in lanes]
-    limits = [np.maximum(np.abs(table[:, LanePoint.CURVATURE]), STRAIGHTEST) ** -1 for table in tables]
+    limits = [
+        np.maximum(np.abs(table[:, LanePoint.CURVATURE]), STRAIGHTEST) ** -1 for table in tables
+    ]
     for k in range(roads, len(lanes)):
         limits[k] = np.minimum(limits[k], YIELD_M)
     if allowed is not None:
@@ -206,7 +231,9 @@ def _lane_table(lane: FloatArray) -> FloatArray:
     return np.column_stack([lane, np.cos(heading), np.sin(heading), curvature, empty])
 
 
-def _plan(tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray) -> None:
+def _plan(
+    tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
+) -> None:
     """Fill the profiles from their ends backwards until nothing changes.
 
     No point may need more braking than the budget leaves beside the cornering there.
@@ -221,5 +248,8 @@ def _plan(tables: list[FloatArray], limits: list[FloatArray], ways: list[list[in
                     table[i, LanePoint.PROFILE + way] = allowed
                     across = min(allowed * abs(float(table[i, LanePoint.CURVATURE])), 1.0)
                     allowed += 2.0 * BRAKING * math.sqrt(1.0 - across * across) * spacing[k]
-        if all(np.array_equal(old, table[0, LanePoint.PROFILE :]) for old, table in zip(before, tables, strict=True)):
+        if all(
+            np.array_equal(old, table[0, LanePoint.PROFILE :])
+            for old, table in zip(before, tables, strict=True)
+        ):
             return

@@ -10,7 +10,16 @@ from typing import Final
 import numpy as np
 
 from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
-from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch, PatchColumn, friction_table, look_up_many
+from edge_agent.lab.simulation.friction import (
+    DRY,
+    ICE,
+    SNOW,
+    WET,
+    Patch,
+    PatchColumn,
+    friction_table,
+    look_up_many,
+)
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
 from edge_agent.lab.simulation.roads import LanePoint, Network, Road, build_network
@@ -60,19 +69,25 @@ class Scenario:
     @property
     def events(self) -> tuple[Patch, ...]:
         """What appears while one drives, in the order of time."""
-        return tuple(sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start))
+        return tuple(
+            sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start)
+        )
 
     def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
         """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
         # copies: numpy warns who looks whether a broadcast view may be written, and the compiler does at a first call
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
-        return look_up_many(self.table, int(PatchColumn.MU), t.ravel(), x.ravel(), y.ravel()).reshape(x.shape)
+        return look_up_many(
+            self.table, int(PatchColumn.MU), t.ravel(), x.ravel(), y.ravel()
+        ).reshape(x.shape)
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(latitude, longitude) [deg]."""
         return self.origin.to_latlon(x, y)
 
-    def from_latlon(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def from_latlon(
+        self, latitude: FloatArray, longitude: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """(x, y) [m]."""
         return self.origin.from_latlon(latitude, longitude)
 
@@ -118,7 +133,12 @@ def hills() -> Scenario:
         (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
         crossfall=0.025, banking=0.5,
     )  # fmt: skip
-    return replace(demo(), name="hills", about="the demo's town on slopes to 8 %, with crossfall", relief=relief)
+    return replace(
+        demo(),
+        name="hills",
+        about="the demo's town on slopes to 8 %, with crossfall",
+        relief=relief,
+    )
 
 
 def frost() -> Scenario:
@@ -132,7 +152,10 @@ def frost() -> Scenario:
         ("Brogatan", 40.0, 0.0, 0.0), ("Kyrkogatan", 14.0, 112.0, math.pi / 2), ("Norra Ringvägen", 66.0, 144.0, 0.0),
         ("Östra Ringvägen", 190.0, 62.0, math.pi / 2), ("Östra Ringvägen south", 190.0, -34.0, math.pi / 2),
     )  # fmt: skip
-    ice = tuple(Patch(f"black ice on {name}", x, y, 44.0, 12.0, ICE, angle, start=35.0) for name, x, y, angle in places)
+    ice = tuple(
+        Patch(f"black ice on {name}", x, y, 44.0, 12.0, ICE, angle, start=35.0)
+        for name, x, y, angle in places
+    )
     return replace(town, name="frost", about="the town on hills; at 35 s black ice appears at five places",
                    patches=(*kept, *ice))  # fmt: skip
 
@@ -145,19 +168,29 @@ def drawn(seed: int) -> Scenario:
     """
     key, usual = key_of(checked_seed(seed), DRAWN_STREAM), demo()
     kinds = {DRY: (0.78, 1.05), WET: (0.50, 0.72), SNOW: (0.25, 0.42), ICE: (0.10, 0.195)}
-    now = {kind: low + (high - low) * uniform(key, k) for k, (kind, (low, high)) in enumerate(kinds.items())}
+    now = {
+        kind: low + (high - low) * uniform(key, k)
+        for k, (kind, (low, high)) in enumerate(kinds.items())
+    }
     patches = tuple(
         replace(p, mu=now[p.mu], looks=now.get(p.looks, p.looks) if p.looks is not None else None,
                 start=30.0 if math.isfinite(p.start) else p.start)
         for p in usual.patches
     )  # fmt: skip
     waves = tuple(
-        Wave(peak, length, 2.0 * math.pi * uniform(key, 10 + k), 2.0 * math.pi * uniform(key, 20 + k))
+        Wave(
+            peak, length, 2.0 * math.pi * uniform(key, 10 + k), 2.0 * math.pi * uniform(key, 20 + k)
+        )
         for k, (peak, length) in enumerate(((0.045, 620.0), (0.035, 290.0), (0.02, 150.0)))
     )
     relief = Relief(waves, crossfall=0.03 * uniform(key, 30), banking=0.5)
     return replace(
-        usual, name=f"{DRAWN}{seed}", about="a town on drawn hills", background=now[DRY], patches=patches, relief=relief
+        usual,
+        name=f"{DRAWN}{seed}",
+        about="a town on drawn hills",
+        background=now[DRY],
+        patches=patches,
+        relief=relief,
     )
 
 
@@ -178,7 +211,13 @@ def winter(seed: int) -> Scenario:
         )
     temperature = -6.0 + 7.0 * uniform(key, 99)
     about = "a winter town on drawn hills"
-    return replace(town, name=f"{WINTER}{seed}", about=about, patches=tuple(patches), air_temperature=temperature)
+    return replace(
+        town,
+        name=f"{WINTER}{seed}",
+        about=about,
+        patches=tuple(patches),
+        air_temperature=temperature,
+    )
 
 
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
@@ -202,7 +241,14 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
         length = 25.0 + 20.0 * size
         row = last - int(5.0 + 20.0 * place + 0.5 * length)
         return [
-            _lay_patch(f"rut {side:+.0f} of lane {lane}", points, row, (length, 0.7), slush, side * 0.5 * TRACK_M)
+            _lay_patch(
+                f"rut {side:+.0f} of lane {lane}",
+                points,
+                row,
+                (length, 0.7),
+                slush,
+                side * 0.5 * TRACK_M,
+            )
             for side in (-1.0, 1.0)
         ]
     return []
@@ -216,7 +262,9 @@ def _lay_patch(
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])
     y = float(point[LanePoint.Y] + left * point[LanePoint.COS])
     angle = math.atan2(point[LanePoint.SIN], point[LanePoint.COS])
-    return Patch(name, x, y, size[0], size[1], mu, angle, looks=WET if name.startswith("rut") else None)
+    return Patch(
+        name, x, y, size[0], size[1], mu, angle, looks=WET if name.startswith("rut") else None
+    )
 
 
 def tiny() -> Scenario:

@@ -47,7 +47,10 @@ class Sensors:
     yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s]
     steering: tuple[float, float] = (0.0, 0.0)  # [rad]
     wheel_speed: float = 0.0  # [rad/s] white
-    torque: tuple[float, float] = (0.0, 0.0)  # [N·m] white; relative error of the gain, one for all wheels
+    torque: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # [N·m] white; relative error of the gain, one for all wheels
     position: tuple[float, float] = (0.0, 0.0)  # [m] white, wandering, north and east each
     yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white, wandering
     leak: bool = False  # accelerometers fixed to the rolling body
@@ -91,7 +94,16 @@ WHITE_STREAM: Final = 2
 SILENCE_STREAM: Final = 3
 
 # channels that fall silent together: inertial unit, steering, each wheel's speed, torques, receiver
-GROUPS: Final = ("inertial", "steering", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "torque", "receiver")
+GROUPS: Final = (
+    "inertial",
+    "steering",
+    "wheel_fl",
+    "wheel_fr",
+    "wheel_rl",
+    "wheel_rr",
+    "torque",
+    "receiver",
+)
 GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7])
 
 
@@ -119,7 +131,9 @@ def sensors_named(name: str | Sensors) -> Sensors:
     if isinstance(name, Sensors):
         return name
     if name not in SENSORS:
-        raise InputError("sensors", f"there is no sensor set {name!r}", f"choose one of {', '.join(SENSORS)}")
+        raise InputError(
+            "sensors", f"there is no sensor set {name!r}", f"choose one of {', '.join(SENSORS)}"
+        )
     return SENSORS[name]
 
 
@@ -141,7 +155,9 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
     offset[S.DELTA : S.DELTA + 4] = offset[S.DELTA]  # one steering sensor feeds the four angles
     wander = (sensors.position[1] * north, sensors.position[1] * east, sensors.yaw[1])
     mounted = misalignment_row(sensors.mounted, seed, index)
-    return np.array([*white, *offset, *gain, *wander, float(sensors.leak), sensors.dropouts, *mounted])
+    return np.array(
+        [*white, *offset, *gain, *wander, float(sensors.leak), sensors.dropouts, *mounted]
+    )
 
 
 def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
@@ -167,7 +183,12 @@ def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: 
 
 @compiled
 def read_late(
-    records: FloatArray, lead: int, error: FloatArray, place: FloatArray, rate_hz: float, signals: FloatArray
+    records: FloatArray,
+    lead: int,
+    error: FloatArray,
+    place: FloatArray,
+    rate_hz: float,
+    signals: FloatArray,
 ) -> None:
     """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
     record, readings = np.empty(records.shape[1]), np.empty(signals.size)
@@ -232,6 +253,9 @@ def sense(
             if error[ErrorColumn.DROPOUTS] > 0.0:
                 window = sample // per_silence
                 for c in range(len(CHANNELS)):
-                    if uniform(silence[n], window * len(GROUPS) + GROUP_OF[c]) < error[ErrorColumn.DROPOUTS]:
+                    if (
+                        uniform(silence[n], window * len(GROUPS) + GROUP_OF[c])
+                        < error[ErrorColumn.DROPOUTS]
+                    ):
                         row[c] = math.nan
     return signals

@@ -13,7 +13,13 @@ import pyarrow as pa
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation.counter_rng import checked_seed
 from edge_agent.lab.simulation.faults import Fault, apply_faults
-from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment, TimedFriction
+from edge_agent.lab.simulation.manoeuvres import (
+    MANOEUVRES,
+    Friction,
+    Manoeuvre,
+    Moment,
+    TimedFriction,
+)
 from edge_agent.lab.simulation.motor import at_rest, turn_motor
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.plant import (
@@ -29,7 +35,14 @@ from edge_agent.lab.simulation.plant import (
 from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
 from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
 from edge_agent.lab.simulation.relief import Relief, cross_slope, gradient, road_named, tilt
-from edge_agent.lab.simulation.sensors import SENSORS, Sensors, error_row, noise_keys, sense, sensors_named
+from edge_agent.lab.simulation.sensors import (
+    SENSORS,
+    Sensors,
+    error_row,
+    noise_keys,
+    sense,
+    sensors_named,
+)
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -80,18 +93,26 @@ def simulate_manoeuvre(
     _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
-    world = ProvingGround(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
+    world = ProvingGround(
+        _friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table
+    )
     records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
     signals = _sensed(records, chosen, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
     signals = apply_faults(t, signals, faults)
-    file = truth.vehicle if chosen == SENSORS["ideal"] else nominal(truth, np.random.default_rng([seed, 0]))
+    file = (
+        truth.vehicle
+        if chosen == SENSORS["ideal"]
+        else nominal(truth, np.random.default_rng([seed, 0]))
+    )
     return _table(t, signals, records), file
 
 
 def _named(name: str) -> Manoeuvre:
     if name not in MANOEUVRES:
-        raise InputError("manoeuvre", f"there is no manoeuvre {name!r}", f"choose one of {', '.join(MANOEUVRES)}")
+        raise InputError(
+            "manoeuvre", f"there is no manoeuvre {name!r}", f"choose one of {', '.join(MANOEUVRES)}"
+        )
     return MANOEUVRES[name]
 
 
@@ -119,10 +140,20 @@ class ProvingGround(NamedTuple):
 
 
 def _drive(
-    manoeuvre: Manoeuvre, truth: TrueVehicle, world: ProvingGround, speed: float, rate_hz: float, samples: int
+    manoeuvre: Manoeuvre,
+    truth: TrueVehicle,
+    world: ProvingGround,
+    speed: float,
+    rate_hz: float,
+    samples: int,
 ) -> FloatArray:
     """True records (T, RECORD) of the drive; the driver gives as much more gas as a slope takes."""
-    p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
+    p, x, u, w = (
+        truth.row(),
+        np.zeros(STATES),
+        np.zeros((len(Control), 4)),
+        np.zeros((len(Wheel), 4)),
+    )
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
@@ -138,7 +169,9 @@ def _drive(
         wish, acceleration = manoeuvre.control(now)
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
-            force = float(p[Parameter.MASS]) * acceleration  # who stands has had his foot down before
+            force = (
+                float(p[Parameter.MASS]) * acceleration
+            )  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
         wanted = float(p[Parameter.MASS]) * acceleration
         force += (wanted - force) * (1.0 if truth.motors else -math.expm1(-dt / PEDAL_LAG_S))
@@ -149,7 +182,9 @@ def _drive(
         if truth.motors is not None:
             for i in range(4):
                 asked = float(u[Control.DRIVE, i] - u[Control.BRAKE, i])
-                u[Control.DRIVE, i] = turn_motor(currents[i], truth.motors, asked, float(x[Motion.OMEGA + i]), dt)
+                u[Control.DRIVE, i] = turn_motor(
+                    currents[i], truth.motors, asked, float(x[Motion.OMEGA + i]), dt
+                )
                 u[Control.BRAKE, i] = 0.0
         for i in range(4):
             u[Control.MU, i] = world.friction(k * dt, *wheel_place(x, p, i))
@@ -159,15 +194,21 @@ def _drive(
 
 
 def _moment(t: float, x: FloatArray, speed: float) -> Moment:
-    return Moment(t, float(x[Motion.X]), float(x[Motion.Y]), float(x[Motion.YAW]), float(x[Motion.VX]), speed)
+    return Moment(
+        t, float(x[Motion.X]), float(x[Motion.Y]), float(x[Motion.YAW]), float(x[Motion.VX]), speed
+    )
 
 
-def _sensed(records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float) -> FloatArray:
+def _sensed(
+    records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
+) -> FloatArray:
     """Signals (T, 18) of the records of one vehicle."""
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))
-    return sense(records[:, None], errors, np.zeros((1, 3)), place, (keys[0], keys[1]), (0, rate_hz, 0))[:, 0]
+    return sense(
+        records[:, None], errors, np.zeros((1, 3)), place, (keys[0], keys[1]), (0, rate_hz, 0)
+    )[:, 0]
 
 
 def _table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:

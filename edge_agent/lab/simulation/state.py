@@ -30,7 +30,9 @@ class Motion(IntEnum):
     ABS_LEFT = 30  # [s] for which the controller still counts as active
     TCS_LEFT = 31
     ESC_LEFT = 32
-    PEAK = 33  # four wheels: brake torque at which ABS last let go [N·m]; negative while it gives back
+    PEAK = (
+        33  # four wheels: brake torque at which ABS last let go [N·m]; negative while it gives back
+    )
 
     ASKED = 37  # [rad/s] yaw rate that steering has asked for, as far as a car follows
 
@@ -51,19 +53,27 @@ class TrueParameter(IntEnum):
     PITCH_LEAK = len(Parameter) + 5
     DRAG = len(Parameter) + 6  # D [N per (m/s)^2]
     ROLLING = len(Parameter) + 7  # k_r
-    SLIP_LIMIT = len(Parameter) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
+    SLIP_LIMIT = (
+        len(Parameter) + 8
+    )  # slip at which anti-lock and traction control begin to let go; inf: none
     BRAKE_FRONT = len(Parameter) + 9  # share of the braking torque at the front axle
     POWER = len(Parameter) + 10  # [W]
     CURVE = len(Parameter) + 11  # of the tyre: 0 Magic Formula, 1 brush model, 2 Dugoff
     SOFTENING = (
         len(Parameter) + 12
     )  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
-    REAR_STEER = len(Parameter) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
+    REAR_STEER = (
+        len(Parameter) + 13
+    )  # angle of the rear wheels over that of the front wheels; 0: they do not steer
     RELAXATION = len(Parameter) + 14  # [m] in which a tyre builds up its slip; 0: at once
-    ABS_HZ = len(Parameter) + 15  # cycles of ABS per second; 0: slip control is smooth and not reported
+    ABS_HZ = (
+        len(Parameter) + 15
+    )  # cycles of ABS per second; 0: slip control is smooth and not reported
     TCS = len(Parameter) + 16  # 1: traction control, of vehicles with ABS_HZ
     ESC = len(Parameter) + 17  # 1: stability control, likewise
-    REGENERATION = len(Parameter) + 18  # [m/s^2] of braking that engine or generator give at the driven wheels
+    REGENERATION = (
+        len(Parameter) + 18
+    )  # [m/s^2] of braking that engine or generator give at the driven wheels
 
 
 PARAMETERS: Final = len(Parameter) + len(TrueParameter)

@@ -28,7 +28,9 @@ from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Resul
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
-HIGHEST = 1.0  # deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
+HIGHEST = (
+    1.0  # deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class Habits:
     elite: float = 0.25  # share of the ants of an iteration that deposit
     memory: float = 0.4  # share of the deposit that the best path so far receives
     retrace: float = 0.3  # chance that an ant of a converged colony walks the best path again
-    trace: Callable[[FloatArray], None] | None = None  # called with the pheromone (V, K) after each iteration
+    trace: Callable[[FloatArray], None] | None = (
+        None  # called with the pheromone (V, K) after each iteration
+    )
 
     def __post_init__(self) -> None:
         """Refuse habits for which (31) or (32) lose their meaning."""
@@ -51,11 +55,18 @@ class Habits:
                 raise InputError(name, f"{value} is no share", "use a number between 0 and 1")
         for name in ("alpha", "theta"):
             if getattr(self, name) < 0.0:
-                raise InputError(name, "negative: the ants would shun what is good", "use 0 or more")
+                raise InputError(
+                    name, "negative: the ants would shun what is good", "use 0 or more"
+                )
 
 
 def transition_probabilities(
-    pheromone: FloatArray, visibility: FloatArray, reachable: BoolArray, *, alpha: float, theta: float
+    pheromone: FloatArray,
+    visibility: FloatArray,
+    reachable: BoolArray,
+    *,
+    alpha: float,
+    theta: float,
 ) -> FloatArray:
     """Equation (31) for every vertex at once: (V, K), zero outside A, each row sums to one."""
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
@@ -85,7 +96,12 @@ def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> Float
 
 
 def renew(
-    pheromone: FloatArray, laid: FloatArray, reachable: BoolArray, *, evaporation: float, retrace: float
+    pheromone: FloatArray,
+    laid: FloatArray,
+    reachable: BoolArray,
+    *,
+    evaporation: float,
+    retrace: float,
 ) -> FloatArray:
     """Equation (32) within the bounds [τ_min, 1]; zero where there is no position."""
     renewed = (1.0 - evaporation) * pheromone + laid
@@ -127,12 +143,18 @@ def optimise(
     graph = Graph.of(problem.choices)
     reachable = graph.reachable
     ledger = Ledger(problem.objective, graph, problem.admissible)
-    eta = np.ones(reachable.shape) if visibility is None else np.nan_to_num(Graph.of(visibility).positions, nan=1.0)
+    eta = (
+        np.ones(reachable.shape)
+        if visibility is None
+        else np.nan_to_num(Graph.of(visibility).positions, nan=1.0)
+    )
     pheromone = np.where(reachable, HIGHEST, 0.0)
     weights = _weights(ants, habits)
 
     for iteration in range(iterations):
-        odds = transition_probabilities(pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta)
+        odds = transition_probabilities(
+            pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta
+        )
         paths = [ledger.draw(lambda odds=odds: _walk(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
         if iteration == 0 and problem.start is not None:
             paths[0] = nearest(graph, problem.start)

@@ -24,7 +24,9 @@ from edge_agent.lab.tuning.search import Iteration, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-LEAST_SPREAD: Final = 1e-3  # of the range of a variable: an archive of equal vectors would draw itself for ever
+LEAST_SPREAD: Final = (
+    1e-3  # of the range of a variable: an archive of equal vectors would draw itself for ever
+)
 REDRAWS: Final = 32  # of a vector that is not admissible
 
 
@@ -38,7 +40,9 @@ class ArchiveHabits:
 
     def __post_init__(self) -> None:
         if self.archive < 2:
-            raise InputError("archive", f"{self.archive} has no spread", "keep at least two vectors")
+            raise InputError(
+                "archive", f"{self.archive} has no spread", "keep at least two vectors"
+            )
         for name in ("greed", "spread"):
             if not getattr(self, name) > 0.0:
                 raise InputError(name, "not positive", "use a positive number")
@@ -51,7 +55,9 @@ class SearchTally:
     def __init__(self, problem: Problem) -> None:
         """Begin without any evaluation."""
         if not problem.choices or any(len(choice) == 0 for choice in problem.choices):
-            raise InputError("choices", "a vertex has no position", "give every vertex at least one")
+            raise InputError(
+                "choices", "a vertex has no position", "give every vertex at least one"
+            )
         self.problem = problem
         self.lower = np.array([float(np.min(choice)) for choice in problem.choices])
         self.upper = np.array([float(np.max(choice)) for choice in problem.choices])
@@ -84,7 +90,9 @@ class SearchTally:
             vector = np.asarray(rng.uniform(self.lower, self.upper))
             if self.problem.admissible(vector):
                 return vector
-        raise InputError("choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices")
+        raise InputError(
+            "choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices"
+        )
 
     def record(self, values: list[float], progress: Progress | None) -> None:
         """Close an iteration: append it to the history and report it."""
@@ -97,7 +105,9 @@ class SearchTally:
     def result(self) -> Result:
         """Return the best vector; InputError before the first evaluation."""
         if self.count == 0:
-            raise InputError("ants, iterations", "nothing was evaluated", "use at least one of each")
+            raise InputError(
+                "ants, iterations", "nothing was evaluated", "use at least one of each"
+            )
         return Result(self.best, self.value, tuple(self.history))
 
 

@@ -46,7 +46,9 @@ def optimise(
     return tally.result()
 
 
-def _mutated(tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator) -> FloatArray:
+def _mutated(
+    tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
+) -> FloatArray:
     """An admissible child; the parent where none is found."""
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))

@@ -38,8 +38,12 @@ from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
 SETTLED_S: Final = 1.0  # scored from here on; before, the score is that of the initial covariance
-WORST: Final = -1e3  # [nat] of an update whose log-likelihood is lower or no number: one broken one is not the score
-CALIBRATION: Final = 50.0  # [nat/s] per squared ln of NIS over its expectation: 24 for a variance wrong by two
+WORST: Final = (
+    -1e3
+)  # [nat] of an update whose log-likelihood is lower or no number: one broken one is not the score
+CALIBRATION: Final = (
+    50.0  # [nat/s] per squared ln of NIS over its expectation: 24 for a variance wrong by two
+)
 LEAST_NIS: Final = 1e-3
 MISS: Final = 20.0  # 2/alpha of a 90 % interval
 
@@ -80,9 +84,14 @@ HELD_OUT: Final = (
     TuningDrive("j-turn", "sedan", 0.90, 910, "hilly"),
     TuningDrive("pulses", "van", 0.50, 911, "rolling"),
 )
-TOWNS: Final = {"train": ((61, 62), 8), "held_out": ((901, 902), 8)}  # seeds of towns, and cars in each
+TOWNS: Final = {
+    "train": ((61, 62), 8),
+    "held_out": ((901, 902), 8),
+}  # seeds of towns, and cars in each
 ROUGH_SHARE: Final = 0.5  # of these cars
-MOST_FALSE_ICE: Final = 0.0012  # share of the samples on wet and dry road up to which false ice costs nothing more
+MOST_FALSE_ICE: Final = (
+    0.0012  # share of the samples on wet and dry road up to which false ice costs nothing more
+)
 FALSE_ICE_PRICE: Final = 60.0  # of interval score, for each share of 1 beyond it
 MISSED_ICE_PRICE: Final = 0.5  # of interval score, for a share of 1
 SURE_MARGIN: Final = 0.04  # below SLIPPERY_MU: closer to it slippery cannot be told from not
@@ -108,9 +117,15 @@ class TuningScores:
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
     log_likelihood: float  # more is better [nat/s]
     nis_ratio: float  # near 1 where the stated covariance is right [1]
-    surface_score: float = math.nan  # interval score, mean over the kinds of surface; less is better [1]
-    false_ice: float = math.nan  # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
-    missed_ice: float = math.nan  # share of the samples on felt ice and snow whose interval does not [1]
+    surface_score: float = (
+        math.nan
+    )  # interval score, mean over the kinds of surface; less is better [1]
+    false_ice: float = (
+        math.nan
+    )  # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
+    missed_ice: float = (
+        math.nan
+    )  # share of the samples on felt ice and snow whose interval does not [1]
 
 
 def detection_cost(scores: TuningScores) -> float:
@@ -123,7 +138,9 @@ def detection_cost(scores: TuningScores) -> float:
 OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
     "interval": lambda scores: -detection_cost(scores),
     "innovation": lambda scores: scores.log_likelihood,
-    "predictive": lambda scores: scores.log_likelihood - CALIBRATION * math.log(max(scores.nis_ratio, LEAST_NIS)) ** 2,
+    "predictive": lambda scores: (
+        scores.log_likelihood - CALIBRATION * math.log(max(scores.nis_ratio, LEAST_NIS)) ** 2
+    ),
 }
 
 
@@ -135,12 +152,22 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
             drive.manoeuvre, mu=drive.mu, seed=drive.seed, rate_hz=RATE_HZ, duration_s=duration_s,
             vehicle=drive.vehicle, sensors=drive.sensors, road=drive.road,
         )  # fmt: skip
-        signals.append(np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(np.float64))
+        signals.append(
+            np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(np.float64)
+        )
         truth.append(np.mean([log[name].to_numpy() for name in per_wheel("true_mu")], axis=0))
-        used.append(np.max([log[name].to_numpy() for name in per_wheel("true_utilisation")], axis=0))
+        used.append(
+            np.max([log[name].to_numpy() for name in per_wheel("true_utilisation")], axis=0)
+        )
         vehicles.append(vehicle)
     t = np.arange(len(signals[0]))[:, None] / RATE_HZ + np.zeros(len(drives))
-    return TuningSet(tuple(vehicles), t, np.stack(signals, axis=1), np.stack(truth, axis=1), np.stack(used, axis=1))
+    return TuningSet(
+        tuple(vehicles),
+        t,
+        np.stack(signals, axis=1),
+        np.stack(truth, axis=1),
+        np.stack(used, axis=1),
+    )
 
 
 def record_all(name: str, duration_s: float) -> TuningSet:
@@ -166,40 +193,60 @@ def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
     t, signals = fleet.step(round(duration_s * RATE_HZ))
     truth = fleet.truth
     return TuningSet(
-        tuple(fleet.vehicles), t - t[0], signals, truth.mu_wheel.mean(axis=-1), truth.utilisation.max(axis=-1)
+        tuple(fleet.vehicles),
+        t - t[0],
+        signals,
+        truth.mu_wheel.mean(axis=-1),
+        truth.utilisation.max(axis=-1),
     )
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
     """IS of 90 % intervals, elementwise [unit of the truth]."""
-    score: FloatArray = upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
+    score: FloatArray = (
+        upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
+    )
     return score
 
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
     """Run the estimator over the drives and score what it says after the first second."""
-    estimates = create(estimator, drives.vehicles, memberships=memberships).advance(drives.t, drives.signals, threads=2)
+    estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
+        drives.t, drives.signals, threads=2
+    )
     settled = drives.t.min(axis=1) >= SETTLED_S
     rate_hz = (len(drives.t) - 1) / float(np.mean(drives.t[-1] - drives.t[0]))
-    lower, upper, truth = estimates.mu_lower[settled], estimates.mu_upper[settled], drives.mu[settled]
-    log_likelihoods = np.nan_to_num(estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST)
+    lower, upper, truth = (
+        estimates.mu_lower[settled],
+        estimates.mu_upper[settled],
+        drives.mu[settled],
+    )
+    log_likelihoods = np.nan_to_num(
+        estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST
+    )
     return TuningScores(
         interval_score=float(interval_score(lower, upper, truth).mean()),
-        coverage=float(np.where(np.isnan(truth), np.nan, (lower <= truth) & (truth <= upper)).mean()),
+        coverage=float(
+            np.where(np.isnan(truth), np.nan, (lower <= truth) & (truth <= upper)).mean()
+        ),
         log_likelihood=float(np.maximum(log_likelihoods, WORST).mean()) * rate_hz,
         nis_ratio=float(np.nanmean(estimates.innovation_nis[settled])),
         **detection_scores(lower, upper, truth, drives.used[settled]),
     )
 
 
-def detection_scores(lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray) -> dict[str, float]:
+def detection_scores(
+    lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray
+) -> dict[str, float]:
     """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N); NaN where no sample decides."""
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
     called = upper < SLIPPERY_MU
     felt = (truth < SLIPPERY_MU - SURE_MARGIN) & (used >= FELT_SHARE)
     return {
-        "surface_score": float(np.mean([score[met].mean() for met in surfaces if met.any()] or [np.nan])),
+        "surface_score": float(
+            np.mean([score[met].mean() for met in surfaces if met.any()] or [np.nan])
+        ),
         "false_ice": _share(called, truth > SURFACES["wet"][0]),
         "missed_ice": _share(~called, felt),
     }
@@ -216,7 +263,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
         InputError: there is no objective of that name.
     """
     if name not in OBJECTIVES:
-        raise InputError("objective", f"{name!r} is unknown", f"choose one of {', '.join(OBJECTIVES)}")
+        raise InputError(
+            "objective", f"{name!r} is unknown", f"choose one of {', '.join(OBJECTIVES)}"
+        )
 
     def objective(vector: FloatArray) -> float:
         try:

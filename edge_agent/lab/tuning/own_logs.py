@@ -18,7 +18,9 @@ FEWEST_PARTS: Final = 3
 HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
 
 
-def own_drives(logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float) -> tuple[TuningSet, TuningSet]:
+def own_drives(
+    logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float
+) -> tuple[TuningSet, TuningSet]:
     """Recordings cut into parts of `duration_s` [s]: those to search on, and the last third of them, to judge by.
 
     Recordings may have any rate; parts have as many samples as the slowest gives in that time.
@@ -27,12 +29,20 @@ def own_drives(logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float) -> 
         InputError: they are too short.
     """
     samples = min(round(duration_s / float(np.median(np.diff(log.t)))) for log, _ in logs)
-    parts = [(log, vehicle, first) for log, vehicle in logs for first in range(0, len(log.t) - samples + 1, samples)]
+    parts = [
+        (log, vehicle, first)
+        for log, vehicle in logs
+        for first in range(0, len(log.t) - samples + 1, samples)
+    ]
     if len(parts) < FEWEST_PARTS or samples < 2:
         raise InputError(
-            "log", f"{len(parts)} parts of {duration_s:g} s are too few", f"give {FEWEST_PARTS} at least, better twenty"
+            "log",
+            f"{len(parts)} parts of {duration_s:g} s are too few",
+            f"give {FEWEST_PARTS} at least, better twenty",
         )
-    chosen = [parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, MOST_PARTS).round().astype(int))]
+    chosen = [
+        parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, MOST_PARTS).round().astype(int))
+    ]
     train = len(chosen) - max(1, len(chosen) // HELD_OUT)
     return _side_by_side(chosen[:train], samples), _side_by_side(chosen[train:], samples)
 

@@ -28,7 +28,9 @@ from edge_agent.lab.tuning.search import Problem, Result
 from schemas.numeric import FloatArray
 
 LEVELS: Final = (0.1, 0.05, 0.01)  # variances of noise and R
-POSITIONS: Final = np.array([0.3, 0.55, 0.8, 1.0, 1.25, 1.5, 1.8])  # of a lower vertex; 1 is the neighbour's peak
+POSITIONS: Final = np.array(
+    [0.3, 0.55, 0.8, 1.0, 1.25, 1.5, 1.8]
+)  # of a lower vertex; 1 is the neighbour's peak
 PREFERENCE: Final = 0.6  # spread of the visibility about the untuned position
 CHUNK: Final = 25  # samples after which windows of variances are read: .5 s
 WORST: Final = -1e3  # [nat] of a sample whose log-likelihood is lower or no number
@@ -45,7 +47,9 @@ class LevelDrive:
     setting: Setting
 
 
-def record_levels(spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED) -> list[LevelDrive]:
+def record_levels(
+    spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED
+) -> list[LevelDrive]:
     """Drive without error, and add the noise of every level."""
     exact = ideal(spec)
     levels = []
@@ -61,7 +65,9 @@ def record_levels(spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_P
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
     """Mean log-likelihood of the innovations [nat per sample]."""
     reported = _reported(sets, drive)
-    value = np.nan_to_num(reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
+    value = np.nan_to_num(
+        reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
+    )
     return float(np.maximum(value, WORST).mean())
 
 
@@ -81,8 +87,13 @@ def accuracy(sets: Sets, drive: LevelDrive) -> float:
     """Less the mean of RMSE over the printed RMSE."""
     reported = _reported(sets, drive)
     batch = drive.batch
-    truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {"mu": batch.mu}
-    ratios = [np.sqrt(np.mean((getattr(reported, name) - truth[name]) ** 2)) / scale for name, scale in SCALES.items()]
+    truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {
+        "mu": batch.mu
+    }
+    ratios = [
+        np.sqrt(np.mean((getattr(reported, name) - truth[name]) ** 2)) / scale
+        for name, scale in SCALES.items()
+    ]
     return -float(np.mean(ratios))
 
 
@@ -94,7 +105,9 @@ OBJECTIVES: Final[dict[str, Callable[[Sets, LevelDrive], float]]] = {
 
 
 def _reported(sets: Sets, drive: LevelDrive) -> Estimates:
-    return bank(drive.batch.vehicles, sets, drive.setting).advance(drive.batch.t, drive.batch.signals)
+    return bank(drive.batch.vehicles, sets, drive.setting).advance(
+        drive.batch.t, drive.batch.signals
+    )
 
 
 def visibility() -> list[FloatArray]:

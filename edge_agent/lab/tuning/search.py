@@ -78,7 +78,9 @@ class Graph:
     def of(cls, choices: Sequence[FloatArray]) -> "Graph":
         """Build from one array of positions per vertex; raises InputError where a vertex has none."""
         if not choices or any(len(choice) == 0 for choice in choices):
-            raise InputError("choices", "a vertex has no position", "give every vertex at least one")
+            raise InputError(
+                "choices", "a vertex has no position", "give every vertex at least one"
+            )
         widest = max(len(choice) for choice in choices)
         positions = np.full((len(choices), widest), np.nan)
         for row, choice in zip(positions, choices, strict=True):
@@ -112,7 +114,9 @@ class Ledger:
             elif self.admissible(self.graph.vector(path)):
                 return path
         if fallback is None:
-            raise InputError("choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices")
+            raise InputError(
+                "choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices"
+            )
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
@@ -129,14 +133,18 @@ class Ledger:
         """Close an iteration: append it to the history and tell `progress`."""
         finite = [value for value in values if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else -np.inf
-        self.history.append(Iteration(len(self.history) + 1, self.best_value, mean, len(self.values)))
+        self.history.append(
+            Iteration(len(self.history) + 1, self.best_value, mean, len(self.values))
+        )
         if progress is not None:
             progress(self.history[-1])
 
     def result(self) -> Result:
         """What was found; InputError before the first evaluation."""
         if self.best_path is None:
-            raise InputError("ants, iterations", "nothing was evaluated", "use at least one of each")
+            raise InputError(
+                "ants, iterations", "nothing was evaluated", "use at least one of each"
+            )
         return Result(self.graph.vector(self.best_path), self.best_value, tuple(self.history))
 
 

@@ -104,8 +104,13 @@ def compare_searches(
                 rng=np.random.default_rng([seed, place]),
             )
             searched.setdefault(name, []).append(result.value)
-            judged.setdefault(name, []).append(study.overall(study.memberships_of(result.best), held_out))
-        log_line(f"seed {seed}: " + ", ".join(f"{name} {values[-1]:.2f}" for name, values in judged.items()))
+            judged.setdefault(name, []).append(
+                study.overall(study.memberships_of(result.best), held_out)
+            )
+        log_line(
+            f"seed {seed}: "
+            + ", ".join(f"{name} {values[-1]:.2f}" for name, values in judged.items())
+        )
     return _figures(searched, judged)
 
 
@@ -128,7 +133,9 @@ def _figures(searched: dict[str, list[float]], judged: dict[str, list[float]]) -
 
 def _mean(name: str, values: Sequence[float]) -> list[Figure]:
     spread: FloatArray = np.asarray(values)
-    error = float(np.std(spread, ddof=1) / np.sqrt(len(spread))) if len(spread) > 1 else float("nan")
+    error = (
+        float(np.std(spread, ddof=1) / np.sqrt(len(spread))) if len(spread) > 1 else float("nan")
+    )
     return [Figure(name, float(spread.mean()), "nat/s"), Figure(f"{name}.se", error, "nat/s")]
 
 

@@ -34,7 +34,10 @@ DURATION_S: Final = 6.0  # the period of the paper's noise schedule
 MU: Final = AT_THE_TRUTH.mu
 VARIANCE: Final = AT_THE_TRUTH.noise[0]  # of all three noises [SI]
 WORST: Final = -1e3  # [nat] of a sample whose log-likelihood is lower or no number
-WAYS: Final[dict[str, Callable[..., Result]]] = {"random": random_search.optimise, "colony": colony.optimise}
+WAYS: Final[dict[str, Callable[..., Result]]] = {
+    "random": random_search.optimise,
+    "colony": colony.optimise,
+}
 
 
 class Condition(NamedTuple):
@@ -99,18 +102,29 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
             vehicle=matched(PRESETS[drive.vehicle]), sensors="ideal",
         )  # fmt: skip
         log = log.take(np.arange(0, len(log), FINE))
-        exact.append(np.stack([log[name].to_numpy(zero_copy_only=False) for name in SIGNALS], axis=-1))
-        truth.append(np.stack([log[f"true_{name}"].to_numpy() for name in ("vx", "vy", "yaw_rate")], axis=-1))
+        exact.append(
+            np.stack([log[name].to_numpy(zero_copy_only=False) for name in SIGNALS], axis=-1)
+        )
+        truth.append(
+            np.stack([log[f"true_{name}"].to_numpy() for name in ("vx", "vy", "yaw_rate")], axis=-1)
+        )
         vehicles.append(vehicle)
     signals, seeds = np.stack(exact, axis=1).astype(float), [drive.seed for drive in drives]
     t = np.arange(len(signals))[:, None] / RATE_HZ + np.zeros(len(drives))
-    noisy = {name: _noisy(signals, t[:, 0], seeds, condition) for name, condition in CONDITIONS.items()}
+    noisy = {
+        name: _noisy(signals, t[:, 0], seeds, condition) for name, condition in CONDITIONS.items()
+    }
     return StudySet(tuple(vehicles), t, noisy, np.stack(truth, axis=1))
 
 
-def _noisy(exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition) -> FloatArray:
+def _noisy(
+    exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
+) -> FloatArray:
     """A copy with white noise on a_x, a_y and r."""
-    variance, noisy = scheduled(t) if condition.schedule else np.full(len(t), VARIANCE), exact.copy()
+    variance, noisy = (
+        scheduled(t) if condition.schedule else np.full(len(t), VARIANCE),
+        exact.copy(),
+    )
     for n, seed in enumerate(seeds):
         add_white(noisy[:, n], variance, np.random.default_rng([seed, 5]))
     return noisy
@@ -125,7 +139,9 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
     """Run the filter over the drives under the condition of that name."""
     filters = bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
-    log_likelihoods = np.nan_to_num(reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
+    log_likelihoods = np.nan_to_num(
+        reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
+    )
     motion = np.stack([reported.vx, reported.vy, reported.yaw_rate], axis=-1)
     rmse = np.sqrt(((motion - drives.truth) ** 2).mean(axis=0)).mean(axis=0)
     return StudyScores(
@@ -137,15 +153,21 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
     """(interval score, coverage) of the 90 % friction interval under a condition."""
-    reported = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(drives.t, drives.signals[name])
+    reported = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
+        drives.t, drives.signals[name]
+    )
     truth = np.full(reported.mu.shape, MU)
     inside = (reported.mu_lower <= truth) & (truth <= reported.mu_upper)
-    return float(interval_score(reported.mu_lower, reported.mu_upper, truth).mean()), float(inside.mean())
+    return float(interval_score(reported.mu_lower, reported.mu_upper, truth).mean()), float(
+        inside.mean()
+    )
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
     """Mean log-likelihood over the conditions [nat/s]: what is searched for."""
-    return float(np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS]))
+    return float(
+        np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])
+    )
 
 
 def memberships_of(vector: FloatArray) -> Memberships:

@@ -13,15 +13,32 @@ from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.app.tuned_memberships import Score
 from edge_agent.lab.tuning import study
 from edge_agent.lab.tuning.search import Progress, Result
-from edge_agent.lab.tuning.study import CONDITIONS, WAYS, StudyScores, StudySet, memberships_of, overall, scores_of
+from edge_agent.lab.tuning.study import (
+    CONDITIONS,
+    WAYS,
+    StudyScores,
+    StudySet,
+    memberships_of,
+    overall,
+    scores_of,
+)
 from schemas.runtime.figures import Figure
 
-UNITS: Final = {"log_likelihood": "nat/s", "nis": "1", "rmse_vx": "m/s", "rmse_vy": "m/s", "rmse_yaw_rate": "rad/s"}
+UNITS: Final = {
+    "log_likelihood": "nat/s",
+    "nis": "1",
+    "rmse_vx": "m/s",
+    "rmse_vy": "m/s",
+    "rmse_yaw_rate": "rad/s",
+}
 TITLES: Final = {"right": "R right", "too-small": "ten times too small", "too-large": "ten times too large",
                  "schedule": "noise by schedule"}  # fmt: skip
 
 
-GIVEN: Final = {"fixed": Memberships(outputs=(0.0,) * SETS), "untuned": Memberships()}  # R as it is; not tuned
+GIVEN: Final = {
+    "fixed": Memberships(outputs=(0.0,) * SETS),
+    "untuned": Memberships(),
+}  # R as it is; not tuned
 SHOWN: Final = (*GIVEN, *WAYS)
 
 
@@ -69,7 +86,9 @@ def figures(done: Study) -> list[Figure]:
     for way in SHOWN:
         sets = done.memberships(way)
         for name in CONDITIONS:
-            listed += _spread(f"tuning.{name}.{way}", [scores_of(one, done.held_out, name) for one in sets])
+            listed += _spread(
+                f"tuning.{name}.{way}", [scores_of(one, done.held_out, name) for one in sets]
+            )
         for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
             values = [overall(one, recorded) for one in sets]
             listed += _mean_sd(f"tuning.overall.{way}.{drives}", values, "nat/s")
@@ -77,7 +96,9 @@ def figures(done: Study) -> list[Figure]:
     for drives in ("train", "held_out"):
         gain = np.array(overalls[f"colony.{drives}"]) - np.array(overalls[f"random.{drives}"])
         listed += _mean_sd(f"tuning.colony_over_random.{drives}", list(gain), "nat/s")
-        listed.append(Figure(f"tuning.colony_over_random.{drives}.wins", float((gain > 0.0).mean()), "1"))
+        listed.append(
+            Figure(f"tuning.colony_over_random.{drives}.wins", float((gain > 0.0).mean()), "1")
+        )
     for way, results in done.found.items():
         for lines in zip(*(result.history for result in results), strict=True):
             best = [line.best for line in lines]
@@ -89,13 +110,19 @@ def _spread(prefix: str, per_condition: Sequence[StudyScores]) -> list[Figure]:
     return [
         figure
         for name, unit in UNITS.items()
-        for figure in _mean_sd(f"{prefix}.{name}", [getattr(one, name) for one in per_condition], unit)
+        for figure in _mean_sd(
+            f"{prefix}.{name}", [getattr(one, name) for one in per_condition], unit
+        )
     ]
 
 
 def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
     listed = [Figure(name, float(np.mean(values)), unit)]
-    return [*listed, Figure(f"{name}.sd", float(np.std(values, ddof=1)), unit)] if len(values) > 1 else listed
+    return (
+        [*listed, Figure(f"{name}.sd", float(np.std(values, ddof=1)), unit)]
+        if len(values) > 1
+        else listed
+    )
 
 
 def markdown(listed: Sequence[Figure]) -> str:
@@ -150,11 +177,19 @@ def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
         prefix = f"tuning.convergence.{way}."
         names = [name for name in values if name.startswith(prefix) and not name.endswith(".sd")]
         evaluations = per_iteration * np.arange(1, len(names) + 1)
-        best, sd = (np.array([values.get(name + end, 0.0) for name in names]) for end in ("", ".sd"))
+        best, sd = (
+            np.array([values.get(name + end, 0.0) for name in names]) for end in ("", ".sd")
+        )
         line = axis.plot(evaluations, best, "o-", ms=3, label=way)[0]
-        axis.fill_between(evaluations, best - sd, best + sd, color=line.get_color(), alpha=0.2, lw=0)
+        axis.fill_between(
+            evaluations, best - sd, best + sd, color=line.get_color(), alpha=0.2, lw=0
+        )
     axis.axhline(values["tuning.overall.untuned.train"], color="k", ls=":", label="untuned")
-    axis.set(xlabel="evaluations", ylabel="log likelihood of the innovations [nat/s]", title="drives searched on")
+    axis.set(
+        xlabel="evaluations",
+        ylabel="log likelihood of the innovations [nat/s]",
+        title="drives searched on",
+    )
     axis.legend()
     drawn.savefig(path, dpi=80)
     plt.close(drawn)

@@ -45,15 +45,32 @@ class Question(NamedTuple):
 QUESTIONS: Final = {
     question.name: question
     for question in (
-        Question("grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50"),
+        Question(
+            "grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50"
+        ),
         Question("worst", "the worst stretches, merged into segments", "-score", "mu"),
-        Question("spells", "onset and duration of slippery spells, and the time to an alert", "onset", "duration_s"),
+        Question(
+            "spells",
+            "onset and duration of slippery spells, and the time to an alert",
+            "onset",
+            "duration_s",
+        ),
         Question("before-after", "what a treatment changed, with interval", "-period", None),
         Question("vehicles", "bias and sensor health per vehicle", "-z", None),
         Question("calibration", "how often the published interval held", "age_h", None),
         Question("weather", "grip by temperature of the nearest station", "temperature", None),
-        Question("change-rates", "how fast roads turn slippery or back, by temperature and hour", "by", None),
-        Question("contract", "whether agreed grip was kept on each link of a road network", "-least_s", None),
+        Question(
+            "change-rates",
+            "how fast roads turn slippery or back, by temperature and hour",
+            "by",
+            None,
+        ),
+        Question(
+            "contract",
+            "whether agreed grip was kept on each link of a road network",
+            "-least_s",
+            None,
+        ),
         Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
     )
 }
@@ -62,7 +79,8 @@ QUESTIONS: Final = {
 def known_questions() -> dict[str, Question]:
     """Return all questions by name, those of plug-ins too."""
     others = {
-        name: plugins.load_entry_point(plugins.QUESTIONS, name) for name in plugins.entry_points_of(plugins.QUESTIONS)
+        name: plugins.load_entry_point(plugins.QUESTIONS, name)
+        for name in plugins.entry_points_of(plugins.QUESTIONS)
     }
     return others | QUESTIONS
 
@@ -75,5 +93,7 @@ def question_of(name: str) -> Question:
     """
     found = known_questions().get(name)
     if found is None:
-        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known_questions())}")
+        raise InputError(
+            "question", f"{name!r} is none", f"use one of {', '.join(known_questions())}"
+        )
     return found

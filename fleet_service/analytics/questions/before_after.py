@@ -31,7 +31,9 @@ def expression(t: Table, at_s: int) -> Table:
     )  # fmt: skip
     cells = cells.filter(cells.n_a > 0, cells.n_b > 0)
     weight = cells.n_a * cells.n_b / (cells.n_a + cells.n_b)
-    cells = cells.mutate(w=weight.cast("float64"), mean_a=cells.s_a / cells.n_a, mean_b=cells.s_b / cells.n_b)
+    cells = cells.mutate(
+        w=weight.cast("float64"), mean_a=cells.s_a / cells.n_a, mean_b=cells.s_b / cells.n_b
+    )
     t = t.inner_join(cells, place)
     residual = ibis.ifelse(t.after, (t.y - t.mean_a) / t.n_a, (t.mean_b - t.y) / t.n_b)
     t = t.mutate(u=t.w * residual)
@@ -55,10 +57,14 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         InputError: no moment is given, or no cell was measured in both periods.
     """
     if options.at is None:
-        raise InputError("at", "no moment of the treatment", "give one, e.g. --at 2026-01-31T07:00:00Z")
+        raise InputError(
+            "at", "no moment of the treatment", "give one, e.g. --at 2026-01-31T07:00:00Z"
+        )
     (row,) = engine.answer(expression(engine.observations(), options.at // NS)).to_pylist()
     if not row["cells"] or row["vehicles"] < 2:
-        raise InputError("at", "no cell was measured in both periods by two vehicles", "give longer periods")
+        raise InputError(
+            "at", "no cell was measured in both periods by two vehicles", "give longer periods"
+        )
     difference = (row["later"] - row["before"]) / row["w"]
     std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
     return pa.table({

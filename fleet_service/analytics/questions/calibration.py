@@ -30,11 +30,15 @@ def expression(t: Table, maps: Table) -> Table:
         high=t.mu_upper.cast("float64"),
     )
     joined = t.inner_join(maps, ["cell", "sector"])
-    joined = joined.filter(joined.time > joined.snapshot, joined.time <= joined.snapshot + HORIZON_S)
+    joined = joined.filter(
+        joined.time > joined.snapshot, joined.time <= joined.snapshot + HORIZON_S
+    )
     inside = (joined.y >= joined.mu_lower) & (joined.y <= joined.mu_upper)
     touches = (joined.high >= joined.mu_lower) & (joined.low <= joined.mu_upper)
     age = ((joined.time - joined.snapshot) / _HOUR_S).floor().cast("int64")
-    joined = joined.mutate(age_h=age, inside=inside.cast("float64"), touches=touches.cast("float64"))
+    joined = joined.mutate(
+        age_h=age, inside=inside.cast("float64"), touches=touches.cast("float64")
+    )
     width = (joined.mu_upper - joined.mu_lower).cast("float64")
     return joined.group_by(["basis", "age_h"]).aggregate(
         values=joined.count(),

@@ -57,13 +57,23 @@ def expression(t: Table) -> Table:
     t = t.filter(value(t))
     w = ibis.window(group_by=["cell", "sector"], order_by=["time", "vehicle", "boot", "seq", "row"])
     t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))
-    t = t.mutate(before=t.slippery.lag().over(w), since=t.time.lag().over(w), by=t.vehicle.lag().over(w))
+    t = t.mutate(
+        before=t.slippery.lag().over(w), since=t.time.lag().over(w), by=t.vehicle.lag().over(w)
+    )
     t = t.mutate(apart=(t.time - t.since).cast("float64"))
-    t = t.filter(t.before.notnull() & (t.by != t.vehicle) & (t.apart >= 1.0) & (t.apart <= LONGEST_S))
+    t = t.filter(
+        t.before.notnull() & (t.by != t.vehicle) & (t.apart >= 1.0) & (t.apart <= LONGEST_S)
+    )
     road = t.temperature - AIR_ABOVE_ROAD_C
     band = ibis.literal(UNKNOWN)
     for name, low, high in BANDS:
-        inside = (road > low) if np.isinf(high) else (road <= high) if np.isinf(low) else (road > low) & (road <= high)
+        inside = (
+            (road > low)
+            if np.isinf(high)
+            else (road <= high)
+            if np.isinf(low)
+            else (road > low) & (road <= high)
+        )
         band = ibis.ifelse(inside, name, band)
     t = t.mutate(
         band=ibis.ifelse(t.temperature.isnull(), UNKNOWN, band),
@@ -119,7 +129,10 @@ def _named(one: str | int) -> str:
 
 def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
     """Return the rate of a class, with the interval of days drawn with replacement."""
-    columns = {name: counted[name].to_numpy().astype(float) for name in ("pairs", "unlike", "slippery", "seconds")}
+    columns = {
+        name: counted[name].to_numpy().astype(float)
+        for name in ("pairs", "unlike", "slippery", "seconds")
+    }
     days, day = np.unique(counted["day"].to_numpy(zero_copy_only=False), return_inverse=True)
     octaves, octave = np.unique(counted["octave"].to_numpy(), return_inverse=True)
     cube = np.zeros((len(days), len(octaves), len(columns)))  # by day, bin of time, count
@@ -132,7 +145,9 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
         rng = np.random.default_rng(0)
         samples = rng.integers(len(days), size=(DRAWS, len(days)))
         drawn = [fit(cube[sample].sum(axis=0), ((rate, misread),))[0] for sample in samples]
-        lower, upper = np.nanpercentile(drawn, ENDS) if np.isfinite(drawn).any() else (np.nan, np.nan)
+        lower, upper = (
+            np.nanpercentile(drawn, ENDS) if np.isfinite(drawn).any() else (np.nan, np.nan)
+        )
     return {
         "pairs": int(pairs), "days": len(days), "hours_between": seconds / 3600, "unlike": int(unlike),
         "share_slippery": slippery / max(2.0 * pairs, 1.0), "rate_per_hour": _known(3600 * rate),
@@ -141,7 +156,9 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
     }  # fmt: skip
 
 
-BEGINS: Final = tuple((1.0 / seconds, misread) for seconds in (600.0, 10_800.0, 100_000.0) for misread in (0.01, 0.2))
+BEGINS: Final = tuple(
+    (1.0 / seconds, misread) for seconds in (600.0, 10_800.0, 100_000.0) for misread in (0.01, 0.2)
+)
 
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
@@ -165,7 +182,10 @@ def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> t
         return -float(unlike @ np.log(p) + (pairs - unlike) @ np.log1p(-p))
 
     starts = [np.array([np.log(rate), _logit(misread / most)]) for rate, misread in begins]
-    best = min((minimize(loss, x, method="Nelder-Mead") for x in starts), key=lambda found: float(found.fun))
+    best = min(
+        (minimize(loss, x, method="Nelder-Mead") for x in starts),
+        key=lambda found: float(found.fun),
+    )
     return float(np.exp(np.clip(best.x[0], -30.0, 5.0))), float(most / (1.0 + np.exp(-best.x[1])))
 
 

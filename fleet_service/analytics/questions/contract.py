@@ -29,7 +29,9 @@ PIECE_M: Final = 50.0  # as long as what a driver slides over before the car sta
 LEAST_SHARE: Final = 0.8  # of a link's length measured, below which nobody can say that it was kept
 GAP_S: Final = 7200  # two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
-LEAST_STD: Final = 0.05  # of one vehicle's error that its own interval does not know: its tyres, its calibration
+LEAST_STD: Final = (
+    0.05  # of one vehicle's error that its own interval does not know: its tyres, its calibration
+)
 KEPT, BROKEN, UNKNOWN = "kept", "broken", "unknown"
 _ROW: Final[dict[str, pa.DataType]] = {
     "link": pa.string(), "direction": pa.string(), "name": pa.string(), "verdict": pa.string(),
@@ -49,7 +51,9 @@ def expression(t: Table, places: Table) -> Table:
     t = t.filter(value(t)).mutate(slot=(t.time / SLOT_S).floor().cast("int64"))
     std = (t.mu_upper.cast("float64") - t.mu_lower.cast("float64")) / INTERVAL_STD
     t = t.mutate(y=t.mu.cast("float64"), variance=std * std)
-    rows = t.inner_join(places, [t.cell == places.cell, t.sector == places.sector], rname="place_{name}")
+    rows = t.inner_join(
+        places, [t.cell == places.cell, t.sector == places.sector], rname="place_{name}"
+    )
     return rows.group_by(["link", "direction", "piece", "slot", "vehicle"]).aggregate(
         y=rows.y.mean(), variance=rows.variance.mean(), values=rows.count()
     )
@@ -62,7 +66,11 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         InputError: the table of roads, the level, or the time within which it must be restored is missing.
     """
     if options.roads is None:
-        raise InputError("roads", "no table of roads", "make one: fleet-service roads EXTRACT --out roads.parquet")
+        raise InputError(
+            "roads",
+            "no table of roads",
+            "make one: fleet-service roads EXTRACT --out roads.parquet",
+        )
     if options.level is None or options.within_s is None:
         missing = "level" if options.level is None else "within"
         raise InputError(missing, "is missing for contract", "give e.g. --level .35 --within 4h")
@@ -89,12 +97,20 @@ def slots(found: pa.Table) -> dict[str, FloatArray]:
     reported = np.bincount(which, variance + LEAST_STD**2) / n
     several = n > 2
     factor = np.where(several, student.ppf(0.95, np.maximum(n - 1, 1)), INTERVAL_STD / 2.0)
-    error = np.maximum(factor * np.sqrt(np.where(several, spread, 0.0) / n), INTERVAL_STD / 2.0 * np.sqrt(reported / n))
+    error = np.maximum(
+        factor * np.sqrt(np.where(several, spread, 0.0) / n),
+        INTERVAL_STD / 2.0 * np.sqrt(reported / n),
+    )
     return {"first": first, "mu": mean, "lower": mean - error, "upper": mean + error, "vehicles": n}
 
 
 def breach(
-    slot: IntArray, lower: FloatArray, mu: FloatArray, upper: FloatArray, level: float, span: tuple[int, int]
+    slot: IntArray,
+    lower: FloatArray,
+    mu: FloatArray,
+    upper: FloatArray,
+    level: float,
+    span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
     """Return the longest breach of one link [s]: by the means, certain, and possible; and its begin (0 for none).
 
@@ -134,14 +150,19 @@ class _Measured(NamedTuple):
     values: list[int]
 
 
-def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options) -> pa.Table:
+def _judged(
+    found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options
+) -> pa.Table:
     level, within = options.level or 0.0, options.within_s or 0.0
     about = {(row["link"], row["direction"]): row
              for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
                  [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
     share = _measured_share(roads, seen)
     rows = found.to_pylist()
-    names = [(str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in rows]
+    names = [
+        (str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"]))
+        for row in rows
+    ]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
     found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
     each, keys = slots(found), sorted(number)
@@ -161,7 +182,10 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
             found_breaches.append(breach(slot, lower, mu, upper, level, span))
         by_mean, begin = max((one[0], one[3]) for one in found_breaches)
         least, most = (max(one[k] for one in found_breaches) for k in (1, 2))
-        worst = min((k for of_piece in own.pieces.values() for k in of_piece), key=lambda k: float(each["mu"][k]))
+        worst = min(
+            (k for of_piece in own.pieces.values() for k in of_piece),
+            key=lambda k: float(each["mu"][k]),
+        )
         enough = share[key] >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
         verdict = BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN
         out.append(

@@ -18,13 +18,22 @@ def expression(t: Table) -> Table:
     """Return one row per day, cell and sector. Without a value there are no percentiles: mu is at least
     `utilised_max`."""
     reported = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
-    t = t.select("day", "cell", "sector", "vehicle", reported=reported, used=t.mu_utilised.nullif(float("nan")))
+    t = t.select(
+        "day",
+        "cell",
+        "sector",
+        "vehicle",
+        reported=reported,
+        used=t.mu_utilised.nullif(float("nan")),
+    )
     found = t.group_by(["day", "cell", "sector"]).aggregate(
         observations=t.count(),
         values=t.reported.count(),
         vehicles=t.vehicle.nunique(),
         utilised_max=t.used.max(),
-        all=t.reported.quantile(list(PERCENTILES.values())),  # at once: a third cheaper than one by one
+        all=t.reported.quantile(
+            list(PERCENTILES.values())
+        ),  # at once: a third cheaper than one by one
     )
     return found.mutate(**{name: found["all"][k] for k, name in enumerate(PERCENTILES)}).drop("all")
 

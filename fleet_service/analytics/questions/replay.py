@@ -31,7 +31,11 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         InputError: the step is not valid, or makes too many frames.
     """
     if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
-        raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
+        raise InputError(
+            "step",
+            f"{options.step_s:g} s is no step",
+            "give the seconds between two frames, e.g. 600",
+        )
     at = options.at if options.at is not None else engine.part.until
     last = at if options.step_s is None else max(at, engine.part.until)
     fusion = fusion_with_weather(engine.root, options.lateness_s, last)
@@ -43,7 +47,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
                 options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
     step, due, frames = int(options.step_s * NS), None, []
-    for updated in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
+    for updated in replay(
+        engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)
+    ):
         if not len(updated.slots):
             continue
         now = int(fusion.live.time[updated.slots].max())
@@ -52,7 +58,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         while due + step <= now:
             due += step
             frames.append(_frame(engine, fusion, due))
-            options.report(f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} cells")
+            options.report(
+                f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} cells"
+            )
     return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
 
 
@@ -67,8 +75,12 @@ def _begin(engine: QueryEngine, first: int, step: int) -> int:
     begin = max(engine.part.since, first - first % step)
     frames = (min(engine.part.until, max(last, first)) - begin) // step
     if frames > MOST_FRAMES:
-        problem = f"makes {frames} frames from {np.datetime64(begin, 'ns').astype('datetime64[s]')} on"
-        raise InputError("step", problem, f"give a longer one, or --from and --to; {MOST_FRAMES} are the most")
+        problem = (
+            f"makes {frames} frames from {np.datetime64(begin, 'ns').astype('datetime64[s]')} on"
+        )
+        raise InputError(
+            "step", problem, f"give a longer one, or --from and --to; {MOST_FRAMES} are the most"
+        )
     return begin
 
 

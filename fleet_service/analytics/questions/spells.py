@@ -22,8 +22,15 @@ def expression(t: Table, least_vehicles: int) -> Table:
     t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))
     w = ibis.window(group_by=place, order_by=order)
     before = t.slippery.lag().over(w)
-    t = t.mutate(new=(before.isnull() | (before != t.slippery)).cast("int64"), following=t.time.lead().over(w))
-    t = t.mutate(run=t.new.sum().over(ibis.window(group_by=place, order_by=order, preceding=None, following=0)))
+    t = t.mutate(
+        new=(before.isnull() | (before != t.slippery)).cast("int64"),
+        following=t.time.lead().over(w),
+    )
+    t = t.mutate(
+        run=t.new.sum().over(
+            ibis.window(group_by=place, order_by=order, preceding=None, following=0)
+        )
+    )
     t = t.filter(t.slippery == 1)
     mine = ibis.window(group_by=[*place, "run"], order_by=order, preceding=None, following=None)
     t = t.mutate(first=t.vehicle.first().over(mine))

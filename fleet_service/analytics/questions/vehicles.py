@@ -26,19 +26,34 @@ def expression(t: Table) -> Table:
         speed=t.speed.cast("float64").mean(),
     )
     v = t.filter(reported).select(
-        "cell", "sector", "vehicle", hour=(t.time / HOUR_S).floor().cast("int64"), y=t.mu.cast("float64")
+        "cell",
+        "sector",
+        "vehicle",
+        hour=(t.time / HOUR_S).floor().cast("int64"),
+        y=t.mu.cast("float64"),
     )
     place = ["cell", "sector", "hour"]
     each = v.group_by([*place, "vehicle"]).aggregate(n=v.count(), s=v.y.sum())
     w = ibis.window(group_by=place)
-    each = each.mutate(others=each.n.sum().over(w) - each.n, other_sum=each.s.sum().over(w) - each.s)
+    each = each.mutate(
+        others=each.n.sum().over(w) - each.n, other_sum=each.s.sum().over(w) - each.s
+    )
     met = each.filter(each.others > 0)
     met = met.mutate(d=met.s / met.n - met.other_sum / met.others)
-    bias = met.group_by("vehicle").aggregate(meetings=met.count(), bias=met.d.mean(), spread=met.d.var(how="pop"))
+    bias = met.group_by("vehicle").aggregate(
+        meetings=met.count(), bias=met.d.mean(), spread=met.d.var(how="pop")
+    )
     values = each.group_by("vehicle").aggregate(values=each.n.sum())
-    found = mine.left_join(values, "vehicle").drop("vehicle_right").left_join(bias, "vehicle").drop("vehicle_right")
+    found = (
+        mine.left_join(values, "vehicle")
+        .drop("vehicle_right")
+        .left_join(bias, "vehicle")
+        .drop("vehicle_right")
+    )
     error = (found.spread / found.meetings).sqrt()
-    found = found.mutate(values=found["values"].fill_null(0), meetings=found.meetings.fill_null(0), bias_std=error)
+    found = found.mutate(
+        values=found["values"].fill_null(0), meetings=found.meetings.fill_null(0), bias_std=error
+    )
     z = ibis.ifelse(found.bias_std > 0, found.bias.abs() / found.bias_std, ibis.null("float64"))
     return found.mutate(z=z).drop("spread")
 

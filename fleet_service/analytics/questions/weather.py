@@ -62,10 +62,14 @@ def _joined(t: Table, stations: Table, readings: Table) -> Table:
         (pairs.lon - pairs.longitude) * (pairs.lat * np.pi / 180).cos()
     ) ** 2
     pairs = pairs.mutate(metres=metres)
-    pairs = pairs.mutate(rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station]))
+    pairs = pairs.mutate(
+        rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station])
+    )
     nearest = pairs.filter(pairs["rank"] == 0).select("region", "station")
     t = t.inner_join(nearest, "region")
-    return t.inner_join(readings, [t.station == readings.station, t.hour == readings.hour], rname="reading_{name}")
+    return t.inner_join(
+        readings, [t.station == readings.station, t.hour == readings.hour], rname="reading_{name}"
+    )
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
@@ -75,9 +79,15 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         InputError: there is no table of stations, or it lacks a column.
     """
     if options.stations is None:
-        raise InputError("stations", "no table of readings", f"give a CSV or Parquet file with {', '.join(NEEDED)}")
+        raise InputError(
+            "stations",
+            "no table of readings",
+            f"give a CSV or Parquet file with {', '.join(NEEDED)}",
+        )
     stations, readings = read(options.stations)
-    return engine.answer(expression(engine.observations(), ibis.memtable(stations), ibis.memtable(readings)))
+    return engine.answer(
+        expression(engine.observations(), ibis.memtable(stations), ibis.memtable(readings))
+    )
 
 
 def read(path: Path) -> tuple[pa.Table, pa.Table]:
@@ -89,10 +99,14 @@ def read(path: Path) -> tuple[pa.Table, pa.Table]:
     try:
         table = pq.read_table(path) if path.suffix == ".parquet" else pacsv.read_csv(path)
     except (OSError, pa.ArrowInvalid) as error:
-        raise InputError("stations", f"cannot read {path} ({error})", "give a CSV or Parquet file") from error
+        raise InputError(
+            "stations", f"cannot read {path} ({error})", "give a CSV or Parquet file"
+        ) from error
     missing = [name for name in NEEDED if name not in table.schema.names]
     if missing:
-        raise InputError("stations", f"{path.name} has no {missing[0]}", f"give columns {', '.join(NEEDED)}")
+        raise InputError(
+            "stations", f"{path.name} has no {missing[0]}", f"give columns {', '.join(NEEDED)}"
+        )
     try:
         time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
         numbers = {name: table[name].cast(pa.float64()) for name in NEEDED[2:]}

@@ -16,7 +16,9 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
-SHARE: Final = 0.1  # of the values of a cell that were slippery: a stretch that froze one night in ten
+SHARE: Final = (
+    0.1  # of the values of a cell that were slippery: a stretch that froze one night in ten
+)
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
@@ -27,10 +29,14 @@ def expression(t: Table, least_vehicles: int) -> Table:
         values=reported.sum(),
         slippery=(reported & (t.mu < SLIPPERY_MU)).sum(),
         mu_sum=ibis.ifelse(reported & (t.mu < SLIPPERY_MU), t.mu.cast("float64"), 0.0).sum(),
-        witnesses=ibis.ifelse(reported & (t.mu < SLIPPERY_MU), t.vehicle, ibis.null("string")).nunique(),
+        witnesses=ibis.ifelse(
+            reported & (t.mu < SLIPPERY_MU), t.vehicle, ibis.null("string")
+        ).nunique(),
     )
     return cells.filter(
-        cells.slippery >= SHARE * cells["values"], cells.slippery > 0, cells.witnesses >= least_vehicles
+        cells.slippery >= SHARE * cells["values"],
+        cells.slippery > 0,
+        cells.witnesses >= least_vehicles,
     )
 
 
@@ -86,7 +92,10 @@ def _touching(cell: IntArray, sector: IntArray) -> IntArray:
     there = order[np.minimum(place, len(key) - 1)] if len(key) else place
     touches = key[there] == beside if len(key) else np.zeros_like(beside, bool)
     here = np.broadcast_to(np.arange(len(key))[:, None], beside.shape)
-    edges = coo_array((np.ones(int(touches.sum()), bool), (here[touches], there[touches])), shape=(len(key), len(key)))
+    edges = coo_array(
+        (np.ones(int(touches.sum()), bool), (here[touches], there[touches])),
+        shape=(len(key), len(key)),
+    )
     return np.asarray(connected_components(edges, directed=False)[1], np.int64)
 
 
@@ -94,7 +103,9 @@ def _members(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
     """Return the cells of each stretch, so that a bent road is drawn as a road and not as a box."""
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
-    return pa.LargeListArray.from_arrays(pa.array(ends, pa.int64()), pa.array(cell[order], pa.int64()))
+    return pa.LargeListArray.from_arrays(
+        pa.array(ends, pa.int64()), pa.array(cell[order], pa.int64())
+    )
 
 
 def _boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:

@@ -21,8 +21,12 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
 REACH_M: Final = 25.0  # from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
-TURN_M: Final = 8.0  # per radian between the road and the sector's axis: a parallel road a lane away is nearer
-MOST_TURN: Final = np.radians(60.0)  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both
+TURN_M: Final = (
+    8.0  # per radian between the road and the sector's axis: a parallel road a lane away is nearer
+)
+MOST_TURN: Final = np.radians(
+    60.0
+)  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both
 SERVICE_M: Final = 6.0  # a yard's entrance beside a street is driven far less
 STEP_M: Final = 2.0
 PIECE: Final = 4096  # cells at once
@@ -48,7 +52,10 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     """Return one row per cell and sector on a link; the reference "Columns of the ten questions" explains the
     columns."""
     lengths, marks = _marks(network.links)
-    tree, scale = cKDTree(_conformal(marks.latitude, marks.longitude)), np.cos(np.radians(marks.latitude))
+    tree, scale = (
+        cKDTree(_conformal(marks.latitude, marks.longitude)),
+        np.cos(np.radians(marks.latitude)),
+    )
     reach = REACH_M / scale.min()
     side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
     cells = _near(marks, float(side))
@@ -57,7 +64,9 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     parts = []
     for first in range(0, len(cells), PIECE):
         piece = cells[first : first + PIECE]
-        pairs = cKDTree(_conformal(*grid.centre(piece))).sparse_distance_matrix(tree, reach, output_type="ndarray")
+        pairs = cKDTree(_conformal(*grid.centre(piece))).sparse_distance_matrix(
+            tree, reach, output_type="ndarray"
+        )
         metres = pairs["v"] * scale[pairs["j"]]
         for axis in range(grid.SECTORS):
             turn = _apart(marks.yaw[pairs["j"]], axis * np.pi / 2.0)
@@ -65,9 +74,15 @@ def join_roads(network: RoadNetwork) -> pa.Table:
             row, mark, metre = pairs["i"][fits], pairs["j"][fits], metres[fits]
             link = marks.link[mark]
             cost = metre + TURN_M * turn[fits] + service[link]
-            each = _first_of(np.lexsort((cost, link, row)), row, link)  # the best mark of each cell and link
-            row, link, mark, metre, cost = (column[each] for column in (row, link, mark, metre, cost))
-            best = _first_of(np.lexsort((cost, row)), row)[np.cumsum(np.append(0, row[1:] != row[:-1]))[: len(row)]]
+            each = _first_of(
+                np.lexsort((cost, link, row)), row, link
+            )  # the best mark of each cell and link
+            row, link, mark, metre, cost = (
+                column[each] for column in (row, link, mark, metre, cost)
+            )
+            best = _first_of(np.lexsort((cost, row)), row)[
+                np.cumsum(np.append(0, row[1:] != row[:-1]))[: len(row)]
+            ]
             goes_on = (end[link] == start[link[best]]) | (end[link[best]] == start[link])
             mine, more = link == link[best], cost - cost[best]
             kept = mine | (goes_on & (more <= side / 2.0))  # the next link begins within the cell
@@ -76,12 +91,19 @@ def join_roads(network: RoadNetwork) -> pa.Table:
             other[np.isinf(other)] = np.nan
             columns = (piece[row], np.full(len(row), axis), mark, metre, other[row], ~mine)
             parts.append([column[kept] for column in columns])
-    cell, sector, mark, distance, ambiguous, second = (np.concatenate(column) for column in zip(*parts, strict=True))
+    cell, sector, mark, distance, ambiguous, second = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
     link = marks.link[mark]
     middle, length = marks.run[mark], lengths[link]
     texts = {
         name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
-        for name, field in (("link", "id"), ("direction", "direction"), ("name", "name"), ("kind", "kind"))
+        for name, field in (
+            ("link", "id"),
+            ("direction", "direction"),
+            ("name", "name"),
+            ("kind", "kind"),
+        )
     }
     numbers = {
         "cell": cell, "sector": sector.astype(np.int8), "from_m": np.maximum(middle - side / 2.0, 0.0),
@@ -91,7 +113,9 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     arrays["ambiguous_m"] = pa.array(ambiguous, from_pandas=True)
     found = pa.table([arrays[name] for name in SCHEMA.names], schema=SCHEMA)
     found = found.sort_by([("cell", "ascending"), ("sector", "ascending"), ("shared", "ascending")])
-    return found.replace_schema_metadata({f"roads.{key}": value for key, value in network.source.items()})
+    return found.replace_schema_metadata(
+        {f"roads.{key}": value for key, value in network.source.items()}
+    )
 
 
 def read_roads(path: Path) -> pa.Table:
@@ -105,7 +129,9 @@ def read_roads(path: Path) -> pa.Table:
         return table.select(SCHEMA.names).cast(SCHEMA)
     except (OSError, pa.ArrowInvalid, pa.ArrowTypeError, KeyError) as error:
         reason = str(error).splitlines()[0][:100]
-        raise InputError("roads", f"{path} is no such file ({reason})", "make it with fleet-service roads") from error
+        raise InputError(
+            "roads", f"{path} is no such file ({reason})", "make it with fleet-service roads"
+        ) from error
 
 
 def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
@@ -116,7 +142,11 @@ def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
         dx, dy = np.diff(link.longitude) * east, np.diff(link.latitude) * METRES_PER_DEGREE
         run = np.concatenate([[0.0], np.cumsum(np.hypot(dx, dy))])
         lengths[k] = run[-1]
-        at = (np.arange(max(int(run[-1] / STEP_M), 1)) + 0.5) * run[-1] / max(int(run[-1] / STEP_M), 1)
+        at = (
+            (np.arange(max(int(run[-1] / STEP_M), 1)) + 0.5)
+            * run[-1]
+            / max(int(run[-1] / STEP_M), 1)
+        )
         piece = np.minimum(np.searchsorted(run, at, side="right") - 1, len(dx) - 1)
         parts.append(
             (np.full(len(at), k), at, np.interp(at, run, link.latitude), np.interp(at, run, link.longitude),

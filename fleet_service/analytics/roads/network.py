@@ -61,7 +61,9 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
         InputError: it cannot be read, has no such column, or holds no road; or a reader is not installed.
     """
     if not path.is_file():
-        raise InputError("extract", f"{path} is no file", "name an .osm.pbf, or a GeoPackage of lines")
+        raise InputError(
+            "extract", f"{path} is no file", "name an .osm.pbf, or a GeoPackage of lines"
+        )
     source = {"extract": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
     if path.name.endswith(EXTRACT):
         links, about = _openstreetmap(path)
@@ -69,9 +71,13 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
         links, about = _lines(path, identity, name), {}
     else:
         known = ", ".join((*EXTRACT, *LINES))
-        raise InputError("extract", f"{path.name} has an ending that is not known", f"give one of {known}")
+        raise InputError(
+            "extract", f"{path.name} has an ending that is not known", f"give one of {known}"
+        )
     if not links:
-        raise InputError("extract", f"{path.name} holds no road that cars may drive", "name another extract")
+        raise InputError(
+            "extract", f"{path.name} holds no road that cars may drive", "name another extract"
+        )
     return RoadNetwork(links, source | about)
 
 
@@ -83,14 +89,22 @@ def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
     links: list[DirectedLink] = []
     try:
         date = osmium.io.Reader(str(path)).header().get("osmosis_replication_timestamp", "")
-        found = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        found = (
+            osmium.FileProcessor(str(path))
+            .with_locations()
+            .with_filter(osmium.filter.KeyFilter("highway"))
+        )
         for way in found:
             if not isinstance(way, osmium.osm.Way) or way.tags.get("highway") not in CLASSES:
                 continue
-            points = np.array([(node.lat, node.lon) for node in way.nodes if node.location.valid()]).reshape(-1, 2)
+            points = np.array(
+                [(node.lat, node.lon) for node in way.nodes if node.location.valid()]
+            ).reshape(-1, 2)
             tags = dict(way.tags)
             kind, name = tags["highway"], tags.get("name", tags.get("ref", ""))
-            by_rule = tags.get("junction") in ("roundabout", "circular") or kind.startswith("motorway")
+            by_rule = tags.get("junction") in ("roundabout", "circular") or kind.startswith(
+                "motorway"
+            )
             oneway = tags.get("oneway", "yes" if by_rule else "no")
             links += _directions(str(way.id), name, kind, oneway, points)
     except (RuntimeError, ValueError, OSError) as error:
@@ -103,14 +117,22 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
     try:
         import geopandas
     except ImportError as error:
-        raise InputError("extract", "geopandas is not installed", install_command("roads")) from error
+        raise InputError(
+            "extract", "geopandas is not installed", install_command("roads")
+        ) from error
     try:
-        frame: Any = geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
+        frame: Any = (
+            geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
+        )
     except Exception as error:  # each of its readers raises its own
         problem = f"{path.name} cannot be read ({(str(error) or 'no reason given').splitlines()[0][:100]})"
         raise InputError("extract", problem, "name a file of lines") from error
     if identity not in frame.columns:
-        raise InputError("id", f"{path.name} has no column {identity!r}", f"use one of {', '.join(frame.columns)}")
+        raise InputError(
+            "id",
+            f"{path.name} has no column {identity!r}",
+            f"use one of {', '.join(frame.columns)}",
+        )
     if frame.crs is not None:
         frame = frame.to_crs(4326)
     links: list[DirectedLink] = []
@@ -120,13 +142,17 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
             continue
         points = np.asarray(about["geometry"].coords)[:, [1, 0]]
         if not (np.isfinite(points).all() and (np.abs(points) <= (90.0, 180.0)).all()):
-            raise InputError("extract", f"{path.name} has points that are no degrees", "give the file its CRS")
+            raise InputError(
+                "extract", f"{path.name} has points that are no degrees", "give the file its CRS"
+            )
         called, kind, oneway = (str(about.get(column) or "") for column in (name, "kind", "oneway"))
         links += _directions(str(about[identity]), called, kind, oneway, points)
     return links
 
 
-def _directions(identity: str, name: str, kind: str, oneway: str, points: FloatArray) -> list[DirectedLink]:
+def _directions(
+    identity: str, name: str, kind: str, oneway: str, points: FloatArray
+) -> list[DirectedLink]:
     """Return the directions in which a line may be driven."""
     apart = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
     points = points[apart[: len(points)]]

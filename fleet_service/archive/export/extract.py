@@ -46,7 +46,10 @@ def observations(root: Path, part: Extract) -> pa.Table:
         where.append(ValueRange("longitude", west, math.nextafter(east, -math.inf)))
         where.append(ValueRange("latitude", south, math.nextafter(north, -math.inf)))
     days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
-    found = [*reading.read(root, Kind.OBSERVATION, where=where, days=days), tables.OBSERVATION_ARCHIVE.empty_table()]
+    found = [
+        *reading.read(root, Kind.OBSERVATION, where=where, days=days),
+        tables.OBSERVATION_ARCHIVE.empty_table(),
+    ]
     table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
     table = mask_unmeasured(table, ("mu",), table["value"].to_numpy().astype(bool))
     return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
@@ -85,7 +88,9 @@ def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> 
     """Return a table with nulls in the columns `names` where nothing was measured, so that no bound gets a colour."""
     for name in names:
         column = table[name]
-        held: pa.ChunkedArray[Any] = pc.if_else(pa.array(known), column, pa.scalar(None, column.type))
+        held: pa.ChunkedArray[Any] = pc.if_else(
+            pa.array(known), column, pa.scalar(None, column.type)
+        )
         table = table.set_column(table.schema.get_field_index(name), table.schema.field(name), held)
     return table
 
@@ -100,7 +105,9 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
     measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
     table = mask_unmeasured(table, _OF_MU, measured)
-    return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
+    return geo.with_cells(
+        _inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")])
+    )
 
 
 WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
@@ -110,7 +117,9 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 
 def _within(column: str, part: Extract) -> ValueRange:
     """Return the filter for rows from the first time on and before the second."""
-    return ValueRange(column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1)
+    return ValueRange(
+        column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
+    )
 
 
 def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
@@ -128,7 +137,9 @@ def write(table: pa.Table, path: Path) -> None:
     """
     writer = _WRITERS.get(path.suffix)
     if writer is None:
-        raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(_WRITERS)}")
+        raise InputError(
+            "out", f"{path.name} has no known ending", f"use one of {', '.join(_WRITERS)}"
+        )
     with commandline.report_write_errors(path):
         writer(table, path)
 
@@ -136,7 +147,9 @@ def write(table: pa.Table, path: Path) -> None:
 def features(table: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are omitted."""
     flat = _flat(table)
-    for geometry, *values in zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True):
+    for geometry, *values in zip(
+        geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True
+    ):
         properties = dict(zip(flat.schema.names, values, strict=True))
         yield {"type": "Feature", "geometry": geometry, "properties": properties}
 
@@ -171,7 +184,9 @@ def _texts(table: pa.Table, name: str) -> list[Any]:
 
 
 def _flat(table: pa.Table) -> pa.Table:
-    plain = [f.name for f in table.schema if not (pa.types.is_nested(f.type) or "binary" in str(f.type))]
+    plain = [
+        f.name for f in table.schema if not (pa.types.is_nested(f.type) or "binary" in str(f.type))
+    ]
     return table.select(plain)
 
 

@@ -29,9 +29,14 @@ def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     try:
         there, base = fs.FileSystem.from_uri(uri)
         there.create_dir(base, recursive=True)
-        sizes = {info.path: info.size for info in there.get_file_info(fs.FileSelector(base, recursive=True))}
+        sizes = {
+            info.path: info.size
+            for info in there.get_file_info(fs.FileSelector(base, recursive=True))
+        }
     except (pa.ArrowInvalid, OSError) as error:
-        raise InputError("to", f"cannot use {uri} ({error})", "give a URI such as s3://bucket/folder") from error
+        raise InputError(
+            "to", f"cannot use {uri} ({error})", "give a URI such as s3://bucket/folder"
+        ) from error
     count = 0
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):
         target = f"{base}/{path.relative_to(root).as_posix()}"

@@ -37,7 +37,9 @@ class Encoding:
 
 
 _REPEATED: Final = ("vehicle", "estimator", "boot", "region", "health", "received_at")
-_STEPPED: Final = tuple(f.name for f in (*tables.OBSERVATION, *tables.STATE) if f.step and f.type == tables.F32)
+_STEPPED: Final = tuple(
+    f.name for f in (*tables.OBSERVATION, *tables.STATE) if f.step and f.type == tables.F32
+)
 # A segment lives until it is compacted and is then read whole: level 1 takes 4 % more bytes and .2 us less a row.
 SEGMENT: Final = Encoding(_REPEATED, level=1)
 # Measured on 388 000 rows of simulated vehicles with the real estimator, bytes a row: single-precision steps 1.3 with
@@ -49,8 +51,12 @@ COMPACTED: Final = Encoding(
     index=True,
 )
 
-MAP: Final = Encoding(("basis", "sector", "vehicles", "observations"), ("first_time", "last_time"), index=True)
-ROLLUP: Final = Encoding(("sector", "hour", "observations", "late", "vehicles", "mu_count"), index=True)
+MAP: Final = Encoding(
+    ("basis", "sector", "vehicles", "observations"), ("first_time", "last_time"), index=True
+)
+ROLLUP: Final = Encoding(
+    ("sector", "hour", "observations", "late", "vehicles", "mu_count"), index=True
+)
 
 
 def write_table(
@@ -80,13 +86,20 @@ def write_table(
         "column_encoding": {name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names},
         "write_statistics": encoding.index, "write_page_index": encoding.index, "write_page_checksum": True,
     }  # fmt: skip
-    with open_durably(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
+    with (
+        open_durably(path, named=named) as file,
+        pq.ParquetWriter(file, table.schema, **options) as writer,
+    ):
         writer.write_table(table, ROW_GROUP)
         writer.add_key_value_metadata(version.footer(table.schema, footer))
 
 
 def put_in_place(
-    root: Path, table: pa.Table, path: Path, encoding: Encoding, footer: Mapping[str, str] | None = None
+    root: Path,
+    table: pa.Table,
+    path: Path,
+    encoding: Encoding,
+    footer: Mapping[str, str] | None = None,
 ) -> None:
     """Write a file below `root`, with its folders; replace an old one.
 
@@ -100,7 +113,12 @@ def put_in_place(
 
 def sync_tree(root: Path, folders: Iterable[Path]) -> None:
     """Make new files in `folders`, and those folders themselves, durable."""
-    above = {parent for folder in folders for parent in (folder, *folder.parents) if parent.is_relative_to(root)}
+    above = {
+        parent
+        for folder in folders
+        for parent in (folder, *folder.parents)
+        if parent.is_relative_to(root)
+    }
     for folder in sorted(above, reverse=True):
         sync_directory(folder)
 
@@ -115,7 +133,9 @@ def lock_archive(root: Path) -> BinaryIO:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unusable(root, error) from error
-    return lock_file(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
+    return lock_file(
+        root / "lock", f"{root} belongs to a running service", "stop it, or give another folder"
+    )
 
 
 def is_served(root: Path) -> bool:
@@ -146,4 +166,6 @@ def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
 
 
 def _unusable(root: Path, error: OSError) -> InputError:
-    return InputError("archive", f"cannot use {root} ({error.strerror})", "give a folder you may write to")
+    return InputError(
+        "archive", f"cannot use {root} ({error.strerror})", "give a folder you may write to"
+    )

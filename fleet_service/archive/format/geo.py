@@ -50,7 +50,10 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
         for n, begin in zip(count.tolist(), first.tolist(), strict=False)
     ]
     extreme = (np.minimum, np.minimum, np.maximum, np.maximum)
-    whole = tuple(f.reduceat(side, first[:-1]) if len(count) else side for f, side in zip(extreme, sides, strict=True))
+    whole = tuple(
+        f.reduceat(side, first[:-1]) if len(count) else side
+        for f, side in zip(extreme, sides, strict=True)
+    )
     return _marked(table, pa.array(wkb, pa.binary()), "MultiPolygon", whole)
 
 
@@ -66,7 +69,9 @@ def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield the geometries of a GeoParquet table as GeoJSON."""
     written: list[Any] = table[GEOMETRY].to_pylist()
     for wkb in written:
-        kind, count = struct.unpack_from("<II", wkb, 1) if len(wkb) > _POINT.itemsize else (_TYPE_POINT, 0)
+        kind, count = (
+            struct.unpack_from("<II", wkb, 1) if len(wkb) > _POINT.itemsize else (_TYPE_POINT, 0)
+        )
         if kind == _TYPE_POINT:
             yield {"type": "Point", "coordinates": np.frombuffer(wkb, "<f8", 2, 5).tolist()}
         elif kind == _TYPE_POLYGON:
@@ -86,7 +91,9 @@ def _ring(corners: int) -> np.dtype[Any]:
     return np.dtype([*_RING.descr, ("xy", "<f8", (corners, 2))])
 
 
-def _outlines(table: pa.Table, cells: IntArray, count: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
+def _outlines(
+    table: pa.Table, cells: IntArray, count: IntArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number of cells per row."""
     if "sector" not in table.schema.names:
         return grid.outline(cells)
@@ -94,14 +101,21 @@ def _outlines(table: pa.Table, cells: IntArray, count: IntArray | None = None) -
     return grid.outline(cells, sector if count is None else np.repeat(sector, count))
 
 
-def _extremes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _extremes(
+    x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     return x.min(axis=1), y.min(axis=1), x.max(axis=1), y.max(axis=1)
 
 
 def _polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
     """Return polygons of the corners x, y (n, k), each as a closed ring."""
     wkb = np.zeros(len(x), _ring(x.shape[1] + 1))
-    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, x.shape[1] + 1
+    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = (
+        _LITTLE_ENDIAN,
+        _TYPE_POLYGON,
+        1,
+        x.shape[1] + 1,
+    )
     corners = np.stack([x, y], axis=2)
     wkb["xy"] = np.concatenate([corners, corners[:, :1]], axis=1)
     return wkb
@@ -113,7 +127,9 @@ def _binary(wkb: np.ndarray[Any, Any]) -> pa.Array[Any]:
     return pa.Array.from_buffers(pa.binary(), len(wkb), buffers)
 
 
-def _marked(table: pa.Table, geometry: pa.Array[Any], kind: str, sides: tuple[FloatArray, ...]) -> pa.Table:
+def _marked(
+    table: pa.Table, geometry: pa.Array[Any], kind: str, sides: tuple[FloatArray, ...]
+) -> pa.Table:
     box = pa.StructArray.from_arrays([pa.array(side) for side in sides], names=list(SIDES))
     column: dict[str, Any] = {
         "encoding": "WKB", "geometry_types": [kind] if len(geometry) else [],
@@ -122,10 +138,15 @@ def _marked(table: pa.Table, geometry: pa.Array[Any], kind: str, sides: tuple[Fl
     if kind != "Point":
         column["orientation"] = "counterclockwise"
     if len(geometry):
-        least, most = [float(side.min()) for side in sides[:2]], [float(side.max()) for side in sides[2:]]
+        least, most = (
+            [float(side.min()) for side in sides[:2]],
+            [float(side.max()) for side in sides[2:]],
+        )
         column["bbox"] = [*least, *most]
     geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
-    marked = table.append_column(_field(GEOMETRY, geometry, "WKB, longitude and latitude (OGC:CRS84)"), geometry)
+    marked = table.append_column(
+        _field(GEOMETRY, geometry, "WKB, longitude and latitude (OGC:CRS84)"), geometry
+    )
     marked = marked.append_column(_field(BBOX, box, "of the geometry, deg"), box)
     metadata: dict[Any, Any] = {**(table.schema.metadata or {}), GEO: json.dumps(geo).encode()}
     return marked.replace_schema_metadata(metadata)

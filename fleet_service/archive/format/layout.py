@@ -28,8 +28,14 @@ from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
-TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the measurement, by which rows are kept
-FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old, and its month
+TIME: Final = {
+    Kind.OBSERVATION: "leave_time",
+    Kind.STATE: "time",
+}  # of the measurement, by which rows are kept
+FIRST_TIME: Final = {
+    Kind.OBSERVATION: "enter_time",
+    Kind.STATE: "time",
+}  # by which a batch is too old, and its month
 CHECKPOINTS: Final = "checkpoints"  # a folder
 EPOCH_FILE: Final = "term"  # holds the epoch of the service that owns the folder
 DAY_NS: Final = 86_400_000_000_000
@@ -43,7 +49,9 @@ _OF_A_TERM: Final = {
     "weather": re.compile(r"\.(?P<term>\d{10})-(?P<epoch>\d{20})\.parquet$"),
     "keys": re.compile(r"(?P<epoch>)\.(?P<term>\d{10})\.witnesses$"),
 }
-_DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")  # and no copy that somebody made of one
+_DAY: Final = re.compile(
+    r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])"
+)  # and no copy that somebody made of one
 
 
 class Cut(NamedTuple):
@@ -78,7 +86,11 @@ def require_archive(root: Path) -> None:
     if not root.is_dir():
         raise InputError("archive", f"{root} is no folder", "give the archive of a service")
     if not any((root / name).is_dir() for name in MARKS):
-        raise InputError("archive", f"{root} is no archive: it has no {MARKS[0]}", "give the archive of a service")
+        raise InputError(
+            "archive",
+            f"{root} is no archive: it has no {MARKS[0]}",
+            "give the archive of a service",
+        )
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
@@ -98,7 +110,9 @@ def day_of(folder: Path) -> int:
 
 def partition_of(path: Path) -> Partition:
     """Return the partition in whose folder a file lies."""
-    return Partition(day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q")))
+    return Partition(
+        day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
+    )
 
 
 def compacted_files(
@@ -109,13 +123,16 @@ def compacted_files(
         yield from sorted(folder.glob("zone=*/*.parquet"))
 
 
-def days(root: Path, table: str, since_day: int | None = None, until_day: int | None = None) -> list[Path]:
+def days(
+    root: Path, table: str, since_day: int | None = None, until_day: int | None = None
+) -> list[Path]:
     """Return the folders of a table's days in order."""
     found = sorted(path for path in (root / table).glob("date=*") if _DAY.fullmatch(path.name))
     return [
         folder
         for folder in found
-        if (since_day is None or day_of(folder) >= since_day) and (until_day is None or day_of(folder) <= until_day)
+        if (since_day is None or day_of(folder) >= since_day)
+        and (until_day is None or day_of(folder) <= until_day)
     ]
 
 

@@ -25,12 +25,26 @@ from schemas.errors import InputError
 
 log = logging.getLogger(__name__)
 BAD: Final = ".bad"
-BATCH_ROWS: Final = 1 << 14  # that are held at once where a file is gone through: a row group takes ten times as much
+BATCH_ROWS: Final = (
+    1 << 14
+)  # that are held at once where a file is gone through: a row group takes ten times as much
 BUFFER_BYTES: Final = 1 << 16  # of a column's file then
 
 # Without them a row is none, whatever version wrote it.
 NEEDED: Final = frozenset(
-    {"leave_time", "time", "cell", "sector", "latitude", "longitude", "vehicle", "boot", "region", "seq", "row"}
+    {
+        "leave_time",
+        "time",
+        "cell",
+        "sector",
+        "latitude",
+        "longitude",
+        "vehicle",
+        "boot",
+        "region",
+        "seq",
+        "row",
+    }
     | {"received_at", "hour", "acts_from", "enter_time", "first_held", "late", "weight"}
 )
 
@@ -124,9 +138,14 @@ def load_groups(
         own = [one for one in where if one.column in names]
         looked = list({one.column: None for one in own})
         for group in matching_row_groups(file.metadata, where):
-            if own and not any(filter_table(part, own).num_rows for part in _batches(file, group, looked)):
+            if own and not any(
+                filter_table(part, own).num_rows for part in _batches(file, group, looked)
+            ):
                 continue
-            parts = [filter_table(conform_columns(part, known), where) for part in _batches(file, group, names)]
+            parts = [
+                filter_table(conform_columns(part, known), where)
+                for part in _batches(file, group, names)
+            ]
             if parts:  # none, of a file whose only vehicle was forgotten
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
@@ -146,9 +165,14 @@ def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Tab
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
     parts = [
-        filter_table(file.read_row_group(group, names), known) for group in matching_row_groups(file.metadata, where)
+        filter_table(file.read_row_group(group, names), known)
+        for group in matching_row_groups(file.metadata, where)
     ]
-    return pa.concat_tables(parts) if parts else own.empty_table().select(own.names if names is None else names)
+    return (
+        pa.concat_tables(parts)
+        if parts
+        else own.empty_table().select(own.names if names is None else names)
+    )
 
 
 def content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
@@ -164,12 +188,18 @@ def _content(
     path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged, buffer_bytes: int = 0
 ) -> Content | None:  # fmt: skip
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True, buffer_size=buffer_bytes) as file:
+        with pq.ParquetFile(
+            path, page_checksum_verification=True, buffer_size=buffer_bytes
+        ) as file:
             entries = entries_of(file.metadata.metadata)
-            if is_newer(entries):  # before it is read: it may be written in a way that is not known here
+            if is_newer(
+                entries
+            ):  # before it is read: it may be written in a way that is not known here
                 judge(path, file.schema_arrow, entries)
             table = read(file)
-            whole = table.num_columns == file.metadata.num_columns  # then its schema is at hand, in a third of the time
+            whole = (
+                table.num_columns == file.metadata.num_columns
+            )  # then its schema is at hand, in a third of the time
             version = judge(path, table.schema if whole else file.schema_arrow, entries)
         table.validate(full=True)
         return Content(table, version, entries)
@@ -196,9 +226,17 @@ def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
 def _column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
     if wanted.name not in table.column_names:
         if wanted.name in NEEDED:
-            raise InputError("archive", f"a file has no column {wanted.name}", "read it with the GripMap that wrote it")
-        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):  # before 1.2
-            mu, used = (np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised"))
+            raise InputError(
+                "archive",
+                f"a file has no column {wanted.name}",
+                "read it with the GripMap that wrote it",
+            )
+        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(
+            table.column_names
+        ):  # before 1.2
+            mu, used = (
+                np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised")
+            )
             return pa.chunked_array([pa.array(is_value(mu, used))])
         return pa.chunked_array([pa.nulls(table.num_rows, wanted.type)])
     column = table.column(wanted.name)

@@ -74,7 +74,9 @@ def read(
     yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
 
 
-def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> Iterator[pa.Table]:
+def read_wanted(
+    root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
+) -> Iterator[pa.Table]:
     """Yield tables like `read`, for a selection."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
@@ -91,7 +93,9 @@ class Listing:
         as of `read`.
     """
 
-    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> None:
+    def __init__(
+        self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
+    ) -> None:
         self.kind, self._wanted, self._damaged = kind, wanted, damaged
         self._schema = segments.SCHEMAS[kind]
         self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
@@ -105,7 +109,9 @@ class Listing:
         """Yield the rows that no compacted file holds; call it once."""
         fresh, self._fresh = self._fresh, []
         for path, table in fresh:
-            yield drop_compacted(table, self.kind, self._done.get(path.name, set())).select(self._names)
+            yield drop_compacted(table, self.kind, self._done.get(path.name, set())).select(
+                self._names
+            )
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
         """Read a file like `load`, one row group at a time; if False, discard the rows taken."""
@@ -141,7 +147,11 @@ def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tup
                 paths = [path for path in paths if layout.age(path.name)[:2] <= wanted.until]
             schema = segments.SCHEMAS[kind]
             loaded = [
-                (path, load(path, schema, wanted.columns, wanted.where, whole=True, damaged=damaged)) for path in paths
+                (
+                    path,
+                    load(path, schema, wanted.columns, wanted.where, whole=True, damaged=damaged),
+                )
+                for path in paths
             ]
         except FileNotFoundError:  # compacted meanwhile
             continue
@@ -169,7 +179,9 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
     """Return the rows that lie in none of the partitions."""
     if not done or not table.num_rows:
         return table
-    day, zone = layout.partitions_of(segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy())
+    day, zone = layout.partitions_of(
+        segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy()
+    )
     taken: BoolArray = np.zeros(table.num_rows, bool)
     for partition in done:
         taken |= (day == partition.day) & (zone == partition.zone)
@@ -188,4 +200,8 @@ def sources_of(path: Path) -> set[str]:
         runs = json.loads((footer.metadata or {}).get(SOURCES, b"[]"))
     except (FileNotFoundError, pa.ArrowInvalid, DamagedError):
         return set()
-    return {layout.segment_name(prefix, number) for prefix, first, last in runs for number in range(first, last + 1)}
+    return {
+        layout.segment_name(prefix, number)
+        for prefix, first, last in runs
+        for number in range(first, last + 1)
+    }

@@ -44,7 +44,10 @@ duckdb.sql('''select cell, sector, count(distinct vehicle), median(mu) filter (v
 """
 _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
     ("observations", tables.OBSERVATION_KEPT),
-    ("states", tables.kept(*tables.STATE, *tables.IDENTITY, tables.STATE_CELL, *tables.BOOKKEEPING[:1])),
+    (
+        "states",
+        tables.kept(*tables.STATE, *tables.IDENTITY, tables.STATE_CELL, *tables.BOOKKEEPING[:1]),
+    ),
     ("map", tables.MAP_KEPT),
     ("rollup/cell_hour", tables.CELL_HOUR),
 )
@@ -75,6 +78,8 @@ def keep(root: Path) -> None:
     """
     path, page = root / NAME, text().encode()
     there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
-    if there != page and (not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())):
+    if there != page and (
+        not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())
+    ):
         with open_durably(path) as file:
             file.write(page)

@@ -56,4 +56,6 @@ def _may(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's
     if statistics is None or not statistics.has_min_max:
         return True
     least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])
-    return (most is None or statistics.min_raw <= most) and (least is None or statistics.max_raw >= least)
+    return (most is None or statistics.min_raw <= most) and (
+        least is None or statistics.max_raw >= least
+    )

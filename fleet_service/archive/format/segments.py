@@ -59,13 +59,23 @@ class Writer:
         folders = [folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
             inbox.mkdir(parents=True, exist_ok=True)
-            for draft in inbox.glob(f"*{ENDING}"):  # of a run that died while writing: never acknowledged
+            for draft in inbox.glob(
+                f"*{ENDING}"
+            ):  # of a run that died while writing: never acknowledged
                 draft.unlink()
-        for parent in {root.parent, root, *folders}:  # a folder that power loss forgets takes its segments along
+        for parent in {
+            root.parent,
+            root,
+            *folders,
+        }:  # a folder that power loss forgets takes its segments along
             sync_directory(parent)
         self._unsynced: set[Path] = set()
         # Compacted rows are known by the names of their segments, so that these may not be used again either.
-        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted_files(root, kind))]
+        named = [
+            path
+            for kind in SCHEMAS
+            for path in (*paths(root, kind), *layout.compacted_files(root, kind))
+        ]
         used = [layout.age(path.name)[0] for path in named]
         self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
@@ -83,7 +93,9 @@ class Writer:
             OSError: it could not be written; no draft is left.
         """
         self._seq += 1
-        path = folder(self._root, kind) / layout.segment_name(f"{self._shard}-{self._epoch:010d}", self._seq)
+        path = folder(self._root, kind) / layout.segment_name(
+            f"{self._shard}-{self._epoch:010d}", self._seq
+        )
         write_table(table_of(kind, rows), path, SEGMENT, named=False)
         self._unsynced.add(path.parent)
         return path
@@ -102,8 +114,13 @@ class Writer:
 def round_to_steps(rows: Rows) -> Rows:
     """Return rows with floats at multiples of their column's step and times in microseconds: the fusion uses what is
     stored."""
-    out = {name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c for name, c in rows.items()}
-    return out | {name: out[name] // tables.US_STEP * tables.US_STEP for name in _TIMES if name in out}
+    out = {
+        name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c
+        for name, c in rows.items()
+    }
+    return out | {
+        name: out[name] // tables.US_STEP * tables.US_STEP for name in _TIMES if name in out
+    }
 
 
 def nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
@@ -117,10 +134,14 @@ def table_of(kind: Kind, rows: Rows) -> pa.Table:
 
 
 def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
-    values = is_value(rows["mu"], rows["mu_utilised"]) if f.name == tables.VALUE.name else rows[f.name]
+    values = (
+        is_value(rows["mu"], rows["mu_utilised"]) if f.name == tables.VALUE.name else rows[f.name]
+    )
     if f.type == tables.LIKELIHOOD:
         valid = np.packbits(rows["with_likelihood"], bitorder="little").tobytes()
-        return pa.Array.from_buffers(f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())])
+        return pa.Array.from_buffers(
+            f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())]
+        )
     if f.type == tables.US:
         values = values // tables.US_STEP
     column: pa.Array[Any] = pa.array(values).cast(f.type)
@@ -161,5 +182,7 @@ def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
 def _likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:
     """Return fixed-size binary as (n, 32); rows without one are flat."""
     filled: pa.Array[Any] = column.fill_null(bytes(mugrid.BINS))
-    data = np.frombuffer((filled.buffers()[1] or pa.py_buffer(b"")).to_pybytes(), np.uint8).reshape(-1, mugrid.BINS)
+    data = np.frombuffer((filled.buffers()[1] or pa.py_buffer(b"")).to_pybytes(), np.uint8).reshape(
+        -1, mugrid.BINS
+    )
     return data[filled.offset : filled.offset + len(filled)]

@@ -29,7 +29,9 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
     """
     path = path_of(root, now)
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
-    table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
+    table = table.append_column("snapshot_time", time).sort_by(
+        [("cell", "ascending"), ("sector", "ascending")]
+    )
     kept = table.cast(tables.MAP_ARCHIVE, safe=False)
     put_in_place(root, geo.with_cells(kept), path, MAP)
     return path

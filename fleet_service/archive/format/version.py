@@ -43,7 +43,13 @@ DIGEST: Final = PREFIX + "digest"
 _PREFIX: Final = PREFIX.encode()
 # Digests of the columns of version 1.0: observations, states, map, roll-up, weather.
 FIRST: Final = frozenset(
-    {"b4e3f43b32a213b3", "1bfeb3d126375335", "6fe39bc9930a552b", "248504dd5bdebddb", "c7a993882fc20c55"}
+    {
+        "b4e3f43b32a213b3",
+        "1bfeb3d126375335",
+        "6fe39bc9930a552b",
+        "248504dd5bdebddb",
+        "c7a993882fc20c55",
+    }
 )
 
 
@@ -89,7 +95,9 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     found = parse_version(entries[KEY])
     if found.major > VERSION.major:
         raise InputError(
-            "archive", f"{path} is of version {found}, and this GripMap reads {VERSION.major}.x", "use a newer GripMap"
+            "archive",
+            f"{path} is of version {found}, and this GripMap reads {VERSION.major}.x",
+            "use a newer GripMap",
         )
     return found
 

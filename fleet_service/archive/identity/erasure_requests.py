@@ -47,7 +47,9 @@ def write_request(root: Path, wanted: Erasure) -> Path:
         file.write(json.dumps(asdict(wanted)).encode())
     owner = root.stat()
     for place in (folder, path):
-        with suppress(PermissionError):  # an administrator asks for the user that the service runs as
+        with suppress(
+            PermissionError
+        ):  # an administrator asks for the user that the service runs as
             os.chown(place, owner.st_uid, owner.st_gid)
     return path
 
@@ -74,7 +76,9 @@ def open_requests(root: Path) -> list[Path]:
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
         if time.time() - path.stat().st_mtime > _KEPT_S:
             path.unlink()
-    return sorted(path for path in (root / FOLDER).glob("*.json") if not path.name.endswith(_ANSWER))
+    return sorted(
+        path for path in (root / FOLDER).glob("*.json") if not path.name.endswith(_ANSWER)
+    )
 
 
 def read(question: Path) -> Erasure:
@@ -85,7 +89,9 @@ def read(question: Path) -> Erasure:
     """
     try:
         record = json.loads(question.read_bytes())
-        return Erasure(str(record["month"]), None if record.get("vehicle") is None else str(record["vehicle"]))
+        return Erasure(
+            str(record["month"]), None if record.get("vehicle") is None else str(record["vehicle"])
+        )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError("request", f"{question.name} is none", "ask again") from error
 

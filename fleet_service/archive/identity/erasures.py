@@ -70,7 +70,11 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
     if pseudonym is not None:
         (folder / f"{month}.{pseudonym}.{max(until, 0)}.erased").touch(0o600)
     else:  # the month's says more than those of its vehicles; what these forgot may be newer than all that is there
-        names = [name for path in folder.glob(f"{month}.*.erased") if (name := _NAME.fullmatch(path.name)) and name[2]]
+        names = [
+            name
+            for path in folder.glob(f"{month}.*.erased")
+            if (name := _NAME.fullmatch(path.name)) and name[2]
+        ]
         until = max([until, *(int(name[3]) for name in names)])
         (folder / f"{month}.{max(until, 0)}.erased").touch(0o600)
         sync_directory(folder)

@@ -100,7 +100,9 @@ def load_or_create_key(path: Path) -> bytes:
         with open_durably(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
             file.write(key + _check(key))
-        sync_directory(path.parent.parent)  # else power loss forgets the key, and acknowledged batches with it
+        sync_directory(
+            path.parent.parent
+        )  # else power loss forgets the key, and acknowledged batches with it
     return _checked(path)
 
 

@@ -57,13 +57,17 @@ class VehicleIds:
         if self._key is None or self._known is None:
             self._key = load_or_create_key(self._folder / _KEY)
             self._known = set(read(self._folder))
-        number = int.from_bytes(blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True)
+        number = int.from_bytes(
+            blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True
+        )
         if pseudonym not in self._known:
             path = self._folder / f"{layout.with_term(month, self._term)}{ENDING}"
             path.touch(_SECRET)
             self._unsynced.add(path)
             with path.open("r+b", buffering=0) as file:
-                file.seek(file.seek(0, os.SEEK_END) // _LINE * _LINE)  # over what a full disk left of a line
+                file.seek(
+                    file.seek(0, os.SEEK_END) // _LINE * _LINE
+                )  # over what a full disk left of a line
                 if file.write(_line(pseudonym, number)) != _LINE:
                     raise OSError(errno.ENOSPC, "no room for a line", str(path))
             self._known.add(pseudonym)
@@ -85,7 +89,11 @@ class VehicleIds:
 
 def read(folder: Path) -> dict[int, int]:
     """Return the numbers by pseudonym of all months, without damaged lines."""
-    return {pseudonym: number for path in _files(folder) for pseudonym, number in _whole(path.read_bytes())}
+    return {
+        pseudonym: number
+        for path in _files(folder)
+        for pseudonym, number in _whole(path.read_bytes())
+    }
 
 
 def remove_damaged_lines(folder: Path) -> int:
@@ -137,7 +145,11 @@ def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
         data = path.read_bytes()
         lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
         with open_durably(path, _SECRET) as file:
-            file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
+            file.write(
+                b"".join(
+                    line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym
+                )
+            )
 
 
 def _line(pseudonym: int, number: int) -> bytes:

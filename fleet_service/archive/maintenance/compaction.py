@@ -46,7 +46,9 @@ def lock_compacted(root: Path) -> BinaryIO:
     Raises:
         InputError: another process adds to them or rewrites them.
     """
-    return lock_file(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended")
+    return lock_file(
+        root / "compaction.lock", f"{root} is being compacted", "wait until that has ended"
+    )
 
 
 @contextmanager
@@ -82,10 +84,19 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
         term = layout.read_epoch(root)
         for kind in Kind:
             waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
-            done = reading.compacted_partitions(layout.compacted_files(root, kind), {path.name for path in waiting})
+            done = reading.compacted_partitions(
+                layout.compacted_files(root, kind), {path.name for path in waiting}
+            )
             # A run that died, or found the disk full, may have left its files in place with their names not yet synced:
             # the segments that they stand for may only be deleted when power loss can no longer forget them.
-            sync_tree(root, {part.folder(root, layout.TABLES[kind]) for parts in done.values() for part in parts})
+            sync_tree(
+                root,
+                {
+                    part.folder(root, layout.TABLES[kind])
+                    for parts in done.values()
+                    for part in parts
+                },
+            )
             rest = _Rest(root, kind, iter(waiting), done, term)
             while (moved := _round(rest, round_rows)).segments:
                 total = CompactionResult(*map(sum, zip(total, moved, strict=True)))
@@ -107,18 +118,25 @@ def _round(rest: _Rest, most: int) -> CompactionResult:
     sources: list[Path] = []
     tables: list[pa.Table] = []
     newest = VERSION
-    while sum(table.num_rows for table in tables) < most and (path := next(rest.segments, None)) is not None:
+    while (
+        sum(table.num_rows for table in tables) < most
+        and (path := next(rest.segments, None)) is not None
+    ):
         found = content(path, set_aside)
         if found is not None:
             sources.append(path)
             newest = max(newest, found.version)
-            tables.append(reading.drop_compacted(found.table, rest.kind, rest.done.get(path.name, set())))
+            tables.append(
+                reading.drop_compacted(found.table, rest.kind, rest.done.get(path.name, set()))
+            )
     if not sources:
         return CompactionResult(0, 0, 0)
     table = join_versions(tables, segments.SCHEMAS[rest.kind])
     named = json.dumps(runs(path.name for path in sources))
     footer = {KEY: str(newest), reading.SOURCES.decode(): named}
-    files = _place(rest.root, rest.kind, layout.compacted_name(sources[-1].name, rest.term), table, footer)
+    files = _place(
+        rest.root, rest.kind, layout.compacted_name(sources[-1].name, rest.term), table, footer
+    )
     for path in sources:
         path.unlink()
     sync_directory(segments.folder(rest.root, rest.kind))

@@ -108,7 +108,9 @@ def place_of(root: Path) -> Place | None:
     except FileNotFoundError:
         return None
     except (ValueError, TypeError) as error:
-        raise InputError("archive", f"{path} is damaged ({error})", "run export iceberg again") from error
+        raise InputError(
+            "archive", f"{path} is damaged ({error})", "run export iceberg again"
+        ) from error
 
 
 def _remember(root: Path, place: Place) -> None:
@@ -120,7 +122,9 @@ def _remember(root: Path, place: Place) -> None:
         before = None
     if before is not None and before != place:
         problem = f"this archive is registered at {before.catalog}, namespace {before.namespace}, files at {before.at}"
-        raise InputError("catalog", problem, f"give these; or drop those tables, then remove {path}")
+        raise InputError(
+            "catalog", problem, f"give these; or drop those tables, then remove {path}"
+        )
     if before is None:
         with open_durably(path) as file:
             file.write(json.dumps(place._asdict()).encode())
@@ -130,7 +134,9 @@ def _catalog(place: Place) -> Catalog:
     try:
         from pyiceberg.catalog import load_catalog
     except ImportError as error:
-        raise InputError("catalog", "pyiceberg is not installed", install_command("iceberg")) from error
+        raise InputError(
+            "catalog", "pyiceberg is not installed", install_command("iceberg")
+        ) from error
     if not place.catalog.startswith(("sqlite://", "postgresql")):
         return load_catalog(place.catalog)
     catalog_properties = {"type": "sql", "uri": place.catalog}
@@ -166,11 +172,17 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
     there = {_name(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
     # one that was rewritten elsewhere is known by its size
-    stale = [n for n, file in mine.items() if n not in there or there[n].stat().st_size != file.file_size_in_bytes]
+    stale = [
+        n
+        for n, file in mine.items()
+        if n not in there or there[n].stat().st_size != file.file_size_in_bytes
+    ]
     missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
     _commit(table, [mine[name] for name in stale], missing)
     now = _held(table.refresh())
-    return RegistrationResult(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
+    return RegistrationResult(
+        len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there)
+    )
 
 
 def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
@@ -208,4 +220,6 @@ def _said(place: Place) -> Iterator[None]:
         raise
     except Exception as error:  # every catalogue has errors of its own
         fix = "see that it is reached, then run it again"
-        raise InputError("catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix) from error
+        raise InputError(
+            "catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix
+        ) from error

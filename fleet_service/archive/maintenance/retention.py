@@ -34,7 +34,9 @@ from schemas.wire import Kind
 
 # A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.
 LEAST_DAYS: Final = 31
-ANONYMOUS: Final = 5  # vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
+ANONYMOUS: Final = (
+    5  # vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
+)
 _KEYS: Final = "keys"
 
 
@@ -80,7 +82,11 @@ def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
 
 def _last_to_go(raw_days: int, today: date) -> int:
     if raw_days < LEAST_DAYS:
-        raise InputError("raw-days", f"{raw_days} are too few to know a batch again", f"give {LEAST_DAYS} or more")
+        raise InputError(
+            "raw-days",
+            f"{raw_days} are too few to know a batch again",
+            f"give {LEAST_DAYS} or more",
+        )
     return (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
 
 
@@ -112,7 +118,9 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
     sync_directory(key.parent)
 
 
-def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf) -> int:
+def _newest(
+    root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
+) -> int:
     """Return the newest first time of a record of these days [ns], -1 if there is none; one not before `until` is
     enough."""
     newest = -1
@@ -169,14 +177,22 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
         for damaged in files:  # nobody can tell what is in them
             damaged.unlink()
         for kind in Kind:
-            theirs = [path for path in layout.compacted_files(root, kind, begin, end) if _names(kind, path, pseudonym)]
+            theirs = [
+                path
+                for path in layout.compacted_files(root, kind, begin, end)
+                if _names(kind, path, pseudonym)
+            ]
             iceberg.unregister(root, theirs)
             for path in theirs:
                 if len(removed := _without(root, kind, path, pseudonym)):
                     rows, cells = rows + len(removed), cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
         for folder in layout.days(root, snapshots.TABLE, begin, end):
-            files += [path for path in sorted(folder.glob("*.parquet")) if _thin_snapshot(root, path, cells)]
+            files += [
+                path
+                for path in sorted(folder.glob("*.parquet"))
+                if _thin_snapshot(root, path, cells)
+            ]
         yield ErasureResult(rows, tuple(files))
 
 
@@ -198,7 +214,9 @@ def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
     found = content(path, _refuse_damaged)
     if found is None or not cells:
         return False
-    lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (found.table["vehicles"].to_numpy() < ANONYMOUS)
+    lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (
+        found.table["vehicles"].to_numpy() < ANONYMOUS
+    )
     if not lines.any():
         return False
     stay = found.table.filter(pa.array(~lines))
@@ -216,7 +234,11 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
     key_of(root, month)
     pseudonym = _pseudonym(root, vehicle, month)
     where = [ValueRange("vehicle", pseudonym, pseudonym)]
-    return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, _days(month)))
+    return sum(
+        table.num_rows
+        for kind in Kind
+        for table in reading.read(root, kind, ["vehicle"], where, _days(month))
+    )
 
 
 def drop_checkpoints(root: Path) -> None:
@@ -243,7 +265,11 @@ def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
         return []
     theirs = pc.equal(found.table["vehicle"], pa.scalar(pseudonym))
     put_in_place(
-        root, found.table.filter(pc.invert(theirs)), path, COMPACTED, {KEY: str(found.version), **found.entries}
+        root,
+        found.table.filter(pc.invert(theirs)),
+        path,
+        COMPACTED,
+        {KEY: str(found.version), **found.entries},
     )
     if kind is Kind.OBSERVATION:
         rollup.make_part(root, path)
@@ -252,7 +278,9 @@ def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
 
 def _refuse_damaged(path: Path, problem: str) -> None:
     """Raise for a damaged file, because it may hold rows to be forgotten."""
-    raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
+    raise InputError(
+        "archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again"
+    )
 
 
 def key_of(root: Path, month: str) -> Path:
@@ -264,7 +292,9 @@ def key_of(root: Path, month: str) -> Path:
     erasures.first_day(month)
     path = root / _KEYS / f"{month}.key"
     if not path.exists():
-        raise InputError("period", f"the archive has no key of {month}", "nobody can tell whose its rows are")
+        raise InputError(
+            "period", f"the archive has no key of {month}", "nobody can tell whose its rows are"
+        )
     return path
 
 

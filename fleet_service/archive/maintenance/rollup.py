@@ -29,7 +29,17 @@ from schemas.wire import Kind
 
 TABLE: Final = "rollup/cell_hour"
 HOUR_NS: Final = 3_600_000_000_000
-_COLUMNS: Final = ["cell", "sector", "leave_time", "vehicle", "mu", "mu_utilised", "log_likelihood", "weight", "late"]
+_COLUMNS: Final = [
+    "cell",
+    "sector",
+    "leave_time",
+    "vehicle",
+    "mu",
+    "mu_utilised",
+    "log_likelihood",
+    "weight",
+    "late",
+]
 _BITS: Final = 64
 
 
@@ -106,7 +116,9 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     histogram = np.zeros((len(starts), mugrid.BINS), np.int32)
     np.add.at(histogram, (group[with_mu], bin_[with_mu]), 1)
     _, who = np.unique(rows["vehicle"].astype(str), return_inverse=True)
-    names = np.array([int(name[:2], 16) % _BITS for name in np.unique(rows["vehicle"].astype(str))], np.uint64)
+    names = np.array(
+        [int(name[:2], 16) % _BITS for name in np.unique(rows["vehicle"].astype(str))], np.uint64
+    )
     pairs = np.unique(group * (int(who.max()) + 1) + who)
     value = segments.is_value(rows["mu"], rows["mu_utilised"])
     return {
@@ -130,6 +142,8 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 col
     if pa.types.is_list(kind):
         offsets = np.arange(len(values) + 1, dtype=np.int32) * mugrid.BINS
         buffers = [None, pa.py_buffer(offsets.tobytes())]
-        return pa.Array.from_buffers(kind, len(values), buffers, children=[pa.array(values.reshape(-1), pa.int32())])
+        return pa.Array.from_buffers(
+            kind, len(values), buffers, children=[pa.array(values.reshape(-1), pa.int32())]
+        )
     column: pa.Array[Any] = pa.array(values).cast(kind, safe=False)
     return column

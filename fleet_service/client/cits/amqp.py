@@ -45,7 +45,9 @@ class _AmqpEvents(MessagingHandler):
     def on_start(self, event: Any) -> None:  # noqa: ANN401
         self._container = event.container
         event.container.selectable(self._link.injector)
-        connection = event.container.connect(self._link.url, heartbeat=HEARTBEAT_S, reconnect=list(RETRY_S))
+        connection = event.container.connect(
+            self._link.url, heartbeat=HEARTBEAT_S, reconnect=list(RETRY_S)
+        )
         if self._link.target:
             self._sender = event.container.create_sender(connection, self._link.target)
         if self._link.source:
@@ -76,7 +78,9 @@ class _AmqpEvents(MessagingHandler):
         sender, queue = self._sender, self._link.queue
         while sender is not None and queue and sender.credit > 0:
             parcel = queue.popleft()
-            message = proton.Message(body=parcel.body, properties=dict(parcel.properties), durable=True, inferred=True)
+            message = proton.Message(
+                body=parcel.body, properties=dict(parcel.properties), durable=True, inferred=True
+            )
             self._flying[sender.send(message)] = parcel
 
     def on_accepted(self, event: Any) -> None:  # noqa: ANN401
@@ -88,7 +92,11 @@ class _AmqpEvents(MessagingHandler):
         parcel = self._flying.pop(event.delivery, None)
         if parcel is not None:
             self._link.rejected += 1
-            log.warning("the interchange refuses message %s: %s", parcel.name, event.delivery.remote.condition)
+            log.warning(
+                "the interchange refuses message %s: %s",
+                parcel.name,
+                event.delivery.remote.condition,
+            )
             self._link.on_accepted(parcel.name)  # the same content would be refused again
 
     def on_released(self, event: Any) -> None:  # noqa: ANN401
@@ -99,7 +107,8 @@ class _AmqpEvents(MessagingHandler):
     def on_message(self, event: Any) -> None:  # noqa: ANN401
         body = event.message.body
         self._link.on_message(
-            bytes(body) if isinstance(body, bytes | memoryview) else b"", event.message.properties or {}
+            bytes(body) if isinstance(body, bytes | memoryview) else b"",
+            event.message.properties or {},
         )
 
 
@@ -130,7 +139,11 @@ class AmqpLink:
         on_message: Callable[[bytes, Mapping[str, Any]], None] = lambda *_: None,
     ) -> None:  # fmt: skip
         if not url.startswith(("amqp://", "amqps://")):
-            raise InputError("amqp", f"{url!r} is no address", "write it like amqps://interchange.example.org:5671")
+            raise InputError(
+                "amqp",
+                f"{url!r} is no address",
+                "write it like amqps://interchange.example.org:5671",
+            )
         self.url, self.target, self.source, self.selector = url, target, source, selector
         self.on_accepted, self.on_message = on_accepted, on_message
         self.queue: deque[Parcel] = deque()

@@ -15,7 +15,14 @@ from schemas.thresholds import METRES_PER_DEGREE, NS
 PROTOCOL_VERSION: Final = 2
 MESSAGE_ID: Final = 1  # of a DENM
 ADHESION: Final = 6  # adverse weather condition: adhesion
-UNKNOWN_SLIPPERY, HEAVY_FROST, SNOW, ICE, BLACK_ICE, SALTED = 0, 1, 4, 5, 6, 10  # sub-causes of adhesion
+UNKNOWN_SLIPPERY, HEAVY_FROST, SNOW, ICE, BLACK_ICE, SALTED = (
+    0,
+    1,
+    4,
+    5,
+    6,
+    10,
+)  # sub-causes of adhesion
 ROADSIDE: Final = 15  # station type of an infrastructure that has no vehicle
 VALIDITY_DEFAULT_S: Final = 600
 POINTS: Final = 23  # most events of a history
@@ -24,7 +31,12 @@ UNITS: Final = 1e7  # per degree
 # Time counts milliseconds since 2004 by TAI; five leap seconds were added to UTC since then.
 EPOCH_NS: Final = 1_072_915_200 * NS
 LEAP_MS: Final = 5000
-UNAVAILABLE: Final = {"latitude": 900_000_001, "longitude": 1_800_000_001, "heading": 3601, "axis": 4095}
+UNAVAILABLE: Final = {
+    "latitude": 900_000_001,
+    "longitude": 1_800_000_001,
+    "heading": 3601,
+    "axis": 4095,
+}
 Termination = Literal["isCancellation", "isNegation"]
 Point = tuple[float, float]
 
@@ -73,7 +85,9 @@ def encode(denm: Denm) -> bytes:
         "referenceTime": its_time(denm.referenced),
         "eventPosition": _position(denm),
         "relevanceDistance": "lessThan5km",
-        "relevanceTrafficDirection": "allTrafficDirections" if denm.heading is None else "upstreamTraffic",
+        "relevanceTrafficDirection": "allTrafficDirections"
+        if denm.heading is None
+        else "upstreamTraffic",
         "validityDuration": denm.validity_s,
         "stationType": ROADSIDE,
     }
@@ -83,7 +97,11 @@ def encode(denm: Denm) -> bytes:
     if denm.termination is None:
         content["situation"] = _situation(denm)
         content["location"] = _location(denm)
-    header = {"protocolVersion": PROTOCOL_VERSION, "messageID": MESSAGE_ID, "stationID": denm.sender}
+    header = {
+        "protocolVersion": PROTOCOL_VERSION,
+        "messageID": MESSAGE_ID,
+        "stationID": denm.sender,
+    }
     return bytes(_compiled().encode("DENM", {"header": header, "denm": content}))
 
 
@@ -96,9 +114,13 @@ def decode(data: bytes) -> Denm:
     try:
         message = _compiled().decode("DENM", data)
     except Exception as error:
-        raise InputError("payload", "is no DENM", "send one by unaligned PER, without a security envelope") from error
+        raise InputError(
+            "payload", "is no DENM", "send one by unaligned PER, without a security envelope"
+        ) from error
     if message["header"]["messageID"] != MESSAGE_ID:
-        raise InputError("payload", f"has message id {message['header']['messageID']}", "send a DENM")
+        raise InputError(
+            "payload", f"has message id {message['header']['messageID']}", "send a DENM"
+        )
     return _record(message)
 
 
@@ -117,7 +139,9 @@ def _compiled() -> Any:  # noqa: ANN401 the library has no types
     try:
         import asn1tools
     except ImportError as error:
-        raise InputError("cits", "the package asn1tools is missing", "pip install 'gripmap[cits]'") from error
+        raise InputError(
+            "cits", "the package asn1tools is missing", "pip install 'gripmap[cits]'"
+        ) from error
     return asn1tools.compile_files(str(Path(__file__).with_name("denm.asn")), "uper")
 
 
@@ -138,15 +162,23 @@ def _situation(denm: Denm) -> dict[str, Any]:
         "informationQuality": denm.quality,
         "eventType": {"causeCode": denm.cause, "subCauseCode": denm.sub_cause},
     }
-    points = [delta for point in denm.history if (delta := _delta(denm.position, point)) is not None][:POINTS]
+    points = [
+        delta for point in denm.history if (delta := _delta(denm.position, point)) is not None
+    ][:POINTS]
     if points:
-        found["eventHistory"] = [{"eventPosition": delta, "informationQuality": denm.quality} for delta in points]
+        found["eventHistory"] = [
+            {"eventPosition": delta, "informationQuality": denm.quality} for delta in points
+        ]
     return found
 
 
 def _location(denm: Denm) -> dict[str, Any]:
     traces = [
-        [{"pathPosition": delta} for point in trace if (delta := _delta(denm.position, point)) is not None][:40]
+        [
+            {"pathPosition": delta}
+            for point in trace
+            if (delta := _delta(denm.position, point)) is not None
+        ][:40]
         for trace in denm.traces[:7]
     ]
     found: dict[str, Any] = {"traces": traces or [[]]}
@@ -170,7 +202,9 @@ def _record(message: Mapping[str, Any]) -> Denm:
     position = (place["latitude"] / UNITS, place["longitude"] / UNITS)
     axis = place["positionConfidenceEllipse"]["semiMajorConfidence"]
     location = content.get("location", {})
-    heading = location.get("eventPositionHeading", {"headingValue": UNAVAILABLE["heading"]})["headingValue"]
+    heading = location.get("eventPositionHeading", {"headingValue": UNAVAILABLE["heading"]})[
+        "headingValue"
+    ]
     event = situation.get("eventType", {"causeCode": 0, "subCauseCode": 0})
     return Denm(
         station=action["originatingStationID"],
@@ -185,9 +219,12 @@ def _record(message: Mapping[str, Any]) -> Denm:
         quality=situation.get("informationQuality", 0),
         cause=event["causeCode"],
         sub_cause=event["subCauseCode"],
-        history=tuple(_point(position, one["eventPosition"]) for one in situation.get("eventHistory", ())),
+        history=tuple(
+            _point(position, one["eventPosition"]) for one in situation.get("eventHistory", ())
+        ),
         traces=tuple(
-            tuple(_point(position, one["pathPosition"]) for one in trace) for trace in location.get("traces", ())
+            tuple(_point(position, one["pathPosition"]) for one in trace)
+            for trace in location.get("traces", ())
         ),
         heading=None if heading == UNAVAILABLE["heading"] else heading / 10.0,
     )
@@ -197,8 +234,13 @@ def _point(origin: Point, delta: Mapping[str, int]) -> Point:
     return origin[0] + delta["deltaLatitude"] / UNITS, origin[1] + delta["deltaLongitude"] / UNITS
 
 
-def approach(position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)) -> tuple[Point, ...]:
+def approach(
+    position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
+) -> tuple[Point, ...]:
     """Return points of the way to an event along its heading [deg from north], nearest first."""
     north, east = math.cos(math.radians(heading)), math.sin(math.radians(heading))
     width = METRES_PER_DEGREE * math.cos(math.radians(position[0]))
-    return tuple((position[0] - far * north / METRES_PER_DEGREE, position[1] - far * east / width) for far in metres)
+    return tuple(
+        (position[0] - far * north / METRES_PER_DEGREE, position[1] - far * east / width)
+        for far in metres
+    )

@@ -60,7 +60,9 @@ class EventBook:
 
     def __init__(self, station: int, content: dict[str, Any] | None = None) -> None:
         if not 0 < station < 1 << 32:
-            raise InputError("station", f"{station} is no station identifier", "give 1 to 4294967295")
+            raise InputError(
+                "station", f"{station} is no station identifier", "give 1 to 4294967295"
+            )
         self.station, self._next = station, 0
         self._events: dict[str, OpenEvent] = {}
         if content is not None:
@@ -90,13 +92,19 @@ class EventBook:
             is_heard: returns True if a service answers for a place (latitude, longitude).
         """
         out: list[Denm] = []
-        for name in [name for name, event in self._events.items() if event.ended and now - event.ended > TERMINATED_NS]:
+        for name in [
+            name
+            for name, event in self._events.items()
+            if event.ended and now - event.ended > TERMINATED_NS
+        ]:
             del self._events[name]
         for alert in standing:
             state = _state(alert)
             known = self._events.get(alert.id)
             if known is None or known.ended:
-                known = OpenEvent(alert.id, self._number(), alert.since, 0, (), (alert.latitude, alert.longitude))
+                known = OpenEvent(
+                    alert.id, self._number(), alert.since, 0, (), (alert.latitude, alert.longitude)
+                )
             if known.state != state or now - known.sent >= RENEW_NS:
                 self._events[alert.id] = OpenEvent(
                     known.name, known.sequence, known.detected, now, state, known.position
@@ -129,7 +137,15 @@ class EventBook:
     def _head(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
         """Return what all messages of an event have; an update and the end are detected now."""
         return Denm(
-            self.station, event.sequence, self.station, now, now, termination, event.position, CELL_STD, VALID_NS // NS
+            self.station,
+            event.sequence,
+            self.station,
+            now,
+            now,
+            termination,
+            event.position,
+            CELL_STD,
+            VALID_NS // NS,
         )
 
     def _number(self) -> int:
@@ -139,7 +155,11 @@ class EventBook:
             self._next = (self._next + 1) % SEQUENCES
             if number not in used:
                 return number
-        raise InputError("events", "all 65536 numbers of the station are in use", "use a second station for a part")
+        raise InputError(
+            "events",
+            "all 65536 numbers of the station are in use",
+            "use a second station for a part",
+        )
 
     def _read(self, content: dict[str, Any]) -> None:
         try:
@@ -159,4 +179,9 @@ class EventBook:
 
 def _state(alert: StretchAlert) -> tuple[float, ...]:
     """Return what a receiver should learn of: extent, sub-cause, and witnesses."""
-    return (float(alert.cells), round(alert.length_m), float(alert.mu < ICE_MU), float(min(alert.vehicles, 6)))
+    return (
+        float(alert.cells),
+        round(alert.length_m),
+        float(alert.mu < ICE_MU),
+        float(min(alert.vehicles, 6)),
+    )

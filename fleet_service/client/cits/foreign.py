@@ -61,7 +61,13 @@ def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[
 def _counts(denm: Denm, now: int) -> bool:
     over = now > denm.detected + denm.validity_s * NS
     vague = denm.position_std > WORST_STD or not math.isfinite(denm.position[0])
-    return denm.cause == ADHESION and denm.sub_cause != SALTED and denm.termination is None and not over and not vague
+    return (
+        denm.cause == ADHESION
+        and denm.sub_cause != SALTED
+        and denm.termination is None
+        and not over
+        and not vague
+    )
 
 
 def _places(denm: Denm) -> Iterable[tuple[float, float]]:

@@ -52,7 +52,9 @@ class Witness:
         silent: DENM that say nothing about grip here and now.
     """
 
-    def __init__(self, session: zenoh.Session, name: str, clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self, session: zenoh.Session, name: str, clock: Callable[[], int] = time.time_ns
+    ) -> None:
         self._session, self._name, self._clock = session, name, clock
         self._boot, self._seq = secrets.randbits(63), 1
         self.refused = self.silent = 0
@@ -76,7 +78,11 @@ class Witness:
 
 
 def run(
-    connection: ZenohSettings, url: str, sending: Sending | None, receiving: Receiving | None, stop: threading.Event
+    connection: ZenohSettings,
+    url: str,
+    sending: Sending | None,
+    receiving: Receiving | None,
+    stop: threading.Event,
 ) -> None:
     """Send and receive until `stop` is set.
 

@@ -73,7 +73,9 @@ class DenmOutput:
         with self._lock:
             self._pending.pop(name, None)
 
-    def keep_up(self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+    def keep_up(
+        self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]
+    ) -> None:
         """Send what is due.
 
         Args:
@@ -108,5 +110,7 @@ def _read(path: Path) -> dict[str, Any] | None:
         if not isinstance(found["pending"], dict) or not isinstance(found["book"], dict):
             raise TypeError("other content")
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError("state", f"{path} is no file of events", "give another, or move it away") from error
+        raise InputError(
+            "state", f"{path} is no file of events", "give another, or move it away"
+        ) from error
     return found

@@ -34,9 +34,13 @@ class Originator:
     def __post_init__(self) -> None:
         """Check country and publisher."""
         if not re.fullmatch("[A-Z]{2}", self.country):
-            raise InputError("country", f"{self.country!r} is no country", "give two capital letters, e.g. SE")
+            raise InputError(
+                "country", f"{self.country!r} is no country", "give two capital letters, e.g. SE"
+            )
         if not self.publisher.strip():
-            raise InputError("publisher", "is empty", "give the publisher's identifier at the interchange")
+            raise InputError(
+                "publisher", "is empty", "give the publisher's identifier at the interchange"
+            )
 
 
 def properties(denm: Denm, originator: Originator) -> dict[str, Any]:

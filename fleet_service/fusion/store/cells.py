@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import FULL, PackedArray
-from fleet_service.fusion.store.records import CELL, NONE, SOURCES, Int32Array, Rows, UInt16Array, UIntArray
+from fleet_service.fusion.store.records import (
+    CELL,
+    NONE,
+    SOURCES,
+    Int32Array,
+    Rows,
+    UInt16Array,
+    UIntArray,
+)
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.jit import LINE, refcount_free, refcount_free_inlined

@@ -46,7 +46,9 @@ from schemas.runtime.records import RecordArray
 
 _NOTHING = np.zeros(0, np.int32)
 _HOUR = 3600
-_AHEAD = 120  # s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
+_AHEAD = (
+    120  # s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
+)
 
 
 class Store:
@@ -75,7 +77,9 @@ class Store:
         self.hour = 0  # whose pairs were dropped last
 
     @staticmethod
-    def of(state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int) -> Store:
+    def of(
+        state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int
+    ) -> Store:
         """A store with these contents."""
         store = Store()
         store.state, store.peers, store.names = state, peers, names
@@ -101,7 +105,9 @@ class Store:
         may not depend on who came first. All else is done in the order of memory.
         """
         plain, valued = due(self.state.windows, before)
-        return plain, valued[np.argsort(self.state.live.cells["key"][self.state.windows["slot"][valued]])]
+        return plain, valued[
+            np.argsort(self.state.live.cells["key"][self.state.windows["slot"][valued]])
+        ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
         """Slot of each key, NONE where there is none."""
@@ -158,7 +164,9 @@ class Store:
         live = self.state.live
         if used[REPORTERS_USED] + rows > len(live.reporters):
             most = max(int(used[REPORTERS_USED]) + rows, 2 * len(live.reporters))
-            self.state = self.state._replace(live=live._replace(reporters=_longer(live.reporters, most)))
+            self.state = self.state._replace(
+                live=live._replace(reporters=_longer(live.reporters, most))
+            )
         if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
             self._rebuild_pairs(0, int(used[PAIRS]) + rows)
 
@@ -226,7 +234,9 @@ class Store:
         live, cells = self.state.live, self.state.live.cells[: self.size]
         slots = np.flatnonzero(cells["reporters"] != NONE)
         row, old = cells["reporters"][slots], live.reporters
-        last = np.maximum(old["time"].max(axis=1, initial=0), old["source_time"].max(axis=(1, 2), initial=0))
+        last = np.maximum(
+            old["time"].max(axis=1, initial=0), old["source_time"].max(axis=(1, 2), initial=0)
+        )
         stay = (last[row] >= least) | (cells["window"][slots] != NONE)
         cells["reporters"][slots] = NONE
         cells["reporters"][slots[stay]] = np.arange(stay.sum())
@@ -237,7 +247,12 @@ class Store:
 @compiled
 def due(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
     """Windows with entries before `before` [ns]: those without a value, and those with one."""
-    plain, valued, without, of_value = np.empty(len(windows), np.int64), np.empty(len(windows), np.int64), 0, 0
+    plain, valued, without, of_value = (
+        np.empty(len(windows), np.int64),
+        np.empty(len(windows), np.int64),
+        0,
+        0,
+    )
     for window in range(len(windows)):
         if windows[window].slot != NONE and windows[window].first < before:
             if windows[window].values:
@@ -259,7 +274,9 @@ def no_peers(vehicles: int) -> RecordArray:
 def distinct(values: IntArray) -> IntArray:
     """Each value once, ascending; by sorting, which for numbers of this kind is several times faster than a set."""
     ordered = np.sort(values)
-    return np.asarray(ordered[np.append(np.ones(len(ordered[:1]), bool), ordered[1:] != ordered[:-1])])
+    return np.asarray(
+        ordered[np.append(np.ones(len(ordered[:1]), bool), ordered[1:] != ordered[:-1])]
+    )
 
 
 def _no_pairs(places: int) -> RecordArray:

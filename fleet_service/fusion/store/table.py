@@ -20,7 +20,9 @@ from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 
 LEAST: Final = 1024  # places of a new table
-ROWS_MOST: Final = 0.8  # share of the places that rows take: eight of them are a line, and probes cost little
+ROWS_MOST: Final = (
+    0.8  # share of the places that rows take: eight of them are a line, and probes cost little
+)
 PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
@@ -59,7 +61,9 @@ def locate(table: IntArray, rows: RecordArray, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
     mixed = _mixed(key)
     place, tag = _first(mixed, len(table)), np.int64(mixed & np.uint64(_TAG))
-    while table[place] != NONE and ((table[place] >> 32) != tag or rows[_row(table[place])].key != key):
+    while table[place] != NONE and (
+        (table[place] >> 32) != tag or rows[_row(table[place])].key != key
+    ):
         place = place + 1 if place + 1 < len(table) else 0
     return place
 
@@ -101,7 +105,9 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
 
 
 @compiled
-def numbered(table: IntArray, rows: RecordArray, wanted: IntArray, used: int) -> tuple[IntArray, int]:
+def numbered(
+    table: IntArray, rows: RecordArray, wanted: IntArray, used: int
+) -> tuple[IntArray, int]:
     """Row of each key, (n,), and how many are used then; an unknown key is written to the next of `rows`."""
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -131,7 +137,9 @@ def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
     """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
     place = first_place(pairs, slot, vehicle)
-    while pairs[place].slot != NONE and (pairs[place].slot != slot or pairs[place].vehicle != vehicle):
+    while pairs[place].slot != NONE and (
+        pairs[place].slot != slot or pairs[place].vehicle != vehicle
+    ):
         place = place + 1 if place + 1 < len(pairs) else 0
     return place
 

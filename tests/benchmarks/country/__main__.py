@@ -28,8 +28,12 @@ SEED: Final = 30_000
 
 def main() -> int:
     """Drive, send, judge; 1 where a bar does not hold."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.country", description="A city and a country.")
-    parser.add_argument("--city", type=Path, help="folder with observations.parquet; default: drive the city first")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks.country", description="A city and a country."
+    )
+    parser.add_argument(
+        "--city", type=Path, help="folder with observations.parquet; default: drive the city first"
+    )
     given: Path | None = parser.parse_args().city
     FOLDER.mkdir(exist_ok=True)
     found: list[Figure] = []
@@ -45,9 +49,15 @@ def main() -> int:
         draw(course, FOLDER / "country.png")
         shutil.copy(course / "course.npz", FOLDER)
     found += [
-        Figure("country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory for a vehicle"),
+        Figure(
+            "country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory for a vehicle"
+        ),
         Figure("country.cell_bytes", each.cell_bytes, "bytes of it for a cell's sector"),
-        Figure("country.pair_bytes", each.pair_bytes, "bytes of it for each of these that a vehicle visited lately"),
+        Figure(
+            "country.pair_bytes",
+            each.pair_bytes,
+            "bytes of it for each of these that a vehicle visited lately",
+        ),
     ]
     found += million({figure.name: figure.value for figure in found})
     figures.write(FOLDER / "figures.json", "country", [SEED], found)

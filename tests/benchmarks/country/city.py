@@ -30,10 +30,23 @@ def city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
     found = measure(drive, folder, World("helsinki", ROUGH, PREFIX, seed))
     cells = f"of {found[f'{PREFIX}.cells']:.0f} cells with two vehicles or more"
     return [
-        Figure(f"{PREFIX}.observations", found[f"{PREFIX}.observations"], f"of {VEHICLES} vehicles in {SECONDS} s"),
+        Figure(
+            f"{PREFIX}.observations",
+            found[f"{PREFIX}.observations"],
+            f"of {VEHICLES} vehicles in {SECONDS} s",
+        ),
         Figure(f"{PREFIX}.coverage90", found[f"{PREFIX}.coverage90"], cells, 0.85, "more"),
         Figure(f"{PREFIX}.rmse", found[f"{PREFIX}.rmse"], "where a friction is given"),
-        Figure(f"{PREFIX}.measured", found[f"{PREFIX}.cells.measured"], "cells where a friction is given"),
-        Figure(f"{PREFIX}.false_ice", found[f"{PREFIX}.false_ice"], "alerts far from anything slippery", 0),
+        Figure(
+            f"{PREFIX}.measured",
+            found[f"{PREFIX}.cells.measured"],
+            "cells where a friction is given",
+        ),
+        Figure(
+            f"{PREFIX}.false_ice",
+            found[f"{PREFIX}.false_ice"],
+            "alerts far from anything slippery",
+            0,
+        ),
         Figure(f"{PREFIX}.alerts", found[f"{PREFIX}.alerts"], "alerts"),
     ]

@@ -34,13 +34,17 @@ class Coefficients(NamedTuple):
 
     vehicle_bytes: float
     cell_bytes: float
-    pair_bytes: float  # of a vehicle and a cell's sector that it visited in the last three to four hours
+    pair_bytes: (
+        float  # of a vehicle and a cell's sector that it visited in the last three to four hours
+    )
 
 
 def coefficients() -> Coefficients:
     """Measured now."""
     few, vehicles, cells = (_measured(kind) for kind in ("few", "vehicles", "cells"))
-    return Coefficients((vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2])
+    return Coefficients(
+        (vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2]
+    )
 
 
 def _measured(kind: str) -> tuple[float, float, float]:
@@ -60,7 +64,9 @@ def _resident() -> int:
 def _stream(kind: str) -> list[Message]:
     now = time.time_ns()
     if kind == "cells":
-        parts = (messages(MANY // REGIONS, ROWS, now, FEW // REGIONS, 0, east) for east in range(REGIONS))
+        parts = (
+            messages(MANY // REGIONS, ROWS, now, FEW // REGIONS, 0, east) for east in range(REGIONS)
+        )
         return [message for part in parts for message in part]
     return messages(MANY, ROWS, now, MANY if kind == "vehicles" else FEW)
 
@@ -68,7 +74,10 @@ def _stream(kind: str) -> list[Message]:
 def main(kind: str) -> None:
     """Take the stream of that kind, and print what it added."""
     sent = _stream(kind)
-    with tempfile.TemporaryDirectory() as folder, closing(Engine(ServiceConfig(), Path(folder))) as engine:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Engine(ServiceConfig(), Path(folder))) as engine,
+    ):
         warm = messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
         engine.intake.ingest(warm, time.time_ns())
         engine.settlement.flush()
@@ -80,7 +89,9 @@ def main(kind: str) -> None:
         engine.settlement.flush()
         assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
         state = engine.state.fusion.store.state
-        print(_resident() - before, engine.state.fusion.size, state.pairs.nbytes / state.used[PAIRS])
+        print(
+            _resident() - before, engine.state.fusion.size, state.pairs.nbytes / state.used[PAIRS]
+        )
 
 
 if __name__ == "__main__":

@@ -68,21 +68,34 @@ class Service(NamedTuple):
         """Its metrics now, by name and labels."""
         with urllib.request.urlopen(f"{self.metrics}/metrics", timeout=30.0) as page:
             lines = page.read().decode().splitlines()
-        return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines if not line.startswith("#")}
+        return {
+            line.rpartition(" ")[0]: float(line.rpartition(" ")[2])
+            for line in lines
+            if not line.startswith("#")
+        }
 
     def archived(self) -> int:
         """Rows of observations in its archive, by the files' own words."""
-        files = [*self.archive.glob("inbox/**/*.parquet"), *self.archive.glob("observations/**/*.parquet")]
+        files = [
+            *self.archive.glob("inbox/**/*.parquet"),
+            *self.archive.glob("observations/**/*.parquet"),
+        ]
         return sum(pq.read_metadata(file).num_rows for file in files)
 
 
 def started(folder: Path, endpoint: str, name: str, region: str) -> Service:
     """A service that is ready."""
     config = ServiceConfig(
-        name=name, regions=[region], zenoh=ZenohSettings(connect=[endpoint]), metrics_port=0, compact_s=COMPACT_S
+        name=name,
+        regions=[region],
+        zenoh=ZenohSettings(connect=[endpoint]),
+        metrics_port=0,
+        compact_s=COMPACT_S,
     )
     path, archive = folder / f"{name}.json", folder / name
-    path.write_text(config.model_dump_json(include={"name", "regions", "zenoh", "metrics_port", "compact_s"}))
+    path.write_text(
+        config.model_dump_json(include={"name", "regions", "zenoh", "metrics_port", "compact_s"})
+    )
     words = ("-m", "fleet_service.cli", "run", "--archive", str(archive), "--config", str(path))
     part = Part(name, [sys.executable, *words], folder)
     part.start()
@@ -94,7 +107,9 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
     country = Country(city, seed)
     seconds = WARM_S + MEASURED_S
     with ExitStack() as stack:
-        router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
+        router = Part(
+            "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder
+        )
         stack.callback(router.kill)
         router.start()
         endpoint = router.line_with("router: ").split()[1]
@@ -104,7 +119,9 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
             stack.callback(services[-1].part.kill)
         words = [endpoint, str(city), str(folder / "waits.npz"), "--seconds", str(seconds)]
         words += ["--vehicles", str(VEHICLES), "--seed", str(seed)]
-        sender = Part("sender", [sys.executable, "-m", "tests.benchmarks.country.sender", *words], folder)
+        sender = Part(
+            "sender", [sys.executable, "-m", "tests.benchmarks.country.sender", *words], folder
+        )
         stack.callback(sender.kill)
         sender.start()
         sender.line_with("{")
@@ -113,7 +130,11 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
         counts = [one.values() for one in services]
         codes = [one.part.stop() for one in services]
         archived = sum(one.archived() for one in services)
-        size = sum(file.stat().st_size for one in services for file in one.archive.glob("observations/**/*.parquet"))
+        size = sum(
+            file.stat().st_size
+            for one in services
+            for file in one.archive.glob("observations/**/*.parquet")
+        )
         compacted = sum(
             pq.read_metadata(file).num_rows
             for one in services
@@ -128,10 +149,22 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
         *found,
         *_growth(looks, coefficients),
         *_shares(looks, int(sent["observations"])),
-        Figure("country.unacknowledged", sent["unacknowledged"], "batches, half a minute after the last", 0),
-        Figure("country.missing", sent["observations"] - archived, "observations that the archives do not hold", 0),
+        Figure(
+            "country.unacknowledged",
+            sent["unacknowledged"],
+            "batches, half a minute after the last",
+            0,
+        ),
+        Figure(
+            "country.missing",
+            sent["observations"] - archived,
+            "observations that the archives do not hold",
+            0,
+        ),
         Figure("country.not_fused", _not_fused(counts), "observations that were archived only"),
-        Figure("country.archive_bytes", size / max(compacted, 1), "bytes of a compacted observation"),
+        Figure(
+            "country.archive_bytes", size / max(compacted, 1), "bytes of a compacted observation"
+        ),
     ]
 
 
@@ -153,7 +186,10 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
             memory = ", ".join(f"{value:.0f}" for value in now.memory)
             waits = f"oldest {last.get('oldest_s', 0.0):.1f} s, p99 {last.get('p99_s', 0.0):.2f} s"
             late = f"sender {last.get('late_s', 0.0):.1f} s late"
-            print(f"  {now.time:4.0f} s: {sum(now.cells):.0f} cells, {memory} MB, {waits}, {late}", flush=True)
+            print(
+                f"  {now.time:4.0f} s: {sum(now.cells):.0f} cells, {memory} MB, {waits}, {late}",
+                flush=True,
+            )
         least = _least([float("inf")] * len(least), parts)
         while time.monotonic() < began + SAYS_S + len(looks) * EVERY_S:
             time.sleep(MEMORY_S)
@@ -174,8 +210,18 @@ def _last_line(sender: Part) -> dict[str, float]:
 
 
 def _kept(folder: Path, looks: Sequence[Look]) -> None:
-    time_s, memory, spent, cells, rows, queued = (np.array(column) for column in zip(*looks, strict=True))
-    np.savez(folder / "course.npz", time=time_s, memory=memory, spent=spent, cells=cells, rows=rows, queued=queued)
+    time_s, memory, spent, cells, rows, queued = (
+        np.array(column) for column in zip(*looks, strict=True)
+    )
+    np.savez(
+        folder / "course.npz",
+        time=time_s,
+        memory=memory,
+        spent=spent,
+        cells=cells,
+        rows=rows,
+        queued=queued,
+    )
 
 
 def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
@@ -188,28 +234,59 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
     rate = measured.sum() * ROWS / MEASURED_S
     return [
         Figure("country.rate", float(rate), "observations/s that were sent", 0.98 * RATE, "more"),
-        Figure("country.lag_s", float(waits[measured].max()), "s, the longest that any batch waited for its ack", 5),
+        Figure(
+            "country.lag_s",
+            float(waits[measured].max()),
+            "s, the longest that any batch waited for its ack",
+            5,
+        ),
         Figure("country.ack_p99_s", float(np.quantile(waits[measured], 0.99)), "s"),
         Figure("country.ack_p50_s", float(np.median(waits[measured])), "s"),
-        Figure("country.region_p50_ratio", float(halves.max() / halves.min()), "slowest region over the fastest", 1.2),
-        Figure("country.region_p99_ratio", float(most.max() / most.min()), "likewise: a checkpoint is a moment's"),
+        Figure(
+            "country.region_p50_ratio",
+            float(halves.max() / halves.min()),
+            "slowest region over the fastest",
+            1.2,
+        ),
+        Figure(
+            "country.region_p99_ratio",
+            float(most.max() / most.min()),
+            "likewise: a checkpoint is a moment's",
+        ),
     ]
 
 
 def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
     """Return the growth of the services' memory over the ten minutes, and the part due to new cells."""
     time_s = np.array([look.time for look in looks])
-    late = (time_s >= WARM_S) & (time_s < WARM_S + MEASURED_S)  # whole minutes: a line goes through the least of each
-    memory, cells = (np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells"))
+    late = (time_s >= WARM_S) & (
+        time_s < WARM_S + MEASURED_S
+    )  # whole minutes: a line goes through the least of each
+    memory, cells = (
+        np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells")
+    )
     grown = sum(slope(time_s[late], memory[:, k]) for k in range(len(SERVICES)))
     new = float(cells[-1].sum() - cells[0].sum())
     beyond = grown - new * coefficients.cell_bytes / 1e6
     return [
-        Figure("country.growth_mb_per_10min", beyond, f"MB of all services, beyond {new:.0f} new cells", 5),
+        Figure(
+            "country.growth_mb_per_10min",
+            beyond,
+            f"MB of all services, beyond {new:.0f} new cells",
+            5,
+        ),
         Figure("country.grown_mb", grown, "MB in the ten minutes with them"),
         Figure("country.cells", float(cells[-1].sum()), "cells of the country"),
-        Figure("country.memory_mb", float(memory[-1, : len(SERVICES)].sum()), "MB of all services at the end"),
-        Figure("country.memory_largest_mb", float(memory[:, : len(SERVICES)].max()), "MB of one of them, at the most"),
+        Figure(
+            "country.memory_mb",
+            float(memory[-1, : len(SERVICES)].sum()),
+            "MB of all services at the end",
+        ),
+        Figure(
+            "country.memory_largest_mb",
+            float(memory[:, : len(SERVICES)].max()),
+            "MB of one of them, at the most",
+        ),
     ]
 
 
@@ -221,16 +298,31 @@ def _shares(looks: Sequence[Look], observations: int) -> list[Figure]:
     rows, spent = np.array(last.rows) - first.rows, (np.array(last.spent) - first.spent) / apart
     per_row = spent[: len(SERVICES)] * apart / rows
     return [
-        Figure("country.observations", float(observations), f"of {VEHICLES} vehicles, one batch each {PERIOD_S:.0f} s"),
         Figure(
-            "country.busiest_rows", float(rows.max() / rows.min()), "rows of the busiest service over the least", 1.2
+            "country.observations",
+            float(observations),
+            f"of {VEHICLES} vehicles, one batch each {PERIOD_S:.0f} s",
         ),
-        Figure("country.busiest_cores", float(spent[: len(SERVICES)].max()), "cores of the busiest service"),
+        Figure(
+            "country.busiest_rows",
+            float(rows.max() / rows.min()),
+            "rows of the busiest service over the least",
+            1.2,
+        ),
+        Figure(
+            "country.busiest_cores",
+            float(spent[: len(SERVICES)].max()),
+            "cores of the busiest service",
+        ),
         Figure("country.cores", float(spent[: len(SERVICES)].sum()), "cores of all services"),
         Figure("country.router_cores", float(spent[-2]), "cores of the router"),
         Figure("country.sender_cores", float(spent[-1]), "cores of the vehicles' sender"),
         Figure("country.service_us", float(1e6 * per_row.mean()), "us of a service an observation"),
-        Figure("country.router_us", float(1e6 * spent[-2] * apart * ROWS / rows.sum()), "us of the router a batch"),
+        Figure(
+            "country.router_us",
+            float(1e6 * spent[-2] * apart * ROWS / rows.sum()),
+            "us of the router a batch",
+        ),
     ]
 
 

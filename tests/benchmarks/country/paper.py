@@ -15,7 +15,9 @@ FACTOR: Final = 10  # times the country that was measured: its vehicles, stream 
 USED: Final = 0.6  # of a core at the most, so that a service catches up after an outage
 DAY_S: Final = 86_400.0
 HOUR_S: Final = 3600.0  # between two times that what is forgotten is dropped
-NEW_PLACES: Final = 1.0  # of the visits, those where their vehicle was not in the last hours: nobody turns round
+NEW_PLACES: Final = (
+    1.0  # of the visits, those where their vehicle was not in the last hours: nobody turns round
+)
 
 
 def million(found: Mapping[str, float]) -> list[Figure]:
@@ -27,11 +29,31 @@ def million(found: Mapping[str, float]) -> list[Figure]:
     return [
         Figure("country.million.per_s", rate, f"observations/s of {VEHICLES} vehicles"),
         Figure("country.million.cores", cores, "cores of all services"),
-        Figure("country.million.services", math.ceil(cores / USED), f"services, {USED:.0%} of a core each"),
-        Figure("country.million.router_cores", rate / ROWS * found["country.router_us"] * 1e-6, "cores of routers"),
+        Figure(
+            "country.million.services",
+            math.ceil(cores / USED),
+            f"services, {USED:.0%} of a core each",
+        ),
+        Figure(
+            "country.million.router_cores",
+            rate / ROWS * found["country.router_us"] * 1e-6,
+            "cores of routers",
+        ),
         Figure("country.million.cells", cells, "cells' sectors"),
-        Figure("country.million.cells_gb", cells * found["country.cell_bytes"] / 1e9, "GB of memory for them"),
-        Figure("country.million.vehicles_gb", VEHICLES * found["country.vehicle_bytes"] / 1e9, "GB for vehicles"),
-        Figure("country.million.pairs_gb", pairs * found["country.pair_bytes"] / 1e9, "GB for where each was lately"),
+        Figure(
+            "country.million.cells_gb",
+            cells * found["country.cell_bytes"] / 1e9,
+            "GB of memory for them",
+        ),
+        Figure(
+            "country.million.vehicles_gb",
+            VEHICLES * found["country.vehicle_bytes"] / 1e9,
+            "GB for vehicles",
+        ),
+        Figure(
+            "country.million.pairs_gb",
+            pairs * found["country.pair_bytes"] / 1e9,
+            "GB for where each was lately",
+        ),
         Figure("country.million.gb_per_day", per_day, "GB of archive a day"),
     ]

@@ -24,12 +24,19 @@ def draw(course: Path, out: Path) -> None:
     for k, (name, colour) in enumerate(zip(SERVICES, COLOURS, strict=True)):
         above.plot(time_s, memory[:, k], color=colour, label=name)
         middle.plot(time_s, cells[:, k] / 1e3, color=colour, label=name)
-    above.set(title="A country of 100 000 vehicles, 20 000 observations/s, three services", ylabel="memory [MB]")
+    above.set(
+        title="A country of 100 000 vehicles, 20 000 observations/s, three services",
+        ylabel="memory [MB]",
+    )
     middle.set(ylabel="cells [thousand]")
     edges = np.arange(0.0, np.nanmax(put) + SPAN_S, SPAN_S)
     part = np.digitize(put, edges)
     inside = [wait[part == number] for number in range(1, len(edges))]
-    for label, share, colour in (("longest", 1.0, "0.75"), ("99 %", 0.99, "0.45"), ("median", 0.5, "0.0")):
+    for label, share, colour in (
+        ("longest", 1.0, "0.75"),
+        ("99 %", 0.99, "0.45"),
+        ("median", 0.5, "0.0"),
+    ):
         worst = [np.quantile(one, share) if len(one) else np.nan for one in inside]
         below.plot(edges[:-1] + SPAN_S / 2, worst, color=colour, label=label)
     below.set(xlabel="time [s]", ylabel="wait for the ack [s]", ylim=(0, 1.25 * below.dataLim.y1))

@@ -68,11 +68,15 @@ class Country:
         columns = read(folder / OBSERVATIONS)
         x, y = grid.deinterleave(columns["cell"])
         corner = np.array([x.min(), y.min()]) // _CELLS * _CELLS
-        assert max(np.ptp(x), np.ptp(y)) < 6 * _CELLS, "the town does not fit between its neighbours"
+        assert max(np.ptp(x), np.ptp(y)) < 6 * _CELLS, (
+            "the town does not fit between its neighbours"
+        )
         self._home = grid.deinterleave(grid.zone_of(columns["cell"][:1]))
         self.drives = [_chunks(columns, who, corner) for who in np.unique(columns["vehicle"])]
         self.drives = [drive for drive in self.drives if drive]
-        self.regions = [self._region(zone, k) for zone, count in enumerate(ZONES) for k in range(count)]
+        self.regions = [
+            self._region(zone, k) for zone, count in enumerate(ZONES) for k in range(count)
+        ]
         weight = np.concatenate([_shares(count) for count in ZONES])
         rng = np.random.default_rng(seed)
         self.region = rng.choice(len(weight), vehicles, p=weight / weight.sum())
@@ -116,7 +120,9 @@ class Country:
         message.seq = message.first_held = turn + 1
         message.cell[:] = grid.interleave(chunk.cell_x + x0, chunk.cell_y + y0).tolist()
         message.longitude[:] = ((chunk.x + x0) / side * 360.0 - 180.0).tolist()
-        message.latitude[:] = np.degrees(np.arctan(np.sinh(np.pi * (1.0 - 2.0 * (chunk.y + y0) / side)))).tolist()
+        message.latitude[:] = np.degrees(
+            np.arctan(np.sinh(np.pi * (1.0 - 2.0 * (chunk.y + y0) / side)))
+        ).tolist()
         message.enter_time[:] = (now - (chunk.enter * PERIOD_S * NS).astype(np.int64)).tolist()
         message.leave_time[:] = (now - (chunk.leave * PERIOD_S * NS).astype(np.int64)).tolist()
         return keys.observation_key(message.region, message.vehicle), message.SerializeToString()
@@ -131,7 +137,9 @@ def _chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
     """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are less, are left out."""
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]
-    return [_chunk(columns, mine[at : at + ROWS], corner) for at in range(0, len(mine) - ROWS + 1, ROWS)]
+    return [
+        _chunk(columns, mine[at : at + ROWS], corner) for at in range(0, len(mine) - ROWS + 1, ROWS)
+    ]
 
 
 def _chunk(columns: dict[str, Any], rows: IntArray, corner: IntArray) -> Chunk:

@@ -40,7 +40,11 @@ class Waits:
 
     def line(self, since: float) -> dict[str, float]:
         """Return the batches sent and waiting, and the 99 % quantile of finished waits since then [s]."""
-        put, acked, now = self.put, self.acked.copy(), time.monotonic()  # a copy: it is written meanwhile
+        put, acked, now = (
+            self.put,
+            self.acked.copy(),
+            time.monotonic(),
+        )  # a copy: it is written meanwhile
         waits = np.isfinite(put) & np.isnan(acked)
         ended = (acked - put)[(put >= since) & np.isfinite(acked)]
         return {
@@ -82,10 +86,19 @@ def main() -> int:
             print(json.dumps(line), flush=True)
             said, late = time.monotonic(), 0.0
     deadline = time.monotonic() + PATIENCE_S
-    while (left := np.isfinite(waits.put) & np.isnan(waits.acked)).any() and time.monotonic() < deadline:
+    while (
+        left := np.isfinite(waits.put) & np.isnan(waits.acked)
+    ).any() and time.monotonic() < deadline:
         time.sleep(0.05)
     np.savez(asked.out, put=waits.put - began, wait=waits.acked - waits.put, region=country.region)
-    print(json.dumps({"unacknowledged": int(left.sum()), "observations": int(np.isfinite(waits.put).sum()) * ROWS}))
+    print(
+        json.dumps(
+            {
+                "unacknowledged": int(left.sum()),
+                "observations": int(np.isfinite(waits.put).sum()) * ROWS,
+            }
+        )
+    )
     session.close()
     return 0
 

@@ -27,7 +27,9 @@ TRIPS: Final = ("--intermediate", "3")  # places that a trip leads over: three k
 CHANGE_S: Final = ("--lanechange.duration", "3")  # not a leap to the side
 LEAP_M: Final = 20.0  # between two steps: SUMO has taken it out of a jam
 SMOOTH_M: Final = 13  # over which a driver opens his path
-USUAL_Q: Final = 5.0  # [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
+USUAL_Q: Final = (
+    5.0  # [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
+)
 WET_AREAS, SNOW_AREAS, ICE_PATCHES = 4, 2, 24
 
 
@@ -80,24 +82,36 @@ def _drive(rows: pd.DataFrame) -> Drive | None:
     window = np.hanning(SMOOTH_M + 2)[1:-1]
     window /= window.sum()
     smooth = [
-        np.convolve(np.pad(np.interp(even, run, one), SMOOTH_M // 2, mode="edge"), window, mode="valid")
+        np.convolve(
+            np.pad(np.interp(even, run, one), SMOOTH_M // 2, mode="edge"), window, mode="valid"
+        )
         for one in (*line.T, speed)
     ]
     path = resampled(np.column_stack(smooth[:2]))
-    return Drive(path, np.interp(np.linspace(0.0, 1.0, len(path)), np.linspace(0.0, 1.0, len(even)), smooth[2]))
+    return Drive(
+        path,
+        np.interp(np.linspace(0.0, 1.0, len(path)), np.linspace(0.0, 1.0, len(even)), smooth[2]),
+    )
 
 
 def town(found: list[Drive], seed: int) -> Streets:
     """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and there on a way."""
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
-    lanes = network_of([one.line for one in found], [[k] for k in range(len(found))], len(found), allowed)
+    lanes = network_of(
+        [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed
+    )
     usual, rng = drawn(seed), np.random.default_rng(seed)
     points = np.concatenate([one.line for one in found])
     patches = []
-    for kind, mu, count, size in (("wet", WET, WET_AREAS, 500.0), ("snow", SNOW, SNOW_AREAS, 300.0)):
+    for kind, mu, count, size in (
+        ("wet", WET, WET_AREAS, 500.0),
+        ("snow", SNOW, SNOW_AREAS, 300.0),
+    ):
         for k in range(count):
             x, y = points[rng.integers(len(points))]
-            patches.append(Patch(f"{kind} {k}", x, y, size, size, mu * rng.uniform(0.85, 1.15), looks=mu))
+            patches.append(
+                Patch(f"{kind} {k}", x, y, size, size, mu * rng.uniform(0.85, 1.15), looks=mu)
+            )
     for k in range(ICE_PATCHES):
         line = found[rng.integers(len(found))].line
         at = rng.integers(5, len(line) - 5)

@@ -28,7 +28,9 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
     network = folder / "town.osm"
     routes.write_town(town, network)
     engine.build(network)
-    chosen = draw.choice(len(town.streets), round(routes.ICY_SHARE * len(town.streets)), replace=False)
+    chosen = draw.choice(
+        len(town.streets), round(routes.ICY_SHARE * len(town.streets)), replace=False
+    )
     icy = [town.streets[k] for k in chosen.tolist()]
     middles = np.array([town.crossings[list(street)].mean(axis=0) for street in icy])
     table = routes.icy_map(town, icy)
@@ -57,11 +59,24 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
         avoided += not _meets(found["shape"], middles) and spent <= SLOWER * plain["time"]
     return [
         Figure(
-            "route.avoids_ice", avoided / max(cases, 1), "of trips with a way round of at most 20 % more", 0.95, "more"
+            "route.avoids_ice",
+            avoided / max(cases, 1),
+            "of trips with a way round of at most 20 % more",
+            0.95,
+            "more",
         ),
-        Figure("route.time_error", error_s, "s between the time of a route and of its shape asked again", 0.0),
+        Figure(
+            "route.time_error",
+            error_s,
+            "s between the time of a route and of its shape asked again",
+            0.0,
+        ),
         Figure("route.cases", float(cases), "trips with such a way round", 5.0, "more"),
-        Figure("route.more_time", float(np.mean(longer)) - 1.0 if longer else float("nan"), "of the quickest route"),
+        Figure(
+            "route.more_time",
+            float(np.mean(longer)) - 1.0 if longer else float("nan"),
+            "of the quickest route",
+        ),
     ]
 
 
@@ -76,7 +91,9 @@ def _route(engine: routes.Valhalla, request: dict[str, Any]) -> dict[str, Any] |
 def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
     """Return the travel time of a shape, without costs [s]."""
     points = [{"lat": a, "lon": b} for a, b in shape.tolist()]
-    answer = engine.ask("trace_route", {"shape": points, "costing": "auto", "shape_match": routes.EDGE})
+    answer = engine.ask(
+        "trace_route", {"shape": points, "costing": "auto", "shape_match": routes.EDGE}
+    )
     return float(answer["trip"]["summary"]["time"])
 
 
@@ -114,7 +131,9 @@ def main() -> int:
     """Measure; 0 if every bar holds."""
     parser = argparse.ArgumentParser(prog="tests.benchmarks.iov", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts alone")
-    parser.add_argument("--out", type=Path, default=Path(".iov"), help="figures and files (default .iov)")
+    parser.add_argument(
+        "--out", type=Path, default=Path(".iov"), help="figures and files (default .iov)"
+    )
     parser.add_argument("--quick", action="store_true", help="smaller numbers")
     arguments = parser.parse_args()
     found: list[Figure] = []

@@ -78,10 +78,27 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
         last[denm.sequence] = denm.termination
     rate = max(count / took for count, took in seconds if count > events // 4)
     return [
-        Figure("denm.invalid", float(invalid), "messages that a second decoder does not write byte for byte", 0.0),
-        Figure("denm.duplicated", float(doubled + len(first) - events), "events over restarts", 0.0),
-        Figure("denm.unterminated", float(sum(end is None for end in last.values())), "events over restarts", 0.0),
-        Figure("denm.selector", float(_selected_wrongly(there.received)), "events of a quadTree selector", 0.0),
+        Figure(
+            "denm.invalid",
+            float(invalid),
+            "messages that a second decoder does not write byte for byte",
+            0.0,
+        ),
+        Figure(
+            "denm.duplicated", float(doubled + len(first) - events), "events over restarts", 0.0
+        ),
+        Figure(
+            "denm.unterminated",
+            float(sum(end is None for end in last.values())),
+            "events over restarts",
+            0.0,
+        ),
+        Figure(
+            "denm.selector",
+            float(_selected_wrongly(there.received)),
+            "events of a quadTree selector",
+            0.0,
+        ),
         Figure("denm.per_s", rate, "messages/s, encoded, sent and accepted", 2000.0, "more"),
         Figure("denm.events", float(len(first)), "events", 100.0, "more"),
     ]
@@ -98,6 +115,9 @@ def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
     for zoom, square in squares:
         digits = f",{grid.quadkey(square, zoom)}"
         for denm, given in lasting:
-            inside = any(int(grid.cell_of(*point, zoom=zoom)) == square for point in (denm.position, *denm.history))
+            inside = any(
+                int(grid.cell_of(*point, zoom=zoom)) == square
+                for point in (denm.position, *denm.history)
+            )
             wrong += (digits in str(given["quadTree"])) != inside
     return wrong

@@ -52,7 +52,9 @@ def make_town(draw: np.random.Generator) -> StreetTown:
     north, east = (part.ravel() for part in np.meshgrid(k, k, indexing="ij"))
     jitter = draw.normal(0.0, 0.12, (2, STREETS**2))
     scale = np.cos(np.radians(ORIGIN[0]))
-    crossings = np.stack((ORIGIN[0] + wide * (north + jitter[0]), ORIGIN[1] + wide * (east + jitter[1]) / scale), 1)
+    crossings = np.stack(
+        (ORIGIN[0] + wide * (north + jitter[0]), ORIGIN[1] + wide * (east + jitter[1]) / scale), 1
+    )
     all_links = [(i, i + 1) for i in range(STREETS**2) if (i + 1) % STREETS]
     all_links += [(i, i + STREETS) for i in range(STREETS**2 - STREETS)]
     return StreetTown(crossings, [link for link in all_links if draw.random() > 0.1])
@@ -60,7 +62,10 @@ def make_town(draw: np.random.Generator) -> StreetTown:
 
 def write_town(town: StreetTown, path: Path) -> None:
     """Write a town as OpenStreetMap XML."""
-    nodes = [f'<node id="{n + 1}" version="1" lat="{a:.7f}" lon="{b:.7f}"/>' for n, (a, b) in enumerate(town.crossings)]
+    nodes = [
+        f'<node id="{n + 1}" version="1" lat="{a:.7f}" lon="{b:.7f}"/>'
+        for n, (a, b) in enumerate(town.crossings)
+    ]
     ways = [
         f'<way id="{n + 1}" version="1"><nd ref="{a + 1}"/><nd ref="{b + 1}"/><tag k="highway" v="residential"/>'
         f'<tag k="name" v="Street {n + 1}"/></way>'
@@ -100,9 +105,25 @@ class Valhalla:
         self.folder = folder
         programs = folder / "wheel"
         if not programs.exists():
-            wheel = ["--no-deps", "--python-version", "3.12", "--only-binary=:all:", "--dest", str(folder)]
+            wheel = [
+                "--no-deps",
+                "--python-version",
+                "3.12",
+                "--only-binary=:all:",
+                "--dest",
+                str(folder),
+            ]
             subprocess.run(
-                [sys.executable, "-m", "pip", "download", "--quiet", *wheel, f"pyvalhalla=={VERSION}"], check=True
+                [
+                    sys.executable,
+                    "-m",
+                    "pip",
+                    "download",
+                    "--quiet",
+                    *wheel,
+                    f"pyvalhalla=={VERSION}",
+                ],
+                check=True,
             )
             with zipfile.ZipFile(next(folder.glob("pyvalhalla-*.whl"))) as packed:
                 packed.extractall(programs)
@@ -124,9 +145,19 @@ class Valhalla:
         tiles = self.folder / "tiles"
         tiles.mkdir(exist_ok=True)
         config["mjolnir"] |= {"tile_dir": str(tiles), "concurrency": 1}
-        for unused in ("tile_extract", "traffic_extract", "admin", "timezone", "landmarks", "transit_dir"):
+        for unused in (
+            "tile_extract",
+            "traffic_extract",
+            "admin",
+            "timezone",
+            "landmarks",
+            "transit_dir",
+        ):
             config["mjolnir"].pop(unused, None)
-        config["service_limits"] |= {"min_linear_cost_factor": 0.1, "max_linear_cost_edges": 100_000}
+        config["service_limits"] |= {
+            "min_linear_cost_factor": 0.1,
+            "max_linear_cost_edges": 100_000,
+        }
         self.config.write_text(json.dumps(_present(config)))
         pbf = network.with_suffix(".pbf")
         _pack(network, pbf)
@@ -135,12 +166,16 @@ class Valhalla:
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a request."""
         done = self._run("valhalla_service", str(self.config), action, json.dumps(request))
-        found: dict[str, Any] = json.loads(next(line for line in done.splitlines() if line.startswith("{")))
+        found: dict[str, Any] = json.loads(
+            next(line for line in done.splitlines() if line.startswith("{"))
+        )
         return found
 
     def _run(self, program: str, *arguments: str) -> str:
         command = [str(self._bin / program), *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ}, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, env={**os.environ}, check=False
+        )
         assert done.returncode == 0, (done.stdout + done.stderr)[-2000:]
         return done.stdout
 

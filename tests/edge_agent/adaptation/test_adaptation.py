@@ -35,7 +35,10 @@ def test_noise_grows_where_the_actual_innovation_exceeds_the_theoretical_one() -
 def test_the_factor_stays_within_its_bounds_however_long_the_mismatch_lasts() -> None:
     high = low = 1.0
     for _ in range(1000):
-        high, low = adapted(high, 100.0, 1.0, INPUTS, OUTPUTS), adapted(low, 0.0, 1.0, INPUTS, OUTPUTS)
+        high, low = (
+            adapted(high, 100.0, 1.0, INPUTS, OUTPUTS),
+            adapted(low, 0.0, 1.0, INPUTS, OUTPUTS),
+        )
     assert high == LARGEST_FACTOR
     assert low == LEAST_FACTOR
 

@@ -15,7 +15,14 @@ TUNED = rule_base(replace(Memberships(), consequents=(1.0, 0.3)))
 
 def test_membership_is_none_at_the_foot_full_at_the_peak_and_even_between() -> None:
     ramp = np.array([1.0, 3.0])
-    assert [is_high(value, ramp) for value in (-9.0, 1.0, 1.5, 2.0, 3.0, 9.0)] == [0.0, 0.0, 0.25, 0.5, 1.0, 1.0]
+    assert [is_high(value, ramp) for value in (-9.0, 1.0, 1.5, 2.0, 3.0, 9.0)] == [
+        0.0,
+        0.0,
+        0.25,
+        0.5,
+        1.0,
+        1.0,
+    ]
 
 
 def test_offsets_hurry_where_the_wheels_are_far_and_not_where_nothing_is_asked_for() -> None:

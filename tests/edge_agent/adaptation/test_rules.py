@@ -23,7 +23,9 @@ def test_where_nothing_is_wrong_no_rule_changes_r() -> None:
 def test_at_the_peaks_the_table_itself_speaks_and_beyond_them_its_edge() -> None:
     for j, rate in enumerate(RATE):
         for i, alpha in enumerate(ALPHA):
-            assert infer_two(alpha, rate, ALPHA, RATE, TABLE) == pytest.approx(TABLE[j, i], abs=1e-12)
+            assert infer_two(alpha, rate, ALPHA, RATE, TABLE) == pytest.approx(
+                TABLE[j, i], abs=1e-12
+            )
     assert infer_two(1e9, 1e9, ALPHA, RATE, TABLE) == pytest.approx(math.log(8.0))
 
 
@@ -32,7 +34,8 @@ def test_r_grows_where_innovations_are_larger_than_expected_and_shrinks_where_sm
 
 
 @pytest.mark.parametrize(
-    "printed", [PRINTED[:4], ("PXX" + PRINTED[0][3:], *PRINTED[1:]), (*PRINTED[:2], PRINTED[3], *PRINTED[3:])]
+    "printed",
+    [PRINTED[:4], ("PXX" + PRINTED[0][3:], *PRINTED[1:]), (*PRINTED[:2], PRINTED[3], *PRINTED[3:])],
 )
 def test_a_corrupted_table_is_refused(printed: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="rules"):
@@ -68,4 +71,6 @@ def test_the_window_speaks_when_it_is_full_and_within_its_bounds() -> None:
 
 
 def test_larger_innovations_weigh_more() -> None:
-    assert weighted_noise(np.array([1.0, 3.0]), 0.0, 1.0, 0.0, 99.0) == pytest.approx(0.5 * (1 + 27) / 4)
+    assert weighted_noise(np.array([1.0, 3.0]), 0.0, 1.0, 0.0, 99.0) == pytest.approx(
+        0.5 * (1 + 27) / 4
+    )

@@ -18,7 +18,9 @@ NOW = 1_790_000_000 * NS
 HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
 
 
-def line(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def line(
+    length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Latitude and longitude [deg] of a straight road from the car, a point a metre."""
     s = np.arange(start, length)
     return path.to_degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
@@ -30,13 +32,20 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
     return key[np.sort(np.unique(key, return_index=True)[1])]
 
 
-def cells(key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW) -> ReceivedCells:
+def cells(
+    key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW
+) -> ReceivedCells:
     """HeardCells of one friction."""
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
     belief = known.belief_of(said - width, said, said + width, slippery)
     return ReceivedCells(
-        key, belief, np.full(len(key), basis), np.full(len(key), 3), np.full(len(key), at), np.full(len(key), at)
+        key,
+        belief,
+        np.full(len(key), basis),
+        np.full(len(key), 3),
+        np.full(len(key), at),
+        np.full(len(key), at),
     )
 
 
@@ -54,4 +63,17 @@ def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
     """An alert of ice at a place."""
     cell, sector = divmod(int(key), grid.SECTORS)
     latitude, longitude = grid.centre(cell)
-    return Alert(cell, sector, raised, time, 0.15, 0.1, 0.22, 0.98, 3, float(latitude), float(longitude), "P(mu < 0.4)")
+    return Alert(
+        cell,
+        sector,
+        raised,
+        time,
+        0.15,
+        0.1,
+        0.22,
+        0.98,
+        3,
+        float(latitude),
+        float(longitude),
+        "P(mu < 0.4)",
+    )

@@ -25,13 +25,21 @@ def everywhere_slippery(now: int) -> list[Alert]:
     scenario = scenario_named("test")
     x, y = np.meshgrid(np.arange(-15.0, 130.0, 5.0), np.arange(-15.0, 105.0, 5.0))
     cells = np.unique(grid.cell_of(*scenario.to_latlon(x.ravel(), y.ravel())))
-    return [alert(int(cell) * grid.SECTORS + k, time=now) for cell in cells for k in range(grid.SECTORS)]
+    return [
+        alert(int(cell) * grid.SECTORS + k, time=now) for cell in cells for k in range(grid.SECTORS)
+    ]
 
 
 def settings(folder: Path, router: Router) -> list[str]:
     path = folder / "agent.json"
     path.write_text(
-        json.dumps({"zenoh": router.settings.model_dump(), "spool": str(folder / "spool.sqlite"), "log": "json"})
+        json.dumps(
+            {
+                "zenoh": router.settings.model_dump(),
+                "spool": str(folder / "spool.sqlite"),
+                "log": "json",
+            }
+        )
     )
     return ["--config", str(path)]
 
@@ -45,7 +53,11 @@ def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
     corners = np.array([scenario.junctions[name] for name in ("a", "b", "c", "a", "c", "b", "a")])
     latitude, longitude = scenario.to_latlon(corners[:, 0], corners[:, 1])
     route = tmp_path / "way.geojson"
-    route.write_text(json.dumps({"type": "LineString", "coordinates": np.column_stack([longitude, latitude]).tolist()}))
+    route.write_text(
+        json.dumps(
+            {"type": "LineString", "coordinates": np.column_stack([longitude, latitude]).tolist()}
+        )
+    )
     with MadeUpService(router.settings, now, standing=everywhere_slippery(now)), Service(router):
         assert main([*WORDS, *settings(tmp_path, router), "--ahead", "--route", str(route)]) == 0
     *lines, last = capsys.readouterr().out.splitlines()
@@ -59,7 +71,17 @@ def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
     assert counts["looks"] >= 3
 
 
-def test_a_route_without_listening_is_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("more", [[], ["--autoware-hash", "RIHS01_0"]])
+def test_limits_for_a_planner_without_listening_are_a_mistake(
+    capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    assert main([*WORDS, "--autoware", "tcp/127.0.0.1:7447", *more]) == 2
+    assert "autoware: is of no use without --ahead" in capsys.readouterr().err
+
+
+def test_a_route_without_listening_is_a_mistake(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([*WORDS, "--route", str(tmp_path / "way.gpx")]) == 2
     assert "route: is of no use without --ahead" in capsys.readouterr().err
 
@@ -69,7 +91,17 @@ def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = time.time_ns()
-    words = ["fleet", "--scenario", "test", "--estimator", "ckf", "--vehicles", "4", "--duration", "6"]
+    words = [
+        "fleet",
+        "--scenario",
+        "test",
+        "--estimator",
+        "ckf",
+        "--vehicles",
+        "4",
+        "--duration",
+        "6",
+    ]
     with MadeUpService(router.settings, now, standing=everywhere_slippery(now)), Service(router):
         assert main([*words, *settings(tmp_path, router), "--warned", "0.5"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -79,7 +111,19 @@ def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
     assert main([*words, "--warned", "2"]) == 2
 
 
-def test_a_share_of_winter_vehicles_beyond_one_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["fleet", "--scenario", "test", "--estimator", "ckf", "--vehicles", "2", "--duration", "1"]
+def test_a_share_of_winter_vehicles_beyond_one_is_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = [
+        "fleet",
+        "--scenario",
+        "test",
+        "--estimator",
+        "ckf",
+        "--vehicles",
+        "2",
+        "--duration",
+        "1",
+    ]
     assert main([*words, "--winter", "2"]) == 2
     assert "error: winter: " in capsys.readouterr().err

@@ -18,7 +18,15 @@ from edge_agent.ahead.horizon import (
     look_ahead,
     safe_speed,
 )
-from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, LocalMap, belief_of
+from edge_agent.ahead.known import (
+    ALERT_HELD_S,
+    BORROWED,
+    CHANGE_S,
+    HELD_S,
+    OTHER_WAY,
+    LocalMap,
+    belief_of,
+)
 from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degrees
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
@@ -45,7 +53,9 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
     assert path is not None
     assert len(path.distance) in (98, 99)
     assert route.ahead(further._replace(latitude=57.701), 500.0) is None
-    assert route.ahead(further._replace(yaw=HOME.yaw + math.pi), 500.0) is None, "the other way is another road"
+    assert route.ahead(further._replace(yaw=HOME.yaw + math.pi), 500.0) is None, (
+        "the other way is another road"
+    )
 
 
 @pytest.mark.parametrize("spacing", [1.0, 60.0])
@@ -56,9 +66,14 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 ) -> None:
     """A right angle to the left, 120 m on."""
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
-    x, y = np.concatenate([way, np.full(len(way) - 1, 120.0)]), np.concatenate([np.zeros(len(way)), way[1:]])
+    x, y = (
+        np.concatenate([way, np.full(len(way) - 1, 120.0)]),
+        np.concatenate([np.zeros(len(way)), way[1:]]),
+    )
     route = GivenRoute(*to_degrees(x, y, HOME))
-    latitude, longitude = to_degrees(np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME)
+    latitude, longitude = to_degrees(
+        np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME
+    )
     yaw = HOME.yaw + math.radians(turned)
     pose = HOME._replace(latitude=float(latitude[0]), longitude=float(longitude[0]), yaw=yaw)
     path = route.ahead(pose, 500.0)
@@ -83,7 +98,8 @@ def test_who_crosses_a_route_or_turns_off_where_it_goes_on_has_left_it() -> None
 def test_a_loop_that_is_driven_twice_is_not_jumped_ahead_in() -> None:
     latitude, longitude = line(100.0)
     twice = GivenRoute(
-        np.concatenate([latitude, latitude[::-1], latitude]), np.concatenate([longitude, longitude[::-1], longitude])
+        np.concatenate([latitude, latitude[::-1], latitude]),
+        np.concatenate([longitude, longitude[::-1], longitude]),
     )
     path = twice.ahead(HOME, 500.0)
     assert path is not None
@@ -101,7 +117,9 @@ def test_unknown_stays_unknown() -> None:
 
 
 def test_a_bound_is_no_value_and_gives_no_advice() -> None:
-    horizon = look_ahead(straight_path(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW)
+    horizon = look_ahead(
+        straight_path(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW
+    )
     assert (horizon.basis == known.BOUND).any()
     assert np.isnan(horizon.mu).all()
     assert not horizon.slippery.any()
@@ -120,7 +138,9 @@ def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
 def test_without_a_network_the_horizon_fades_to_unknown() -> None:
     cache = told([cells(keys_on(), 0.8, width=0.05)])
     path = straight_path(HOME, 60.0)
-    fresh, later, gone = (look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0))
+    fresh, later, gone = (
+        look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0)
+    )
     seen = fresh.basis == known.MEASURED
     assert seen.any()
     assert (later.mu_lower[seen] < fresh.mu_lower[seen] - 0.1).all(), "the interval opens"
@@ -207,12 +227,16 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
     length = horizon_length(HOME.speed)
     for second in range(80):
         k = int(second * HOME.speed)
-        pose = Pose(float(latitude[k]), float(longitude[k]), HOME.yaw, HOME.speed, NOW + second * NS)
+        pose = Pose(
+            float(latitude[k]), float(longitude[k]), HOME.yaw, HOME.speed, NOW + second * NS
+        )
         ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [straight_path(pose, length)]
         horizon = look_ahead(ways[0].near(length), cache, pose.time)
         known_m.append(int((horizon.basis == known.MEASURED).sum()))
         for box in asked.wanting(ways[0], pose, length):
-            heard = cells(road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time)
+            heard = cells(
+                road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time
+            )
             cache.take(1, heard, pose.time)
     assert min(known_m[1:]) > 100
 
@@ -264,12 +288,20 @@ def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
     assert np.isfinite(seen.safe_speed[seen.alerted]).all()
     tile = int(grid.tile_of(road[2] // grid.SECTORS))
     cache.take(tile, cells(road[2:3], 0.8, at=NOW - NS), NOW)
-    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), "grip that was found before"
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
+        "grip that was found before"
+    )
     cache.take(tile, cells(road[2:3], 0.3, basis=known.BOUND, at=NOW + NS), NOW)
-    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), "who rolled over it found none"
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
+        "who rolled over it found none"
+    )
     cache.take(tile, cells(road[2:3], 0.6, basis=known.BOUND, at=NOW + NS), NOW)
-    assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), "who braked there found enough"
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), (
+        "who braked there found enough"
+    )
     cache.take(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
-    assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {int(road[3])}
+    assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {
+        int(road[3])
+    }
     across = straight_path(HOME._replace(yaw=HOME.yaw + np.pi / 2), 60.0)
     assert not look_ahead(across, cache, NOW + NS).alerted.any(), "another road"

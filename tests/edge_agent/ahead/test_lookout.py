@@ -94,7 +94,9 @@ def town(router: Router) -> Iterator[MadeUpService]:
         yield town
 
 
-def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, town: MadeUpService) -> None:
+def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(
+    router: Router, town: MadeUpService
+) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         town.put(alert(int(ICE[0]), time=NOW))
@@ -112,13 +114,17 @@ def test_an_alert_is_told_at_once_and_not_with_the_next_look(
     monkeypatch.setattr(lookout, "LOOK_S", 1e6)
     monkeypatch.setattr(lookout, "STALE_S", 1e6)
     with driving(router) as car:
-        until(lambda: car.lookout.counts.looks == 2 and any("alert" in asked for asked in town.asked))
+        until(
+            lambda: car.lookout.counts.looks == 2 and any("alert" in asked for asked in town.asked)
+        )
         town.put(alert(int(ICE[0]), time=NOW))
         assert car.next().state == "raised"
         assert car.lookout.counts.looks == 3
 
 
-def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(router: Router, town: MadeUpService) -> None:
+def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(
+    router: Router, town: MadeUpService
+) -> None:
     town.standing = [alert(int(key), time=NOW) for key in keys_on(2600.0, start=2560.0)]
     with driving(router) as car:
         subscriber = car.lookout.counts.subscribers[CAR]
@@ -131,13 +137,17 @@ def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(router
         assert set(subscriber.tiles) - before
 
 
-def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: MadeUpService) -> None:
+def test_ice_that_was_found_before_the_car_came_is_asked_for(
+    router: Router, town: MadeUpService
+) -> None:
     town.standing = [alert(int(key), time=NOW) for key in ICE]
     with driving(router) as car:
         assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
-def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router, town: MadeUpService) -> None:
+def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
+    router: Router, town: MadeUpService
+) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         warning = car.next()
@@ -147,10 +157,14 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router
         dry = seen.runs.start_m < 60.0
         assert seen.runs.mu[dry & (seen.runs.basis == known.MEASURED)].min() > 0.7
         assert np.isfinite(seen.runs.safe_speed).any()
-        assert all("bbox=" in asked for asked in town.asked if "/map/" in asked), "pieces, never the whole map"
+        assert all("bbox=" in asked for asked in town.asked if "/map/" in asked), (
+            "pieces, never the whole map"
+        )
 
 
-def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: MadeUpService) -> None:
+def test_what_lies_ahead_is_put_on_the_vehicles_own_key(
+    router: Router, town: MadeUpService
+) -> None:
     town.standing = [alert(int(ICE[0]), time=NOW)]
     owner = open_session(router.settings)
     assert owner is not None
@@ -171,7 +185,9 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: Ma
     assert encode_ahead(told) == sample.payload.to_bytes()
 
 
-def test_ice_during_a_router_outage_is_received_after_reconnect(router: Router, town: MadeUpService) -> None:
+def test_ice_during_a_router_outage_is_received_after_reconnect(
+    router: Router, town: MadeUpService
+) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         router.stop()
@@ -191,7 +207,9 @@ def test_a_service_that_comes_after_the_car_is_asked_too(router: Router) -> None
             assert car.next().state == "raised"
 
 
-def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router: Router, town: MadeUpService) -> None:
+def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
+    router: Router, town: MadeUpService
+) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()}
     with driving(router) as car:
         car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
@@ -235,7 +253,9 @@ def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Rou
         assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
-def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, town: MadeUpService) -> None:
+def test_where_it_is_the_car_believes_its_filter_and_the_map(
+    router: Router, town: MadeUpService
+) -> None:
     town.mu = {int(key): 0.2 for key in keys_on()}
     here, flat = np.array([keys_on()[0]]), (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
@@ -244,14 +264,18 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, tow
         assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
 
         def informed(seen: Outlook) -> bool:
-            car.lookout.believe(here, flat)  # block after block: while the car looks ahead, it does not wait for that
+            car.lookout.believe(
+                here, flat
+            )  # block after block: while the car looks ahead, it does not wait for that
             return bool(seen.here[0] < 0.3)
 
         seen = car.until(informed)
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
-def test_a_hostile_alert_is_refused_counted_and_changes_nothing(router: Router, town: MadeUpService) -> None:
+def test_a_hostile_alert_is_refused_counted_and_changes_nothing(
+    router: Router, town: MadeUpService
+) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         assert car.next().state == "raised"
@@ -261,7 +285,14 @@ def test_a_hostile_alert_is_refused_counted_and_changes_nothing(router: Router, 
         far = alert(int(ICE[0]) + (1 << 30), time=NOW)
         town.session.put(keys.alert_key(tile), wire.encode_alert(far))
         until(
-            lambda: sum(n for name, n in car.lookout.counts.subscribers[CAR].counts.items() if "refused" in name) >= 2
+            lambda: (
+                sum(
+                    n
+                    for name, n in car.lookout.counts.subscribers[CAR].counts.items()
+                    if "refused" in name
+                )
+                >= 2
+            )
         )
         assert car.lookout.counts.values()["heard_refused"] >= 2
         assert car.until(lambda seen: seen.warnings).warnings[0].state == "raised"
@@ -313,12 +344,17 @@ class Liar(MadeUpService):
     def tile(self, key: IntArray, mu: FloatArray) -> bytes:
         self.said += 1
         lies = [tile_payload(HERE, 0.2, NOW, **lie) for lie in LIES.values()]
-        return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][self.said % (len(LIES) + len(NOISE) + 1)]
+        return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][
+            self.said % (len(LIES) + len(NOISE) + 1)
+        ]
 
 
 def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> None:
     every = len(LIES) + len(NOISE) + 1
-    with Liar(router.settings, time.time_ns(), {int(key): 0.85 for key in keys_on()}) as liar, driving(router) as car:
+    with (
+        Liar(router.settings, time.time_ns(), {int(key): 0.85 for key in keys_on()}) as liar,
+        driving(router) as car,
+    ):
         later_s = 0.0
         while liar.said < every:  # a piece is asked for again when it is old
             said, later_s = liar.said, later_s + REFRESH_S + 1.0
@@ -326,7 +362,9 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
         assert not car.lookout.counts.total_of("cells")
-        car.until(lambda seen: seen.time < time.time_ns() + NS)  # at an hour from now an alert of now is forgotten
+        car.until(
+            lambda seen: seen.time < time.time_ns() + NS
+        )  # at an hour from now an alert of now is forgotten
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
         assert car.next().state == "raised"
         assert not car.lookout.counts.failures
@@ -355,7 +393,9 @@ def test_alerts_that_are_not_possible_are_refused() -> None:
 def _at(metre: float, seconds: float) -> Pose:
     latitude, longitude = line(max(metre + 1.0, 2.0))
     return HOME._replace(
-        latitude=float(latitude[int(metre)]), longitude=float(longitude[int(metre)]), time=NOW + round(seconds * NS)
+        latitude=float(latitude[int(metre)]),
+        longitude=float(longitude[int(metre)]),
+        time=NOW + round(seconds * NS),
     )
 
 
@@ -367,7 +407,12 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
     latitude, longitude = line(150.0)
     covered = np.zeros(150, bool)
     for box in boxes:
-        covered |= (latitude >= box.south) & (latitude <= box.north) & (longitude >= box.west) & (longitude <= box.east)
+        covered |= (
+            (latitude >= box.south)
+            & (latitude <= box.north)
+            & (longitude >= box.west)
+            & (longitude <= box.east)
+        )
     assert covered.all()
     assert asked.wanting(path, pose, 100.0) == []
     assert asked.wanting(path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)), 100.0)
@@ -389,7 +434,9 @@ def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
     border, flickers = Tiles(), 0
     west, _, _, _ = (float(side) for side in grid.bounds(TILE, grid.TILE_ZOOM))
     for second in range(100):
-        pose = HOME._replace(longitude=west + 2e-6 * (-1) ** second, yaw=np.pi / 2, time=NOW + second * NS)
+        pose = HOME._replace(
+            longitude=west + 2e-6 * (-1) ** second, yaw=np.pi / 2, time=NOW + second * NS
+        )
         flickers += sum(map(len, border.follow([straight_path(pose, 150.0)], pose)))
     assert flickers <= 4
     assert LEAVE_S > 2.0

@@ -10,7 +10,14 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edge_agent.ahead.horizon import COMFORT, MARGIN_M, SIGHT_M
-from edge_agent.ahead.planner import FREE, HOLD_S, PlannerKey, SteadyLimit, encode_limit, limit_ahead
+from edge_agent.ahead.planner import (
+    FREE,
+    HOLD_S,
+    PlannerKey,
+    SteadyLimit,
+    encode_limit,
+    limit_ahead,
+)
 from schemas.stopping import stopping_speed
 from schemas.thresholds import NS
 
@@ -30,13 +37,17 @@ def test_a_ros_decoder_reads_the_message(limit: float) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
-    read: Any = store.deserialize_cdr(encode_limit(limit, 17 * NS + 5), "tier4_planning_msgs/msg/VelocityLimit")
+    read: Any = store.deserialize_cdr(
+        encode_limit(limit, 17 * NS + 5), "tier4_planning_msgs/msg/VelocityLimit"
+    )
     assert (read.stamp.sec, read.stamp.nanosec) == (17, 5)
     assert read.max_velocity == min(limit, FREE)
     assert read.use_constraints
     assert read.constraints.min_acceleration == -COMFORT
     assert read.sender == "gripmap"
-    assert bytes(store.serialize_cdr(read, "tier4_planning_msgs/msg/VelocityLimit")) == encode_limit(limit, 17 * NS + 5)
+    assert bytes(
+        store.serialize_cdr(read, "tier4_planning_msgs/msg/VelocityLimit")
+    ) == encode_limit(limit, 17 * NS + 5)
 
 
 def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
@@ -78,4 +89,6 @@ def test_limit_falls_at_once_and_rises_after_a_while() -> None:
 
 def test_a_road_that_nobody_measured_gives_no_limit() -> None:
     assert limit_ahead(np.arange(5.0), np.full(5, np.nan)) == math.inf
-    assert PlannerKey(3, "RIHS01_ab").key.startswith("3/planning/scenario_planning/max_velocity_candidates/")
+    assert PlannerKey(3, "RIHS01_ab").key.startswith(
+        "3/planning/scenario_planning/max_velocity_candidates/"
+    )

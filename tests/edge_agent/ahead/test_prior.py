@@ -112,10 +112,15 @@ def test_what_is_published_is_the_same_bit_for_bit_whatever_the_map_says() -> No
             beliefs = pipeline.beliefs()
             assert beliefs is not None
             own, visit = beliefs
-            out = prior.step(pipeline.places, own, visit, dict.fromkeys(prior.enters(pipeline.places), lie))
+            out = prior.step(
+                pipeline.places, own, visit, dict.fromkeys(prior.enters(pipeline.places), lie)
+            )
             alone = np.exp(own) / np.exp(own).sum(axis=1, keepdims=True)
             helped = max(helped, float(np.abs(out - alone).max()))
         published.append(records)
         assert (helped > 0.05) == (lie is not None)
     for one in published[1:]:
-        assert all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(published[0], one, strict=True))
+        assert all(
+            np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+            for a, b in zip(published[0], one, strict=True)
+        )

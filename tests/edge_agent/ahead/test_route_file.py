@@ -21,7 +21,8 @@ LAUGHS = '<!DOCTYPE g [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]><gpx><rte><rtept la
 
 
 @pytest.mark.parametrize(
-    "text", [TRACK, TRACK.replace("trkpt", "rtept"), *map(json.dumps, (GEOMETRY, FEATURE, COLLECTION))]
+    "text",
+    [TRACK, TRACK.replace("trkpt", "rtept"), *map(json.dumps, (GEOMETRY, FEATURE, COLLECTION))],
 )
 def test_gpx_and_geojson_give_the_same_way(tmp_path: Path, text: str) -> None:
     file = tmp_path / "route"

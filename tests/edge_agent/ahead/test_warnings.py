@@ -101,7 +101,9 @@ def test_ice_on_the_other_carriageway_is_none_of_ours() -> None:
 
 def test_one_vehicle_alone_warns_nobody() -> None:
     lonely = cells(icy(), 0.15, width=0.05)
-    assert Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
+    assert (
+        Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
+    )
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
@@ -140,7 +142,9 @@ def test_a_car_that_takes_another_way_is_told_that_the_warning_is_over() -> None
     car = Car(dry_but(icy()))
     raised = car.drive(224.0)
     assert raised[0].state == "raised"
-    pose = car.pose()._replace(yaw=HOME.yaw + math.pi / 2, time=car.pose().time + round((ABSENT_S + UPDATE_S) * NS))
+    pose = car.pose()._replace(
+        yaw=HOME.yaw + math.pi / 2, time=car.pose().time + round((ABSENT_S + UPDATE_S) * NS)
+    )
     horizon = look_ahead(straight_path(pose, 200.0), car.cache, pose.time)
     _, told = update_warnings(car.active, [horizon], pose, car.cache)
     assert [one.state for one in told] == ["ended"]
@@ -159,7 +163,10 @@ def test_at_a_fork_a_stretch_on_one_way_is_told_as_possible() -> None:
     pose = HOME._replace(speed=20.0)
     route = GivenRoute(*line(ROAD)).ahead(pose, 300.0)
     assert route is not None
-    ways = [look_ahead(route, cache, NOW), look_ahead(straight_path(pose._replace(yaw=1.6), 150.0), cache, NOW)]
+    ways = [
+        look_ahead(route, cache, NOW),
+        look_ahead(straight_path(pose._replace(yaw=1.6), 150.0), cache, NOW),
+    ]
     _, told = update_warnings((), ways, pose, cache)
     assert [one.sure for one in told] == [False]
     _, told = update_warnings((), ways[:1], pose, cache)

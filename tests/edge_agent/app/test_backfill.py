@@ -22,7 +22,12 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of drives, each with its vehicle file beside it."""
     folder = tmp_path_factory.mktemp("drives")
     for seed in range(DRIVES):
-        files = ["--out", str(folder / f"d{seed}.parquet"), "--vehicle-out", str(folder / f"d{seed}.json")]
+        files = [
+            "--out",
+            str(folder / f"d{seed}.parquet"),
+            "--vehicle-out",
+            str(folder / f"d{seed}.json"),
+        ]
         assert main(["simulate", "slalom", "--duration", "1", "--seed", str(seed), *files]) == 0
     return folder
 
@@ -31,7 +36,9 @@ def logs(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.parquet"))
 
 
-def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(drives: Path, tmp_path: Path) -> None:
+def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
+    drives: Path, tmp_path: Path
+) -> None:
     paths = [str(path) for path in logs(drives)]
     for jobs in ("1", "2"):
         out = ["--out", str(tmp_path / jobs), "--jobs", jobs]
@@ -47,7 +54,10 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(drives: 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
     """Their vehicle files are pipes: a drive waits there until something is written, or the writer leaves."""
-    tasks = [task._replace(vehicle=tmp_path / task.vehicle.name) for task in tasks_of(logs(drives), None, tmp_path)]
+    tasks = [
+        task._replace(vehicle=tmp_path / task.vehicle.name)
+        for task in tasks_of(logs(drives), None, tmp_path)
+    ]
     writers: dict[Path, int] = {}
     under_way: list[int] = []
 
@@ -82,25 +92,43 @@ def test_a_bad_log_is_told_and_the_others_are_estimated(
     bad = tmp_path / "bad.parquet"
     bad.write_bytes(b"not a log")
     vehicle = ["--vehicle", str(drives / "d0.json"), "--estimator", "ckf"]
-    assert main(["replay", str(bad), str(drives / "d0.parquet"), *vehicle, "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(
+            [
+                "replay",
+                str(bad),
+                str(drives / "d0.parquet"),
+                *vehicle,
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 2
+    )
     reported = capsys.readouterr().err
     assert f"error: {bad}: log:" in reported
     assert "2 of 2 logs, 100 samples" in reported
     assert [path.name for path in logs(tmp_path / "out")] == ["d0.parquet"]
 
 
-def test_logs_of_one_name_and_estimates_over_their_log_are_refused(drives: Path, tmp_path: Path) -> None:
+def test_logs_of_one_name_and_estimates_over_their_log_are_refused(
+    drives: Path, tmp_path: Path
+) -> None:
     log = drives / "d0.parquet"
     with pytest.raises(InputError, match="would both write"):
         tasks_of([log, tmp_path / "d0.parquet"], None, tmp_path)
     with pytest.raises(InputError, match="would replace the log"):
         tasks_of([log], None, drives)
-    assert tasks_of([log], None, tmp_path) == [Task(log, drives / "d0.json", tmp_path / "d0.parquet")]
+    assert tasks_of([log], None, tmp_path) == [
+        Task(log, drives / "d0.json", tmp_path / "d0.parquet")
+    ]
     with pytest.raises(InputError, match="jobs: 0 is below 1"):
         list(backfill([], "ckf", 0))
 
 
-def test_several_logs_are_not_published(drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_logs_are_not_published(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["replay", *map(str, logs(drives)), "--out", str(tmp_path), "--publish"]) == 2
     assert "error: publish: 3 logs into a folder" in capsys.readouterr().err
 
@@ -117,11 +145,16 @@ def test_an_engine_is_for_several_logs_and_wants_no_jobs(
     assert "error: engine: one log into one file" in capsys.readouterr().err
 
 
-def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(drives: Path, tmp_path: Path) -> None:
+def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(
+    drives: Path, tmp_path: Path
+) -> None:
     (task, *_) = tasks_of(logs(drives), None, tmp_path)
     first = estimate_atomically(task, "ckf", None)
     content = task.out.read_bytes()
     assert estimate_atomically(task, "ckf", None) == first == Outcome(task, 100, None)
     assert [path.name for path in tmp_path.iterdir()] == [task.out.name]
     assert task.out.read_bytes() == content
-    assert estimate_atomically(task._replace(vehicle=tmp_path / "none.json"), "ckf", None).error is not None
+    assert (
+        estimate_atomically(task._replace(vehicle=tmp_path / "none.json"), "ckf", None).error
+        is not None
+    )

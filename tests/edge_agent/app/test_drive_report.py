@@ -45,7 +45,9 @@ def drive_of(*names: str, rows: int = ROWS, wide: bool = False) -> RecordedDrive
     signals = np.full((rows, len(CHANNELS)), np.nan)
     signals[:, S.LATITUDE] = 57.7 + t * 1e-5
     signals[:, S.LONGITUDE] = 11.97
-    return RecordedDrive(SignalLog(t, signals, START_NS), dict.fromkeys(names or ("ckf",), table), "a <drive>")
+    return RecordedDrive(
+        SignalLog(t, signals, START_NS), dict.fromkeys(names or ("ckf",), table), "a <drive>"
+    )
 
 
 def data_of(text: str) -> dict[str, Any]:
@@ -57,7 +59,9 @@ def data_of(text: str) -> dict[str, Any]:
 def test_the_page_holds_every_quantity_of_every_estimator() -> None:
     found = data_of(page_of(drive_of("ckf", "sr-ukf")))
     assert [plot["name"] for plot in found["plots"]] == [panel.name for panel in PANELS]
-    assert all([c["estimator"] for c in plot["curves"]] == ["ckf", "sr-ukf"] for plot in found["plots"])
+    assert all(
+        [c["estimator"] for c in plot["curves"]] == ["ckf", "sr-ukf"] for plot in found["plots"]
+    )
     assert found["health"] == [{"name": "no position", "spans": [[20.01, 39.99]]}]
     assert len(found["track"]["x"]) == len(found["track"]["colour"])
 

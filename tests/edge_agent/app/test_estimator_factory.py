@@ -34,7 +34,9 @@ def test_the_pure_core_reads_no_file_and_says_who_does(name: str) -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_has_a_bank(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
-    reported = bank_of(name, [vehicle] * 2).advance(np.repeat(t[:3, None], 2, 1), np.repeat(signals[:3, None], 2, 1))
+    reported = bank_of(name, [vehicle] * 2).advance(
+        np.repeat(t[:3, None], 2, 1), np.repeat(signals[:3, None], 2, 1)
+    )
     assert reported.mu.shape == (3, 2)
 
 

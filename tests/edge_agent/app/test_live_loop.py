@@ -42,7 +42,11 @@ class Basket:
         self.taken += records
 
     def column(self, kind: Kind, name: str) -> np.ndarray:
-        parts = [r.vehicle if name == "vehicle" else r.columns[name] for r in self.taken if r.kind is kind]
+        parts = [
+            r.vehicle if name == "vehicle" else r.columns[name]
+            for r in self.taken
+            if r.kind is kind
+        ]
         return np.concatenate(parts)
 
 
@@ -59,7 +63,9 @@ def fleet_blocks(
 
 
 def joined(parts: list[Block]) -> Block:
-    return Block(*(np.concatenate([getattr(b, name) for b in parts]) for name in ("t", "time", "signals")))
+    return Block(
+        *(np.concatenate([getattr(b, name) for b in parts]) for name in ("t", "time", "signals"))
+    )
 
 
 def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> None:
@@ -108,7 +114,9 @@ def run(
     return progress, basket, reported
 
 
-def test_a_simulated_source_hands_its_context_to_the_observations(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_simulated_source_hands_its_context_to_the_observations(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Hand-made: the first car brakes with ABS now and then, the second one's lamp always burns, the third has none."""
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):
@@ -118,7 +126,9 @@ def test_a_simulated_source_hands_its_context_to_the_observations(caplog: pytest
         parts[place] = replace(
             block,
             context=context_block(
-                block.t.shape[0], block.t.shape[1], {"abs_active": abs_active, "air_temperature": -3.0}
+                block.t.shape[0],
+                block.t.shape[1],
+                {"abs_active": abs_active, "air_temperature": -3.0},
             ),
         )
     _, basket, _ = run(iter(parts), fleet, threading.Event(), clock=count(0.0, 0.1).__next__)
@@ -129,13 +139,22 @@ def test_a_simulated_source_hands_its_context_to_the_observations(caplog: pytest
     last = pipeline.finish()
     assert last is not None
     plain.offer(last)
-    whose, flag = basket.column(Kind.OBSERVATION, "vehicle"), basket.column(Kind.OBSERVATION, "abs_active")
+    whose, flag = (
+        basket.column(Kind.OBSERVATION, "vehicle"),
+        basket.column(Kind.OBSERVATION, "abs_active"),
+    )
     assert set(flag[whose == 0].tolist()) == {0, 1}
     assert set(flag[whose > 0].tolist()) == {-1}
     filled = np.isfinite(basket.column(Kind.OBSERVATION, "air_temperature"))
     assert filled.mean() >= 0.9
-    told = [record.getMessage() for record in caplog.records if "counts as unknown" in record.getMessage()]
-    assert told == ["vehicle 1: abs_active has been on since the start: it counts as unknown; correct the profile"]
+    told = [
+        record.getMessage()
+        for record in caplog.records
+        if "counts as unknown" in record.getMessage()
+    ]
+    assert told == [
+        "vehicle 1: abs_active has been on since the start: it counts as unknown; correct the profile"
+    ]
     for name in plain.taken[0].columns.keys() - {"abs_active", "air_temperature"}:
         one, other = (b.column(Kind.OBSERVATION, name) for b in (plain, basket))
         assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), name
@@ -152,7 +171,9 @@ def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
 def test_a_loop_that_cannot_keep_up_counts_each_late_block_and_skips_none() -> None:
     fleet, parts = fleet_blocks(20)
     seconds = iter(np.arange(1000.0))
-    progress, _, reported = run(iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds)))
+    progress, _, reported = run(
+        iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds))
+    )
     assert progress.blocks == 20
     assert progress.behind >= 19
     assert progress.lag_s > 10
@@ -184,7 +205,9 @@ def test_systemd_gets_signs_of_life_unless_the_thread_that_sends_has_died(
         manager.setblocking(False)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         fleet, parts = fleet_blocks(3)
-        _, _, reported = run(iter(parts), fleet, threading.Event(), clock=count(0.0, STATUS_EVERY_S).__next__)
+        _, _, reported = run(
+            iter(parts), fleet, threading.Event(), clock=count(0.0, STATUS_EVERY_S).__next__
+        )
         assert reported
         if broken:
             with pytest.raises(BlockingIOError):
@@ -193,7 +216,9 @@ def test_systemd_gets_signs_of_life_unless_the_thread_that_sends_has_died(
             assert manager.recv(64) == b"READY=1\nWATCHDOG=1"
 
 
-def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -43,4 +43,6 @@ def test_reader_finds_every_sample_with_its_schema(tmp_path: Path, count: int) -
     for (schema, _, message), row in zip(found, rows, strict=True):
         assert schema is not None
         assert message.log_time == round(row["t"] * 1e9)
-        assert json.loads(message.data) == {name: value for name, value in row.items() if value is not None}
+        assert json.loads(message.data) == {
+            name: value for name, value in row.items() if value is not None
+        }

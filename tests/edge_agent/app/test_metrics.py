@@ -17,7 +17,9 @@ from tests.edge_agent.service import Router, Service
 from tests.waiting import until
 
 
-def test_an_agent_shows_what_was_settled_and_what_waits(router: Router, service: Service, tmp_path: Path) -> None:
+def test_an_agent_shows_what_was_settled_and_what_waits(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
     service.answer = False
     publisher, progress = publisher_of(settings(router, tmp_path)), Progress()
     observations, _ = drive()
@@ -25,14 +27,19 @@ def test_an_agent_shows_what_was_settled_and_what_waits(router: Router, service:
     publisher.offer(observations)
 
     def shown(name: str, kind: str = "") -> float:
-        return {metric.name: metric.values for metric in metrics.metrics(publisher, progress)}[name][kind]
+        return {metric.name: metric.values for metric in metrics.metrics(publisher, progress)}[
+            name
+        ][kind]
 
     until(lambda: service.batches and shown("published_records", "observation") == sent)
     assert shown("unsettled_records") == sent
     service.answer = True
     until(lambda: shown("acknowledged_records", "observation") == sent)
     assert publisher.close(within_s=5.0)
-    assert (shown("unsettled_records"), shown("rejected_records", Kind.STATE.name.lower())) == (0, 0)
+    assert (shown("unsettled_records"), shown("rejected_records", Kind.STATE.name.lower())) == (
+        0,
+        0,
+    )
 
 
 def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
@@ -40,7 +47,9 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
 ) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     observations, states = drive()
-    publisher.offer(observations._replace(vehicle=observations.vehicle + 1000))  # nobody has this number
+    publisher.offer(
+        observations._replace(vehicle=observations.vehicle + 1000)
+    )  # nobody has this number
     strange = states.columns | {"health": np.full(len(states.vehicle), 1 << 40)}  # no 32 bits
     publisher.offer(states._replace(columns=strange), observations)
     until(lambda: publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle))
@@ -52,7 +61,9 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
     assert publisher.close(within_s=5.0)
 
 
-def test_agent_without_answers_or_with_full_outbox_reports_problems(tmp_path: Path, router: Router) -> None:
+def test_agent_without_answers_or_with_full_outbox_reports_problems(
+    tmp_path: Path, router: Router
+) -> None:
     late: list[float] = []
     config = settings(router, tmp_path)
     publisher = Publisher(
@@ -71,7 +82,9 @@ def test_agent_without_answers_or_with_full_outbox_reports_problems(tmp_path: Pa
     publisher.close(within_s=0.0)
 
 
-def test_an_agent_without_a_router_or_behind_its_time_is_in_trouble(tmp_path: Path, router: Router) -> None:
+def test_an_agent_without_a_router_or_behind_its_time_is_in_trouble(
+    tmp_path: Path, router: Router
+) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     until(lambda: publisher.links == 3)
     assert metrics.health_problems(publisher, Progress()) == []

@@ -65,7 +65,9 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 }
 
 
-def told_within(source: Block, find: Callable[[SignalWatch], list[str]], seconds: float) -> list[str]:
+def told_within(
+    source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
+) -> list[str]:
     """Return the lines that are printed in so many seconds."""
     clock, lines = Clock(), list[str]()
     watch = SignalWatch(clock)

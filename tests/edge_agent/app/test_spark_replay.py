@@ -31,7 +31,12 @@ def session() -> Iterator[Any]:
 def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("drives")
     for seed in range(DRIVES):
-        files = ["--out", str(folder / f"d{seed}.parquet"), "--vehicle-out", str(folder / f"d{seed}.json")]
+        files = [
+            "--out",
+            str(folder / f"d{seed}.parquet"),
+            "--vehicle-out",
+            str(folder / f"d{seed}.json"),
+        ]
         assert main(["simulate", "slalom", "--duration", "2", "--seed", str(seed), *files]) == 0
     return sorted(folder.glob("*.parquet"))
 
@@ -50,7 +55,14 @@ def test_both_engines_write_the_same_bytes_and_tell_the_same_of_a_bad_log(
     bad.write_bytes(b"no log")
     bad.with_suffix(".json").write_bytes(drives[0].with_suffix(".json").read_bytes())
     for engine in ("local", "spark"):
-        words = ["replay", *map(str, [*drives, bad]), "--out", str(tmp_path / engine), "--estimator", ESTIMATOR]
+        words = [
+            "replay",
+            *map(str, [*drives, bad]),
+            "--out",
+            str(tmp_path / engine),
+            "--estimator",
+            ESTIMATOR,
+        ]
         assert main([*words, "--engine", engine]) == 2
         said = capsys.readouterr().err
         assert f"error: {bad}: log:" in said
@@ -68,7 +80,9 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tmp_path / "tries")
     told = spark.spread(session, tasks_of(drives, None, tmp_path / "spark"), dying)
-    assert sorted(path.name for path in (tmp_path / "tries").iterdir()) == [path.name for path in drives], "all died"
+    assert sorted(path.name for path in (tmp_path / "tries").iterdir()) == [
+        path.name for path in drives
+    ], "all died"
     assert [outcome.samples for outcome in told] == [200] * DRIVES
     list(backfill(tasks_of(drives, None, tmp_path / "local"), ESTIMATOR, 1))
     assert contents(tmp_path / "spark") == contents(tmp_path / "local")

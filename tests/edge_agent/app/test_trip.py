@@ -85,15 +85,22 @@ def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path:
         known = trip.vehicle.calibration
         assert (0 if known is None else known.drives) == count - 1
         _, blocks = driven(trip, bad)
-        got, raw = np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks]), bad.signals[:, S.YAW_RATE]
+        got, raw = (
+            np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks]),
+            bad.signals[:, S.YAW_RATE],
+        )
         offset = 0.0 if known is None or known.yaw_rate is None else known.yaw_rate[0]
         waited = [rows for rows in range(11) if delayed_by(rows, got + offset, raw)]
-        assert waited, "each row is a reading of the log, less the offset, at most a tenth of a second old"
+        assert waited, (
+            "each row is a reading of the log, less the offset, at most a tenth of a second old"
+        )
         assert count > 1 or waited[0] == 0, "nothing is known yet"
     assert offset == pytest.approx(0.012, abs=0.004)
 
 
-def test_a_fault_that_comes_up_takes_the_doctors_word_back(smooth: Recorded, tmp_path: Path) -> None:
+def test_a_fault_that_comes_up_takes_the_doctors_word_back(
+    smooth: Recorded, tmp_path: Path
+) -> None:
     path = tmp_path / "car.json"
     driven(Trip(smooth.vehicle, PROFILE, path), smooth)
     broken = Trip(smooth.vehicle, PROFILE, path)

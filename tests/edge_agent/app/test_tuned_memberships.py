@@ -57,14 +57,23 @@ def broken(change: Change) -> str:
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (lambda d: d["memberships"].update(inputs=[-0.8, 0.0, -0.4, 1.0, 4.0]), "memberships.inputs"),
-        (lambda d: d["memberships"].update(outputs=[0.2, 0.1, 0.0, -0.1, -0.2]), "memberships.outputs"),
+        (
+            lambda d: d["memberships"].update(inputs=[-0.8, 0.0, -0.4, 1.0, 4.0]),
+            "memberships.inputs",
+        ),
+        (
+            lambda d: d["memberships"].update(outputs=[0.2, 0.1, 0.0, -0.1, -0.2]),
+            "memberships.outputs",
+        ),
         (lambda d: d["memberships"].update(ln_scales=[9.0, 0.0]), "memberships.ln_scales"),
         (lambda d: d["memberships"].update(inputs=[-0.8, 0.0]), "memberships.inputs"),
         (lambda d: d["memberships"].pop("outputs"), "memberships.outputs"),
         (lambda d: d["memberships"].update(vertices=[1.0]), "memberships.vertices"),
         (lambda d: d["scores"].pop("random"), "scores.random"),
-        (lambda d: d["scores"]["colony"]["held_out"].pop("nis_ratio"), "scores.colony.held_out.nis_ratio"),
+        (
+            lambda d: d["scores"]["colony"]["held_out"].pop("nis_ratio"),
+            "scores.colony.held_out.nis_ratio",
+        ),
         (lambda d: d["provenance"].pop("command"), "provenance.command"),
         (lambda d: d["provenance"].update(seed=-1), "provenance.seed"),
         (lambda d: d["provenance"]["budget"].update(ants=0), "provenance.budget.ants"),
@@ -117,7 +126,10 @@ def test_the_default_estimator_has_a_shipped_file() -> None:
 
 def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
     document = load(FOLDER / "aco-fckf.json").document
-    held_out = {way: detection_cost(TuningScores(**document.scores[way].held_out.model_dump())) for way in WAYS}
+    held_out = {
+        way: detection_cost(TuningScores(**document.scores[way].held_out.model_dump()))
+        for way in WAYS
+    }
     best = min(WAYS, key=held_out.__getitem__)
     assert document.winner == best
     kept = [Memberships.from_json(one) for one in document.candidates.get(best, [])]
@@ -126,7 +138,10 @@ def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
 
 def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
     scores = load(FOLDER / "paper-aco-fckf.json").document.scores
-    default, colony = scores["default"].held_out.log_likelihood, scores["colony"].held_out.log_likelihood
+    default, colony = (
+        scores["default"].held_out.log_likelihood,
+        scores["colony"].held_out.log_likelihood,
+    )
     assert colony > default + 1.0
     found = study.overall(shipped("paper-aco-fckf"), study.record(study.HELD_OUT))
     assert found == pytest.approx(colony, rel=0.02)
@@ -136,4 +151,6 @@ def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
     """Fails when the filter changed after the tuning: run the command in the file again."""
     document = load(FOLDER / "aco-fckf.json").document
     found = scores_of(shipped("aco-fckf"), record_all("held_out", DURATION_S), "aco-fckf")
-    assert found.interval_score == pytest.approx(document.scores[document.winner].held_out.interval_score, rel=0.02)
+    assert found.interval_score == pytest.approx(
+        document.scores[document.winner].held_out.interval_score, rel=0.02
+    )

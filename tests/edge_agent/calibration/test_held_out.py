@@ -32,7 +32,9 @@ def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
     known = vehicle.calibration
     if known is None:
         return Prediction(0.0, 0.0)
-    likelihood = (1.0 if known.ax is not None else 0.0) - (1.0 if known.radius_fl is not None else 0.0)
+    likelihood = (1.0 if known.ax is not None else 0.0) - (
+        1.0 if known.radius_fl is not None else 0.0
+    )
     return Prediction(likelihood, 0.0)
 
 
@@ -80,6 +82,8 @@ def test_understeer_and_gain_of_the_steering_are_traced_together(drive: Recorded
     compliance = 0.002 * np.where(np.isfinite(v), v, 0.0) * signals[:, S.YAW_RATE]
     signals[:, S.DELTA : S.DELTA + 2] += compliance[:, None]
     soft = trace_steering(prepare(drive.t, signals, drive.vehicle))
-    assert soft["understeer"] - plain["understeer"] == pytest.approx(0.002, abs=2.0 * soft["understeer_std"])
+    assert soft["understeer"] - plain["understeer"] == pytest.approx(
+        0.002, abs=2.0 * soft["understeer_std"]
+    )
     assert soft["understeer"] - plain["understeer"] > 0.001
     assert abs(soft["steer_gain"] - plain["steer_gain"]) < 2.0 * soft["steer_gain_std"]

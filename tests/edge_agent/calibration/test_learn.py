@@ -66,8 +66,14 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
 def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     bad = spoiled(smooth)
     calibration = learn(parts(bad, 3), bad.vehicle)
-    mended = corrected(bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration}))
-    for channel, off in ((S.AX, OFF["ax"]), (S.YAW_RATE, OFF["yaw_rate"]), (S.DELTA, OFF["steer_offset"])):
+    mended = corrected(
+        bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration})
+    )
+    for channel, off in (
+        (S.AX, OFF["ax"]),
+        (S.YAW_RATE, OFF["yaw_rate"]),
+        (S.DELTA, OFF["steer_offset"]),
+    ):
         left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
         assert abs(left) < 0.35 * off
     assert corrected(bad.t, bad.signals, bad.vehicle) is bad.signals
@@ -88,10 +94,16 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
     assert drive.vehicle.drive_split_front == 0.0
     unsaid = drive.vehicle.model_copy(update={"drive_split_front": None})
-    known, blind = ([one_drive(*part, vehicle) for part in parts(drive, 3)] for vehicle in (drive.vehicle, unsaid))
+    known, blind = (
+        [one_drive(*part, vehicle) for part in parts(drive, 3)]
+        for vehicle in (drive.vehicle, unsaid)
+    )
     ours, theirs = weighed(known, drive.vehicle), weighed(blind, unsaid)
     for name in ("radius_fl", "radius_fr", "radius_rl", "radius_rr"):
-        right, wrong = (abs(float(np.median([part[name] for part in estimates]))) for estimates in (known, blind))
+        right, wrong = (
+            abs(float(np.median([part[name] for part in estimates])))
+            for estimates in (known, blind)
+        )
         assert right < 0.6 * wrong
         assert wrong < getattr(theirs, name)[1]
         assert getattr(theirs, name)[1] > getattr(ours, name)[1]
@@ -104,7 +116,11 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     laden = drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1.1})
     plain, more, heavy = (
         learn(parts(one, 3), vehicle).force_gain
-        for one, vehicle in ((drive, drive.vehicle), (scaled(torques, 1.1)(drive), drive.vehicle), (drive, laden))
+        for one, vehicle in (
+            (drive, drive.vehicle),
+            (scaled(torques, 1.1)(drive), drive.vehicle),
+            (drive, laden),
+        )
     )
     assert plain is not None
     assert more is not None
@@ -112,7 +128,9 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     assert abs(plain[0] - 1.0) < 0.08
     for gained in (more, heavy):
         assert gained[0] - plain[0] == pytest.approx(0.1, abs=0.02)
-    vehicle = drive.vehicle.model_copy(update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))})
+    vehicle = drive.vehicle.model_copy(
+        update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))}
+    )
     mended = corrected(drive.t, scaled(torques, 1.1)(drive).signals, vehicle)
     assert np.allclose(mended[:, torques], drive.signals[:, torques], equal_nan=True)
     unsaid = drive.signals.copy()
@@ -120,7 +138,10 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     assert learn([(drive.t, unsaid)], drive.vehicle).force_gain is None
 
 
-WHEELS_AND_STEERING = {"wheel_lag": range(S.OMEGA, S.OMEGA + 4), "steer_lag": range(S.DELTA, S.DELTA + 4)}
+WHEELS_AND_STEERING = {
+    "wheel_lag": range(S.OMEGA, S.OMEGA + 4),
+    "steer_lag": range(S.DELTA, S.DELTA + 4),
+}
 LATE = 8  # samples
 
 
@@ -131,7 +152,9 @@ def late(drive: Recorded, channels: range) -> Recorded:
 
 
 @pytest.mark.parametrize("name", WHEELS_AND_STEERING)
-def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(smooth: Recorded, name: str) -> None:
+def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(
+    smooth: Recorded, name: str
+) -> None:
     seconds = float(smooth.t[LATE] - smooth.t[0])
     bad = late(smooth, WHEELS_AND_STEERING[name])
     before, after = (learn(parts(one, 3), smooth.vehicle) for one in (smooth, bad))
@@ -141,12 +164,20 @@ def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(smooth: 
     known = Calibration.model_validate({"drives": 1, name: (seconds, 0.001)})
     vehicle = bad.vehicle.model_copy(update={"calibration": known})
     mended = corrected(bad.t, bad.signals, vehicle)
-    both = [*WHEELS_AND_STEERING["wheel_lag"], *WHEELS_AND_STEERING["steer_lag"], S.AX, S.AY, S.YAW_RATE]
+    both = [
+        *WHEELS_AND_STEERING["wheel_lag"],
+        *WHEELS_AND_STEERING["steer_lag"],
+        S.AX,
+        S.AY,
+        S.YAW_RATE,
+    ]
     assert np.array_equal(mended[LATE:, both], smooth.signals[:-LATE, both], equal_nan=True)
 
 
 def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> None:
-    known = Calibration(drives=1, wheel_lag=(0.013, 0.001), steer_lag=(-0.041, 0.001), ax=(0.2, 0.01))
+    known = Calibration(
+        drives=1, wheel_lag=(0.013, 0.001), steer_lag=(-0.041, 0.001), ax=(0.2, 0.01)
+    )
     vehicle = smooth.vehicle.model_copy(update={"calibration": known})
     t, signals = smooth.t[:300], smooth.signals[:300]
     whole = corrected(t, signals, vehicle)
@@ -175,14 +206,22 @@ def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:
 
 def write(path: Path, drive: Recorded) -> str:
     columns = {"t": pa.array(drive.t)}
-    columns |= {name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
+    columns |= {
+        name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)
+    }
     pq.write_table(pa.table(columns), path)
     return str(path)
 
 
 @pytest.mark.timeout(600)  # kernels may have to be compiled
-def test_a_calibrated_file_is_written_read_and_heeded(smooth: Recorded, tmp_path: Path, capsys: Output) -> None:
-    log, car, better = write(tmp_path / "a.parquet", spoiled(smooth)), tmp_path / "car.json", tmp_path / "better.json"
+def test_a_calibrated_file_is_written_read_and_heeded(
+    smooth: Recorded, tmp_path: Path, capsys: Output
+) -> None:
+    log, car, better = (
+        write(tmp_path / "a.parquet", spoiled(smooth)),
+        tmp_path / "car.json",
+        tmp_path / "better.json",
+    )
     car.write_text(smooth.vehicle.model_dump_json(exclude_none=True))
     assert main(["calibrate", log, log, "--vehicle", str(car), "--out", str(better)]) == 0
     assert "steer_offset" in capsys.readouterr().out
@@ -192,7 +231,9 @@ def test_a_calibrated_file_is_written_read_and_heeded(smooth: Recorded, tmp_path
     said = []
     for number, file in enumerate((car, better)):
         out = tmp_path / f"{number}.parquet"
-        assert main(["replay", log, "--vehicle", str(file), "--estimator", "ckf", "--out", str(out)]) in (0, 3)
+        assert main(
+            ["replay", log, "--vehicle", str(file), "--estimator", "ckf", "--out", str(out)]
+        ) in (0, 3)
         said.append(pq.read_table(out))
     assert not said[0].equals(said[1])
     wrong = write(tmp_path / "b.parquet", scaled([S.AY], -1.0)(smooth))
@@ -201,9 +242,13 @@ def test_a_calibrated_file_is_written_read_and_heeded(smooth: Recorded, tmp_path
     assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better), "--trust"]) == 0
 
 
-def test_an_old_file_reads_and_an_unknown_quantity_is_refused(smooth: Recorded, tmp_path: Path) -> None:
+def test_an_old_file_reads_and_an_unknown_quantity_is_refused(
+    smooth: Recorded, tmp_path: Path
+) -> None:
     old = json.loads(smooth.vehicle.model_dump_json(exclude_none=True))
     assert Vehicle.model_validate(old).calibration is None
-    (tmp_path / "car.json").write_text(json.dumps(old | {"calibration": {"version": 1, "drives": 1, "az": [0, 1]}}))
+    (tmp_path / "car.json").write_text(
+        json.dumps(old | {"calibration": {"version": 1, "drives": 1, "az": [0, 1]}})
+    )
     with pytest.raises(InputError, match="az"):
         load_vehicle(tmp_path / "car.json")

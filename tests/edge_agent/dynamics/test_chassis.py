@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
+from edge_agent.dynamics.chassis import (
+    DUGOFF,
+    PlanarMotion,
+    WheelInputs,
+    response,
+    tyre_forces,
+    wheel_inputs,
+)
 from edge_agent.dynamics.drive_wheel import ELECTRIC_S, WheelState, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body, four, parameter_row
@@ -38,7 +45,9 @@ def test_no_wheel_has_more_than_its_friction_and_stiff_ones_have_it_almost(shape
 
 
 def test_the_shape_of_the_curve_matters() -> None:
-    assert not np.allclose(forces(DUGOFF, 0.5, np.full(4, 57.0))[1], forces(1.4, 0.5, np.full(4, 57.0))[1])
+    assert not np.allclose(
+        forces(DUGOFF, 0.5, np.full(4, 57.0))[1], forces(1.4, 0.5, np.full(4, 57.0))[1]
+    )
 
 
 def test_a_wheel_without_speed_rolls_freely() -> None:
@@ -51,13 +60,19 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
 
     def felt(known: FloatArray) -> tuple[float, float, float]:
         cos, sin, mu = four(inputs[:, 0]), four(inputs[:, 1]), (0.8, 0.8, 0.8, 0.8)
-        return response(body(ROW), PlanarMotion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu))
+        return response(
+            body(ROW), PlanarMotion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu)
+        )
 
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
-    assert felt(UNKNOWN) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
+    assert felt(UNKNOWN) == pytest.approx(
+        accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
+    )
     tyre_x[:2] = 100.0, 200.0
     known = np.array([100.0, 200.0, np.nan, np.nan])
-    assert felt(known) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
+    assert felt(known) == pytest.approx(
+        accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
+    )
 
 
 def test_brush_curve_begins_with_slope_one_and_saturates_at_three() -> None:

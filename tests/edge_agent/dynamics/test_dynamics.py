@@ -43,7 +43,9 @@ def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
 
 def test_inverse_curve_undoes_it_and_knows_no_slip_beyond_the_peak() -> None:
     for rho in (-0.95, -0.2, 0.0, 0.5, 0.99):
-        assert tyres.magic_formula(tyres.magic_formula_inverse(rho, 1.4), 1.4, 0.0) == pytest.approx(rho, abs=1e-12)
+        assert tyres.magic_formula(
+            tyres.magic_formula_inverse(rho, 1.4), 1.4, 0.0
+        ) == pytest.approx(rho, abs=1e-12)
     assert tyres.magic_formula_inverse(1.0, 1.4) == math.inf
 
 
@@ -57,8 +59,12 @@ def test_slip_stiffness_does_not_depend_on_friction() -> None:
 def test_no_combination_of_slips_gives_more_than_the_friction_circle() -> None:
     rng = np.random.default_rng(3)
     for x, y in rng.normal(0.0, 0.2, (200, 2)):
-        assert math.hypot(*tyres.combined_magic((x, y), (6e4, 5e4), 0.4, 3000.0, 1.6, 0.2)) <= 1200.0 * (1 + 1e-12)
-        assert math.hypot(*tyres.combined_dugoff((x, y), (6e4, 5e4), 0.4, 3000.0)) <= 1200.0 * (1 + 1e-12)
+        assert math.hypot(
+            *tyres.combined_magic((x, y), (6e4, 5e4), 0.4, 3000.0, 1.6, 0.2)
+        ) <= 1200.0 * (1 + 1e-12)
+        assert math.hypot(*tyres.combined_dugoff((x, y), (6e4, 5e4), 0.4, 3000.0)) <= 1200.0 * (
+            1 + 1e-12
+        )
 
 
 def test_wheel_loads_carry_the_weight_and_a_left_turn_loads_the_right() -> None:
@@ -102,11 +108,16 @@ def test_the_rotation_has_no_seam_where_the_yaw_rate_vanishes() -> None:
 
 def test_wheel_torque_balance_closes() -> None:
     force = wheel.force_from_torque(400.0, 12.0, CAR.wheel_inertia, CAR.wheel_radius)
-    assert wheel.wheel_acceleration(400.0, force, CAR.wheel_inertia, CAR.wheel_radius) == pytest.approx(12.0)
+    assert wheel.wheel_acceleration(
+        400.0, force, CAR.wheel_inertia, CAR.wheel_radius
+    ) == pytest.approx(12.0)
 
 
 def test_every_parameter_of_the_row_has_its_place() -> None:
     assert ROW.shape == (len(Parameter),)
     assert ROW[Parameter.SLOPE_X] == pytest.approx(6e4 / (1200.0 * GRAVITY / 4))
     assert math.isnan(ROW[Parameter.DRIVE_FRONT])
-    assert parameter_row(CAR.model_copy(update={"drive_split_front": 0.4}))[Parameter.DRIVE_FRONT] == 0.4
+    assert (
+        parameter_row(CAR.model_copy(update={"drive_split_front": 0.4}))[Parameter.DRIVE_FRONT]
+        == 0.4
+    )

@@ -20,7 +20,11 @@ def drive(
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
     """t (T,) [s], signals (T, 18), nominal vehicle of a manoeuvre with ordinary sensors; its own friction if None."""
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
-    return log["t"].to_numpy(), np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float), vehicle
+    return (
+        log["t"].to_numpy(),
+        np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float),
+        vehicle,
+    )
 
 
 def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:

@@ -21,7 +21,9 @@ from tests.edge_agent.estimators.drives import drive, joined
 PRIOR_WIDTH = 0.9 * 1.15
 
 
-def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: FloatArray | None = None) -> Estimates:
+def run(
+    name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: FloatArray | None = None
+) -> Estimates:
     bank = create(name, [vehicle], memberships=Memberships())  # type: ignore[list-item]
     ends = None if closes is None else closes.astype(bool)[:, None]
     return bank.advance(t[:, None], signals[:, None], ends)
@@ -70,7 +72,9 @@ def test_however_the_samples_are_cut_the_numbers_are_the_same() -> None:
     cuts = [0, 1, 2, 5, 6, 83, 200, 201, 599, len(t)]
     parts = [bank.advance(t[a:b, None], signals[a:b, None]) for a, b in pairwise(cuts)]
     for name in COLUMNS:
-        assert np.array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name)), name
+        assert np.array_equal(
+            np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name)
+        ), name
 
 
 def test_closing_visits_does_not_change_the_estimates() -> None:
@@ -109,7 +113,9 @@ def test_a_visit_straight_on_is_flat() -> None:
     assert np.ptp(reported.evidence[500, 0]) < 0.2
 
 
-def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anything_above() -> None:
+def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anything_above() -> (
+    None
+):
     t, signals, vehicle = drive("gentle-braking", 0.85)
     closes = np.zeros(len(t), bool)
     end = int(np.searchsorted(t, 4.0))
@@ -206,18 +212,26 @@ def test_the_adaptation_is_what_tells_the_estimators_apart() -> None:
 
 def test_noisier_scales_give_wider_velocities() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
-    wide = create("ckf", [vehicle], memberships=Memberships(ln_scales=(1.0, 1.0))).advance(t[:, None], signals[:, None])
+    wide = create("ckf", [vehicle], memberships=Memberships(ln_scales=(1.0, 1.0))).advance(
+        t[:, None], signals[:, None]
+    )
     assert wide.vx_std[-1, 0] > run("ckf", t, signals, vehicle).vx_std[-1, 0]
 
 
 @pytest.mark.parametrize(
     ("name", "shape", "field"),
-    [("aco-fckf-2", (3, 1, 18), "estimator"), ("ckf", (3, 2, 18), "signals"), ("ckf", (3, 1, 17), "signals")],
+    [
+        ("aco-fckf-2", (3, 1, 18), "estimator"),
+        ("ckf", (3, 2, 18), "signals"),
+        ("ckf", (3, 1, 17), "signals"),
+    ],
 )
 def test_misuse_is_refused_by_name(name: str, shape: tuple[int, ...], field: str) -> None:
     vehicle = drive("slalom", 0.3, seconds=2.0)[2]
     with pytest.raises(InputError, match=field):
-        create(name, [vehicle], memberships=Memberships()).advance(np.zeros((3, 1)), np.zeros(shape))
+        create(name, [vehicle], memberships=Memberships()).advance(
+            np.zeros((3, 1)), np.zeros(shape)
+        )
 
 
 def test_a_bank_of_no_vehicles_is_refused() -> None:

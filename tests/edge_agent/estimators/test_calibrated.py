@@ -16,11 +16,14 @@ NOMINAL = nominal_states(Constants())
 
 
 def test_each_learned_quantity_narrows_its_state_and_a_vague_one_does_not() -> None:
-    vague = Calibration.model_validate({"drives": 1, **{quantity: (0.0, 10.0) for quantity, _ in LEARNED.values()}})
+    vague = Calibration.model_validate(
+        {"drives": 1, **{quantity: (0.0, 10.0) for quantity, _ in LEARNED.values()}}
+    )
     for state, (quantity, each_drive) in LEARNED.items():
         sharp = Calibration.model_validate({"drives": 1, quantity: (0.0, 1e-6)})
         plain, unsure, known = spreads_of(
-            [CAR.model_copy(update={"calibration": one}) for one in (None, vague, sharp)], NOMINAL.std
+            [CAR.model_copy(update={"calibration": one}) for one in (None, vague, sharp)],
+            NOMINAL.std,
         )
         assert np.array_equal(plain, NOMINAL.std)
         assert np.array_equal(unsure, NOMINAL.std)
@@ -30,7 +33,9 @@ def test_each_learned_quantity_narrows_its_state_and_a_vague_one_does_not() -> N
 
 def test_each_filter_of_a_bank_has_the_prior_of_its_own_vehicle() -> None:
     known = CAR.model_copy(update={"calibration": Calibration(drives=3, ax=(0.2, 0.05))})
-    filters = new_filters(np.zeros((2, 12)), NOMINAL, NOMINAL.mean, spreads_of([CAR, known], NOMINAL.std))
+    filters = new_filters(
+        np.zeros((2, 12)), NOMINAL, NOMINAL.mean, spreads_of([CAR, known], NOMINAL.std)
+    )
     spreads = filters["nominal"]["std"]
     assert spreads.shape == (2, STATES)
     assert spreads[0, NodeState.BIAS_X] == Constants().bias_x_std

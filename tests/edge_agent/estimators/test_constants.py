@@ -55,7 +55,9 @@ MOVES = {
     "demand_half": Move(
         "least probabilities", "braking", 0.3
     ),  # what is not taken as evidence is charged to more nodes
-    "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
+    "demand_power": Move(
+        "penalty", "acceleration", 0.5
+    ),  # above the threshold all is evidence, nothing is charged
     "plausible_loss": Move("least probabilities", "constant-radius", 1.1),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
@@ -63,12 +65,20 @@ MOVES = {
     "abrupt_time": Move("upper", "joints", 0.99, LESS),  # ... sooner
     "steady_half": Move("width", "constant-radius", 1.05),
     "steady_share": Move("std VY", "constant-radius", 0.9),
-    "sliding_slope": Move("upper", "constant-radius", 1.08),  # more nodes pay for sliding: those of little friction
+    "sliding_slope": Move(
+        "upper", "constant-radius", 1.08
+    ),  # more nodes pay for sliding: those of little friction
     "sliding_penalty": Move("lower", "constant-radius", 1.03),
-    "axle_penalty": Move("upper", "constant-radius", 0.8),  # saturated nodes, of little friction, gain
+    "axle_penalty": Move(
+        "upper", "constant-radius", 0.8
+    ),  # saturated nodes, of little friction, gain
     # limits
-    "farthest": Move("penalty", "braking", 0.5, LESS),  # nodes may not go to where they would be charged
-    "huber": Move("nis", "stopping", 5.0, LESS),  # R is inflated by what is refused, and follows it less
+    "farthest": Move(
+        "penalty", "braking", 0.5, LESS
+    ),  # nodes may not go to where they would be charged
+    "huber": Move(
+        "nis", "stopping", 5.0, LESS
+    ),  # R is inflated by what is refused, and follows it less
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
     # the tyre and the vehicle: what a sharper curve explains is not explained by a sharper tyre
@@ -79,18 +89,26 @@ MOVES = {
     "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
     "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
     "stiffness_time": Move("std STEER", "turn and straight", 0.88),
-    "stiffness_power_x": Move("nis", "acceleration", 0.6),  # the residual of a stiff tyre is divided by more
+    "stiffness_power_x": Move(
+        "nis", "acceleration", 0.6
+    ),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
     "informing_x": Move("std LN_KX", "j-turn", 1.05),
     "informing_y": Move("std LN_KY", "pulses", 1.15),
     "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
-    "compliance_mean": Move("strain", "constant-radius", 1.1),  # a car whose axle does not yield is not as expected
+    "compliance_mean": Move(
+        "strain", "constant-radius", 1.1
+    ),  # a car whose axle does not yield is not as expected
     "compliance_std": Move("std COMPLIANCE", "stopping", 2.5),
-    "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),  # they are forgotten sooner
+    "steer_time": Move(
+        "std COMPLIANCE", "constant-radius", 1.02, LESS
+    ),  # they are forgotten sooner
     "spin_share": Move("nis", "braking", 0.9),
     # wheels that slide
     "slip_time": Move("least probabilities", "acceleration", 1.04, LESS),
-    "slip_change": Move("least probabilities", "acceleration", 1.1),  # the road may be any other sooner
+    "slip_change": Move(
+        "least probabilities", "acceleration", 1.1
+    ),  # the road may be any other sooner
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     "rear_unlike": Move("adaptation", "acceleration", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
@@ -154,9 +172,13 @@ MOVES = {
     "strain_most": Move("vy_std", "rough acceleration", 0.9, LESS),
     "odd_least": Move("distrust", "side force without turning", 0.98),  # it is believed later
     "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
-    "distrust_noise": Move("nis", "side force without turning", 0.97, LESS),  # it no longer follows what it distrusts
+    "distrust_noise": Move(
+        "nis", "side force without turning", 0.97, LESS
+    ),  # it no longer follows what it distrusts
     "distrust_drift": Move("vy_std", "side force without turning", 1.5),
-    "distrust_forget": Move("std RADIUS", "side force without turning", 0.9),  # what was learned is kept for longer
+    "distrust_forget": Move(
+        "std RADIUS", "side force without turning", 0.9
+    ),  # what was learned is kept for longer
 }
 
 
@@ -187,7 +209,11 @@ def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
         log, vehicle = simulate_manoeuvre(
             "acceleration", mu=0.8, seed=1, duration_s=12.0, sensors="rough", road="hilly"
         )
-        return log["t"].to_numpy(), np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float), vehicle
+        return (
+            log["t"].to_numpy(),
+            np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float),
+            vehicle,
+        )
     return made_up(name)
 
 
@@ -215,7 +241,9 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
     constants = Constants()
     if name is not None:
         constants = constants._replace(**{name: times * getattr(constants, name)})
-    bank = mixture_bank(parameter_table([vehicle]), design_of(Memberships(), adaptive=True, constants=constants))
+    bank = mixture_bank(
+        parameter_table([vehicle]), design_of(Memberships(), adaptive=True, constants=constants)
+    )
     parts, looks = [], []
     for k in range(0, len(t), CUT):
         parts.append(bank.advance(t[k : k + CUT, None], signals[k : k + CUT, None]).values)
@@ -244,7 +272,9 @@ def inside(filters: np.ndarray) -> dict[str, float]:
     weight, split = filters["weight"], filters["split"]
     chain, halves = weight[:, :NODES], weight[split][:, NODES:].sum(axis=1)
     best = chain.argmax(axis=1)
-    apart = np.abs(filters["mean"][:, :NODES, :2] - filters["mean"][np.arange(len(best)), best][:, None, :2])
+    apart = np.abs(
+        filters["mean"][:, :NODES, :2] - filters["mean"][np.arange(len(best)), best][:, None, :2]
+    )
     overall = filters["overall_mean"]
     std, mean = np.sqrt(np.diag(filters["overall_covariance"][-1])), overall[-1]
     rolling, trust = filters["rolling"], filters["trust"]
@@ -288,7 +318,11 @@ def test_every_constant_has_its_move() -> None:
 @pytest.mark.parametrize("name", MOVES)
 def test_a_constant_moves_what_it_is_for_in_its_direction_and_by_its_size(name: str) -> None:
     move = MOVES[name]
-    usual, changed = (figures(move.drive, *one)[move.figure] for one in ((None, 1.0), (name, move.times)))
+    usual, changed = (
+        figures(move.drive, *one)[move.figure] for one in ((None, 1.0), (name, move.times))
+    )
     assert usual > 0.0
     ratio = changed / usual
-    assert ratio >= move.ratio if move.ratio > 1.0 else ratio <= move.ratio, f"{move.figure} times {ratio:.3f}"
+    assert ratio >= move.ratio if move.ratio > 1.0 else ratio <= move.ratio, (
+        f"{move.figure} times {ratio:.3f}"
+    )

@@ -25,7 +25,8 @@ LISTS = {
     "004": paper_aco_fckf.ELEMENTS,
 }
 SOURCE = "\n".join(
-    f"{path.relative_to(ROOT).as_posix()}\n{path.read_text()}" for path in (ROOT / "edge_agent").rglob("*.py")
+    f"{path.relative_to(ROOT).as_posix()}\n{path.read_text()}"
+    for path in (ROOT / "edge_agent").rglob("*.py")
 )
 
 

@@ -37,7 +37,9 @@ def one_sample(speed: float) -> GivenMotion:
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2
     signals[0, S.DELTA : S.DELTA + 2] = 0.05
     signals[0, S.OMEGA : S.OMEGA + 4] = speed / PRESETS["sedan"].vehicle.wheel_radius * 1.01
-    return GivenMotion(PRESETS["sedan"].vehicle, np.zeros(1), np.array([speed]), np.array([0.3]), signals)
+    return GivenMotion(
+        PRESETS["sedan"].vehicle, np.zeros(1), np.array([speed]), np.array([0.3]), signals
+    )
 
 
 @pytest.mark.parametrize("proportional", [False, True])
@@ -47,7 +49,9 @@ def test_tyres_are_those_of_the_compiled_model(proportional: bool) -> None:
     row[Parameter.PROPORTIONAL] = float(proportional)
     mu = np.array([0.3, 0.5, 0.7, 0.9])
     x, y = np.empty(4), np.empty(4)
-    wheels = wheel_inputs(given.signals[0, S.DELTA : S.DELTA + 4], given.signals[0, S.OMEGA : S.OMEGA + 4])
+    wheels = wheel_inputs(
+        given.signals[0, S.DELTA : S.DELTA + 4], given.signals[0, S.OMEGA : S.OMEGA + 4]
+    )
     tyre_forces(row, np.array([15.0, 0.3, 0.2, 1.0, 2.0]), wheels, mu, DUGOFF, x, y)
     found = WheelForces.of(given, proportional=proportional, single=False).tyre(0, mu[None])[0]
     assert found[:, 0] == pytest.approx(x, rel=1e-12)
@@ -66,7 +70,9 @@ def test_turn_reaches_the_printed_error_and_three_signals_do_not(
 
 def test_both_forms_agree_in_double_precision_alone(turn: tuple[GivenMotion, FloatArray]) -> None:
     given, truth = turn
-    root, double, single = (wheel_friction_ukf.estimate(given, one) for one in (AS_PRINTED, UKF, UKF_SINGLE))
+    root, double, single = (
+        wheel_friction_ukf.estimate(given, one) for one in (AS_PRINTED, UKF, UKF_SINGLE)
+    )
     assert np.abs(root.mu - double.mu).max() < 1e-3
     assert double.lost == 0.0
     assert single.lost > 0.5
@@ -82,7 +88,10 @@ def test_square_root_form_survives_single_precision(turn: tuple[GivenMotion, Flo
 
 def test_alpha_of_one_gives_the_same_result(turn: tuple[GivenMotion, FloatArray]) -> None:
     given, _ = turn
-    small, large = (wheel_friction_ukf.estimate(given, AS_PRINTED._replace(alpha=alpha)).mu for alpha in (1e-3, 1.0))
+    small, large = (
+        wheel_friction_ukf.estimate(given, AS_PRINTED._replace(alpha=alpha)).mu
+        for alpha in (1e-3, 1.0)
+    )
     assert np.abs(small - large).max() < 1e-6
 
 

@@ -13,7 +13,12 @@ from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
 from edge_agent.estimators.friction_mixture.node_filter import take_rows, unfelt
 from edge_agent.estimators.friction_mixture.split_sides import project, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import curve_tables, magic_formulas, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.tyre_curve import (
+    curve_tables,
+    magic_formulas,
+    ratio_at,
+    theta_at,
+)
 from edge_agent.estimators.friction_mixture.workspace import NodeWorkspace
 from schemas.runtime.records import records
 
@@ -27,13 +32,21 @@ def covariance(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("missing", [(), (1,), (0, 4)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_rows_taken_in_one_by_one_are_the_textbook_s_update(seed: int, missing: tuple[int, ...]) -> None:
+def test_rows_taken_in_one_by_one_are_the_textbook_s_update(
+    seed: int, missing: tuple[int, ...]
+) -> None:
     rng = np.random.default_rng(seed)
-    before, mean, node = np.linalg.cholesky(covariance(seed)), rng.normal(size=STATES), records(NodeWorkspace, 1)[0]
+    before, mean, node = (
+        np.linalg.cholesky(covariance(seed)),
+        rng.normal(size=STATES),
+        records(NodeWorkspace, 1)[0],
+    )
     # deviations that only the first ACTIVE axes of the factor see: rows = H*x with H = A*L^-1
     node["deviation"] = rng.normal(size=(ROWS, ACTIVE))
     node["residual"], node["inflated"] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
-    a, v, r = (np.delete(node[name], missing, axis=0) for name in ("deviation", "residual", "inflated"))
+    a, v, r = (
+        np.delete(node[name], missing, axis=0) for name in ("deviation", "residual", "inflated")
+    )
     node["residual"][list(missing)] = np.nan
     spread = a @ a.T + np.diag(r)
     cross = before[:, :ACTIVE] @ a.T
@@ -63,7 +76,9 @@ def test_far_beyond_the_table_a_spinning_wheel_still_has_the_force_of_sliding() 
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, 1.0])
-def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have(slope: float) -> None:
+def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have(
+    slope: float,
+) -> None:
     rng = np.random.default_rng(0)
     slip, force = rng.normal(0.0, 0.03, 100_000), rng.normal(0.0, 0.01, 100_000)
     distance = (force - slope * slip) / np.hypot(1.0, slope)
@@ -71,14 +86,19 @@ def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have
     assert distance.var() == pytest.approx(felt, rel=0.02)
 
 
-def test_the_densities_of_split_nodes_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> None:
+def test_the_densities_of_split_nodes_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> (
+    None
+):
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     for side in range(2):
         middles = np.unique(sides.mu[NODES:, side])
         for one, next_one in pairwise(middles):
             between = np.searchsorted(mu, 0.5 * (one + next_one))
-            held = [sides.share[side][sides.mu[NODES:, side] == place][0][between] for place in (one, next_one)]
+            held = [
+                sides.share[side][sides.mu[NODES:, side] == place][0][between]
+                for place in (one, next_one)
+            ]
             assert min(held) > 0.0
 
 

@@ -9,7 +9,13 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.estimators import Estimates, adaptive_federated_ckf, compensated_wckf, create, paper_aco_fckf
+from edge_agent.estimators import (
+    Estimates,
+    adaptive_federated_ckf,
+    compensated_wckf,
+    create,
+    paper_aco_fckf,
+)
 from edge_agent.estimators.estimates import COLUMNS
 from edge_agent.estimators.paper_aco_fckf import Setting
 from edge_agent.observe.cell_tracker import locate, new_tracks
@@ -58,9 +64,14 @@ def test_a_vehicle_has_the_same_numbers_alone_and_among_many(name: str) -> None:
 def test_however_the_samples_are_cut_the_numbers_are_the_same_and_causal(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=1.5)
     whole, bank = run(name, t, signals, vehicle), bank_of(name, [vehicle])
-    parts = [bank.advance(t[a:b, None], signals[a:b, None]) for a, b in pairwise([0, 1, 2, 37, 90, len(t)])]
+    parts = [
+        bank.advance(t[a:b, None], signals[a:b, None])
+        for a, b in pairwise([0, 1, 2, 37, 90, len(t)])
+    ]
     for array in COLUMNS:
-        assert np.array_equal(np.concatenate([getattr(p, array) for p in parts]), getattr(whole, array)), array
+        assert np.array_equal(
+            np.concatenate([getattr(p, array) for p in parts]), getattr(whole, array)
+        ), array
     if whole.mu_wheel is not None:
         wheels = [p.mu_wheel for p in parts if p.mu_wheel is not None]
         assert np.array_equal(np.concatenate(wheels), whole.mu_wheel)
@@ -95,7 +106,9 @@ def test_without_evidence_the_observer_tells_friction_with_its_interval(name: st
     t, signals = t[:, None], signals[:, None]
     _, located = locate(new_tracks(1), t, signals)
     reported = bank_of(name, [vehicle]).advance(t, signals, located.closes)
-    _, output, _ = observe(OpenVisits.start(1), (t * 1e9).astype(np.int64), located, reported, AgentConfig())
+    _, output, _ = observe(
+        OpenVisits.start(1), (t * 1e9).astype(np.int64), located, reported, AgentConfig()
+    )
     assert len(output.vehicle) > 0
     assert output.columns["log_likelihood"].shape == (len(output.vehicle), 0)
     assert (output.columns["mu_lower"] < output.columns["mu_upper"]).all()
@@ -113,7 +126,9 @@ def test_friction_that_is_set_and_not_estimated_is_told_as_the_prior(name: str) 
 def test_the_friction_that_is_set_matters_where_tyres_bend(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     module = adaptive_federated_ckf if name == "adaptive-federated-ckf" else compensated_wckf
-    right, wrong = (module.bank([vehicle], mu).advance(t[:, None], signals[:, None]) for mu in (0.3, 0.9))
+    right, wrong = (
+        module.bank([vehicle], mu).advance(t[:, None], signals[:, None]) for mu in (0.3, 0.9)
+    )
     assert right.innovation_nis.mean() < wrong.innovation_nis.mean()
 
 
@@ -122,7 +137,9 @@ def test_straight_on_at_constant_speed_every_wheel_is_as_unknown_as_before(name:
     t, signals, vehicle = drive("straight", 0.85, seconds=10.0)
     reported = run(name, t, signals, vehicle)
     assert reported.mu_wheel is not None
-    assert (reported.mu_wheel[-1, 0, :, 2] - reported.mu_wheel[-1, 0, :, 1] >= 0.8 * PRIOR_WIDTH).all()
+    assert (
+        reported.mu_wheel[-1, 0, :, 2] - reported.mu_wheel[-1, 0, :, 1] >= 0.8 * PRIOR_WIDTH
+    ).all()
 
 
 def test_with_wheel_torque_the_unscented_filter_finds_the_friction_of_a_slalom_on_snow() -> None:
@@ -134,7 +151,9 @@ def test_with_wheel_torque_the_unscented_filter_finds_the_friction_of_a_slalom_o
     broken[:, S.TORQUE : S.TORQUE + 4] = np.nan
     less = run("sr-ukf", t, broken, vehicle)
     assert (less.health & int(Health.NO_TORQUE)).all()
-    assert (less.mu_upper - less.mu_lower)[300:].mean() > (reported.mu_upper - reported.mu_lower)[300:].mean()
+    assert (less.mu_upper - less.mu_lower)[300:].mean() > (reported.mu_upper - reported.mu_lower)[
+        300:
+    ].mean()
 
 
 @pytest.mark.parametrize(
@@ -160,7 +179,9 @@ def test_every_setting_of_the_papers_filter_matters(change: dict[str, object]) -
 def test_the_fuzzy_sets_matter_to_the_papers_filter_and_are_refused_where_there_are_none() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
     still = Memberships(outputs=(0.0, 0.0, 0.0, 0.0, 0.0))
-    reported = create("paper-aco-fckf", [vehicle], memberships=still).advance(t[:, None], signals[:, None])
+    reported = create("paper-aco-fckf", [vehicle], memberships=still).advance(
+        t[:, None], signals[:, None]
+    )
     assert (reported.adaptation == 1.0).all()
     assert (run("paper-aco-fckf", t, signals, vehicle).adaptation != 1.0).any()
     with pytest.raises(InputError, match="memberships"):
@@ -173,4 +194,6 @@ def test_misuse_is_refused_by_name(shape: tuple[int, ...], field: str) -> None:
     with pytest.raises(InputError, match=field):
         bank_of("paper-aco-fckf", [vehicle]).advance(np.zeros((3, 1)), np.zeros(shape))
     with pytest.raises(InputError, match="closes"):
-        create("sr-ukf", [vehicle]).advance(np.zeros((3, 1)), np.zeros((3, 1, 18)), np.zeros((2, 1), bool))
+        create("sr-ukf", [vehicle]).advance(
+            np.zeros((3, 1)), np.zeros((3, 1, 18)), np.zeros((2, 1), bool)
+        )

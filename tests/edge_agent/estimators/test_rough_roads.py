@@ -50,7 +50,9 @@ def test_a_car_that_starts_after_it_stood_is_not_held_back() -> None:
     go = signals.copy()
     go[:, S.AX] += 0.3
     go[:, OMEGA] -= go[:1, OMEGA]  # as from standstill
-    said = run(np.concatenate([rest, t - t[0] + 5.0]), np.concatenate([still, without_torque(go)]), vehicle)
+    said = run(
+        np.concatenate([rest, t - t[0] + 5.0]), np.concatenate([still, without_torque(go)]), vehicle
+    )
     gained = vehicle.wheel_radius * (go[-50:, OMEGA].mean())
     assert abs(said.vx[-50:].mean() - gained) < 0.1 * gained
 
@@ -102,7 +104,11 @@ def test_steering_that_is_late_contradicts_and_then_the_interval_is_the_priors()
 
 def test_a_wheel_speed_that_is_decoded_wrong_is_refused() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=8.0)
-    wrong, silent, hit = signals.copy(), signals.copy(), np.random.default_rng(5).random(len(t)) < 0.7
+    wrong, silent, hit = (
+        signals.copy(),
+        signals.copy(),
+        np.random.default_rng(5).random(len(t)) < 0.7,
+    )
     wrong[hit, S.OMEGA] += 142.0 / vehicle.wheel_radius
     silent[hit, S.OMEGA] = np.nan
     said = run(t, wrong, vehicle)

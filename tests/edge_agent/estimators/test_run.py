@@ -18,5 +18,7 @@ print(sum(sr_ukf.KERNEL.stats.cache_hits.values()))
 
 def test_a_new_process_finds_the_kernel_that_another_has_compiled() -> None:
     for process in range(2):
-        out = subprocess.run([sys.executable, "-c", WORDS], check=True, capture_output=True, text=True).stdout
+        out = subprocess.run(
+            [sys.executable, "-c", WORDS], check=True, capture_output=True, text=True
+        ).stdout
         assert process == 0 or out.strip() == "1"

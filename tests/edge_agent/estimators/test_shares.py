@@ -33,6 +33,9 @@ def test_two_threads_give_the_numbers_of_one_bit_for_bit(name: str) -> None:
     crowd = np.repeat(signals[:, None], count, axis=1)
     crowd += 0.01 * np.random.default_rng(0).normal(size=(1, count, crowd.shape[2]))
     times = np.repeat(t[:, None], count, axis=1)
-    reported = [bank_of(name, [vehicle] * count).advance(times, crowd, threads=threads) for threads in (1, 2)]
+    reported = [
+        bank_of(name, [vehicle] * count).advance(times, crowd, threads=threads)
+        for threads in (1, 2)
+    ]
     for array in COLUMNS:
         assert np.array_equal(getattr(reported[0], array), getattr(reported[1], array)), array

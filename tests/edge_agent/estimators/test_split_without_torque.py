@@ -27,12 +27,16 @@ def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
             signals[:, first : first + 4] = signals[:, [first + 1, first, first + 3, first + 2]]
         signals[:, S.DELTA : S.DELTA + 4] *= -1.0
     t = log["t"].to_numpy()
-    return log["true_vx"].to_numpy(), bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+    return log["true_vx"].to_numpy(), bank_of("aco-fckf", [vehicle]).advance(
+        t[:, None], signals[:, None]
+    )
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_split_stop_without_torque_tells_the_sides_and_the_speed(seed: int, *, mirrored: bool) -> None:
+def test_split_stop_without_torque_tells_the_sides_and_the_speed(
+    seed: int, *, mirrored: bool
+) -> None:
     vx, estimates = stop(seed, mirrored=mirrored)
     judged = slice(int(FIRST_SIDES * len(vx)), int(LAST_SIDES * len(vx)))
     wheels = estimates.mu_wheel
@@ -41,4 +45,6 @@ def test_split_stop_without_torque_tells_the_sides_and_the_speed(seed: int, *, m
     assert snow[2] < 0.45 < dry[0]  # the upper end of the snow, the median of the dry side
     assert snow[1] < SNOW < snow[2]
     assert dry[1] < DRY < dry[2]
-    assert np.sqrt(np.mean((estimates.vx[judged, 0] - vx[judged]) ** 2)) < 0.08  # [m/s]; .3 without the yaw balance
+    assert (
+        np.sqrt(np.mean((estimates.vx[judged, 0] - vx[judged]) ** 2)) < 0.08
+    )  # [m/s]; .3 without the yaw balance

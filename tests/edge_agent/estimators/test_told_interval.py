@@ -41,11 +41,19 @@ def _tell(
     return friction.lower, friction.median, friction.upper
 
 
-def told(weight: FloatArray, patch: float = 0.0, likeness: float = 0.0) -> tuple[float, float, float]:
+def told(
+    weight: FloatArray, patch: float = 0.0, likeness: float = 0.0
+) -> tuple[float, float, float]:
     """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so like its file."""
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
-    return _tell(contexts, records(MixtureMemory, 1), weight, np.full(PATCH_NODES, patch / PATCH_NODES), likeness)
+    return _tell(
+        contexts,
+        records(MixtureMemory, 1),
+        weight,
+        np.full(PATCH_NODES, patch / PATCH_NODES),
+        likeness,
+    )
 
 
 def about(mu: float, width: float) -> FloatArray:
@@ -62,7 +70,9 @@ def test_who_knows_nothing_tells_the_prior() -> None:
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.3, 0.5, 0.8])
-def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_as_much(mu: float) -> None:
+def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_as_much(
+    mu: float,
+) -> None:
     weight = about(mu, 0.1)
     rough, alike = told(weight), told(weight, likeness=0.7)
     assert alike[:2] == rough[:2]
@@ -88,7 +98,9 @@ def test_a_long_upper_tail_is_not_cut_off() -> None:
 def test_slippery_for_sure_is_said_at_its_own_level_only(mu: float) -> None:
     weight = about(mu, 0.08)
     _, _, upper = told(weight)
-    assert (upper < SLIPPERY_MU) == (quantile(DESIGN.mu, DESIGN.prior, weight, SURE_END) < SLIPPERY_MU)
+    assert (upper < SLIPPERY_MU) == (
+        quantile(DESIGN.mu, DESIGN.prior, weight, SURE_END) < SLIPPERY_MU
+    )
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:

@@ -34,7 +34,9 @@ def believing(*, strained: float = 1.0, odd: float = 0.0) -> Trust:
     return cast(Trust, trust[0])  # as a kernel sees it
 
 
-def after(signals: FloatArray, t: FloatArray, vehicle: object, *, adaptive: bool = True) -> tuple[np.void, BoolArray]:
+def after(
+    signals: FloatArray, t: FloatArray, vehicle: object, *, adaptive: bool = True
+) -> tuple[np.void, BoolArray]:
     bank = mixture_bank(
         parameter_table([vehicle]),  # type: ignore[list-item]
         design_of(Memberships(), adaptive=adaptive),
@@ -52,7 +54,10 @@ def test_strain_is_one_where_nothing_was_learned_and_chi_square_over_freedom_of_
 def test_axles_are_surer_in_a_car_that_is_as_its_file_says_and_within_limits() -> None:
     usual = CONSTANTS.strain_usual
     assert strained_noise(believing(strained=usual), CONSTANTS) == pytest.approx(1.0)
-    noise = [strained_noise(believing(strained=share * usual), CONSTANTS) for share in (0.01, 0.8, 1.2, 100.0)]
+    noise = [
+        strained_noise(believing(strained=share * usual), CONSTANTS)
+        for share in (0.01, 0.8, 1.2, 100.0)
+    ]
     assert noise == sorted(noise)
     assert (noise[0], noise[-1]) == (CONSTANTS.strain_least, CONSTANTS.strain_most)
 
@@ -62,7 +67,10 @@ def test_innovations_as_stated_speak_for_the_model_and_thrice_as_large_ones_agai
 
 
 def test_evidence_is_believed_less_and_less_until_the_brink_and_then_not_at_all() -> None:
-    shares = [credence(believing(odd=share * CONSTANTS.odd_least), CONSTANTS) for share in (0.0, 0.3, 0.8, 1.0, 2.0)]
+    shares = [
+        credence(believing(odd=share * CONSTANTS.odd_least), CONSTANTS)
+        for share in (0.0, 0.3, 0.8, 1.0, 2.0)
+    ]
     assert shares[0] == 1.0
     assert shares[-2:] == [0.0, 0.0]
     assert shares == sorted(shares, reverse=True)
@@ -85,7 +93,9 @@ def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
     assert trust["odd"] < CONSTANTS.odd_least
 
 
-def test_side_force_that_nothing_turns_contradicts_for_as_long_as_patience_and_a_straight_undoes_nothing() -> None:
+def test_side_force_that_nothing_turns_contradicts_for_as_long_as_patience_and_a_straight_undoes_nothing() -> (
+    None
+):
     vehicle = drive("straight", 0.85)[2]
     t = np.arange(0.0, 5.0 + CONSTANTS.patience, 0.01)
     signals = np.zeros((len(t), 18))

@@ -27,7 +27,9 @@ System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """f, q, h and the standard deviations of the measurement."""
 
 
-def textbook(mean: FloatArray, cov: FloatArray, system: System, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+def textbook(
+    mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """One turn of the Kalman filter with whole covariances."""
     f, q, h, noise = system
     mean, cov = f @ mean, f @ cov @ f.T + q
@@ -85,11 +87,27 @@ def _federated_turn(
         own, own_root, points = np.empty(n), np.empty((n, n)), np.empty((2 * n, n))
         share(root, part, own_root)
         axis_points(mean, own_root, xi, points)
-        predict(np.ascontiguousarray(points @ f.T), weight, weight, root_of(q / part), own, own_root, work)
+        predict(
+            np.ascontiguousarray(points @ f.T),
+            weight,
+            weight,
+            root_of(q / part),
+            own,
+            own_root,
+            work,
+        )
         innovation, std = z - h @ own, noise * np.array([1.0, np.sqrt(2.0)])
         if sub == 1:
             innovation[0] = np.nan
-        update(own, own_root, own_root.copy(), np.ascontiguousarray(h @ own_root), innovation, std, work)
+        update(
+            own,
+            own_root,
+            own_root.copy(),
+            np.ascontiguousarray(h @ own_root),
+            innovation,
+            std,
+            work,
+        )
         parts.append((own, own_root))
     fuse(parts[0][0], parts[0][1], parts[1][0], parts[1][1], work)
     return parts[0]
@@ -127,12 +145,20 @@ def test_a_downdate_that_would_leave_no_covariance_refuses_and_changes_nothing()
     assert np.array_equal(root, before)
 
 
-def _measured(seed: int, noise: float) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
+def _measured(
+    seed: int, noise: float
+) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
     rng = np.random.default_rng(seed)
     root, mean = root_of(covariance(4, seed)), rng.normal(size=4)
     h, innovation = rng.normal(size=(3, 4)), rng.normal(size=3)
     innovation[1] = np.nan
-    args = (root.copy(), np.ascontiguousarray(h @ root), innovation, np.full(3, noise), np.empty((12, 12)))
+    args = (
+        root.copy(),
+        np.ascontiguousarray(h @ root),
+        innovation,
+        np.full(3, noise),
+        np.empty((12, 12)),
+    )
     other, other_root = mean.copy(), root.copy()
     told = update_by_downdate(mean, root, *args)
     plain = update(other, other_root, *args)
@@ -149,7 +175,11 @@ def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
 
 def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_system() -> None:
     rng, n = np.random.default_rng(21), 4
-    f, h, q = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n)), rng.normal(size=(3, n)), 0.01 * covariance(n, 22)
+    f, h, q = (
+        0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n)),
+        rng.normal(size=(3, n)),
+        0.01 * covariance(n, 22),
+    )
     noise, rule = np.array([0.2, 0.3, 0.4]), cubature(n)
     mean, cov = np.ones(n), covariance(n, 23)
     x, root, points, work = mean.copy(), root_of(cov), np.empty((2 * n, n)), np.empty((20, 40))
@@ -157,8 +187,12 @@ def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_s
         z = rng.normal(size=3)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
         sigma_points(x, root, rule.xi, points)
-        predict(np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, root_of(q), x, root, work)
-        told = update_by_downdate(x, root, root.copy(), np.ascontiguousarray(h @ root), z - h @ x, noise, work)
+        predict(
+            np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, root_of(q), x, root, work
+        )
+        told = update_by_downdate(
+            x, root, root.copy(), np.ascontiguousarray(h @ root), z - h @ x, noise, work
+        )
         assert not told[3]
         assert x == pytest.approx(mean, abs=1e-12)
         assert root @ root.T == pytest.approx(cov, abs=1e-12)

@@ -13,7 +13,12 @@ from edge_agent.filters.sigma import SigmaRule, cubature, unscented
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-RULES = [cubature(4), unscented(4, 1.0, 0.0, 0.0), unscented(4, 1.0, 2.0, 0.5), unscented(4, 0.9, 2.0, 1.0)]
+RULES = [
+    cubature(4),
+    unscented(4, 1.0, 0.0, 0.0),
+    unscented(4, 1.0, 2.0, 0.5),
+    unscented(4, 0.9, 2.0, 1.0),
+]
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
@@ -47,7 +52,9 @@ def test_a_negative_covariance_weight_is_refused() -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 7), (6, 20)])
-def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tuple[int, int]) -> None:
+def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(
+    shape: tuple[int, int],
+) -> None:
     a = np.random.default_rng(5).normal(size=shape)
     b = a.copy()
     householder.triangularize(b, *shape)
@@ -57,7 +64,9 @@ def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tu
     assert (np.diag(factor) >= 0).all()
 
 
-@pytest.mark.parametrize("rule", [cubature(2), unscented(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name)
+@pytest.mark.parametrize(
+    "rule", [cubature(2), unscented(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name
+)
 def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: SigmaRule) -> None:
     points, mean, work = np.empty((len(rule.xi), 2)), np.empty(2), np.zeros((2, 8))
     root = np.zeros((2, 2))
@@ -80,12 +89,19 @@ def _moved(
     sigma_points(mean, factor_of(cov), rule.xi, points)
     new, root = np.empty(n), np.zeros((n, n))
     noise = factor_of(q)
-    householder.predict(points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n)))
+    householder.predict(
+        points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n))
+    )
     return new, root
 
 
 def _corrected(
-    rule: SigmaRule, mean: FloatArray, root: FloatArray, h: FloatArray, std: FloatArray, z: FloatArray
+    rule: SigmaRule,
+    mean: FloatArray,
+    root: FloatArray,
+    h: FloatArray,
+    std: FloatArray,
+    z: FloatArray,
 ) -> tuple[FloatArray, FloatArray, tuple[int, float, float]]:
     n, count, rows = len(mean), len(rule.xi), len(z)
     points = np.empty((count, n))
@@ -139,7 +155,13 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
     k = c @ np.linalg.inv(s)
     new, root = mean.copy(), factor_of(cov)
     householder.update(
-        new, root, (points - mean).T / math.sqrt(6), (seen - centre).T / math.sqrt(6), nu, r, np.zeros((5, 8))
+        new,
+        root,
+        (points - mean).T / math.sqrt(6),
+        (seen - centre).T / math.sqrt(6),
+        nu,
+        r,
+        np.zeros((5, 8)),
     )
     assert np.allclose(new, mean + k @ nu, rtol=0, atol=1e-9)
     assert np.allclose(root @ root.T, cov - k @ s @ k.T, rtol=0, atol=1e-9)

@@ -34,7 +34,9 @@ def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
     assert root == pytest.approx(np.linalg.cholesky(covariance(seed)), abs=1e-12)
     multiply(root, np.zeros(N), again)
     assert again == pytest.approx(covariance(seed), abs=1e-12)
-    assert [variance(root, i) for i in range(N)] == pytest.approx(np.diag(covariance(seed)), abs=1e-12)
+    assert [variance(root, i) for i in range(N)] == pytest.approx(
+        np.diag(covariance(seed)), abs=1e-12
+    )
 
 
 def test_noise_is_added_to_the_diagonal_of_a_product() -> None:
@@ -78,10 +80,18 @@ def test_carlson_s_update_by_a_state_is_the_orthogonal_one(state: int) -> None:
     ours, ours_root, gain = mean.copy(), root.copy(), np.empty(N)
     far, expected = carlson(ours, ours_root, state, mean[state] + 0.7, 0.04, gain)
     used, log_likelihood, square = update(
-        mean, root, root.copy(), root[state : state + 1].copy(), np.array([0.7]), np.array([0.2]), np.zeros((9, 9))
+        mean,
+        root,
+        root.copy(),
+        root[state : state + 1].copy(),
+        np.array([0.7]),
+        np.array([0.2]),
+        np.zeros((9, 9)),
     )
     assert ours == pytest.approx(mean, abs=1e-12)
     assert ours_root == pytest.approx(root, abs=1e-12)
     assert used == 1
     assert square == pytest.approx(far, rel=1e-12)
-    assert -0.5 * (math.log(2.0 * math.pi * expected) + far) == pytest.approx(log_likelihood, rel=1e-12)
+    assert -0.5 * (math.log(2.0 * math.pi * expected) + far) == pytest.approx(
+        log_likelihood, rel=1e-12
+    )

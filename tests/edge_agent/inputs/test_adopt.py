@@ -45,14 +45,18 @@ def test_exact_drive_is_left_as_it_is(drive: Recorded) -> None:
 
 
 @pytest.mark.parametrize(("device", "columns"), [("steering", DELTA[:2]), ("wheels", OMEGA)])
-def test_late_device_is_measured_and_corrected(drive: Recorded, device: str, columns: Sequence[int]) -> None:
+def test_late_device_is_measured_and_corrected(
+    drive: Recorded, device: str, columns: Sequence[int]
+) -> None:
     wrong = replace(log_of(drive), signals=late(drive.signals, columns, 0.15))
     adopted = adopt_measured(wrong, drive.vehicle)
     assert [note.split()[1] for note in adopted.notes] == [device]
     assert adopted.diagnosis.passed
     rows = slice(1000, -1000)
     before = np.nanmean(np.abs(wrong.signals[rows][:, columns] - drive.signals[rows][:, columns]))
-    after = np.nanmean(np.abs(adopted.log.signals[rows][:, columns] - drive.signals[rows][:, columns]))
+    after = np.nanmean(
+        np.abs(adopted.log.signals[rows][:, columns] - drive.signals[rows][:, columns])
+    )
     assert after < 0.35 * before
 
 
@@ -75,7 +79,9 @@ def test_locked_rear_axle_is_recognised_and_freed(drive: Recorded) -> None:
 
 
 def test_radius_of_an_axle_scales_its_wheels_and_torques(drive: Recorded) -> None:
-    vehicle = drive.vehicle.model_copy(update={"wheel_radius_rear": 1.04 * drive.vehicle.wheel_radius})
+    vehicle = drive.vehicle.model_copy(
+        update={"wheel_radius_rear": 1.04 * drive.vehicle.wheel_radius}
+    )
     scaled = corrected(drive.t, drive.signals, vehicle)
     assert np.allclose(scaled[:, OMEGA[2:]], 1.04 * drive.signals[:, OMEGA[2:]], equal_nan=True)
     assert np.array_equal(scaled[:, OMEGA[:2]], drive.signals[:, OMEGA[:2]], equal_nan=True)
@@ -96,11 +102,15 @@ def test_car_on_a_lift_is_recognised_and_stands(driven: tuple[int, ...]) -> None
         signals[:, S.OMEGA + first : S.OMEGA + first + 2] = (40.0 + 30.0 * np.sin(0.5 * t))[:, None]
     vehicle = PRESETS["sedan"].vehicle
     adopted = adopt_measured(SignalLog(t, signals, None, None, None), vehicle)
-    assert [(fault.channel, fault.kind) for fault in adopted.diagnosis.findings] == [("omega", "lift")]
+    assert [(fault.channel, fault.kind) for fault in adopted.diagnosis.findings] == [
+        ("omega", "lift")
+    ]
     assert not adopted.log.signals[:, OMEGA].any()
     on_road = signals.copy()
     on_road[:, S.AX] += vehicle.wheel_radius * 15.0 * np.cos(0.5 * t)
     assert all(
         fault.kind != "lift"
-        for fault in adopt_measured(replace(adopted.log, signals=on_road), vehicle).diagnosis.findings
+        for fault in adopt_measured(
+            replace(adopted.log, signals=on_road), vehicle
+        ).diagnosis.findings
     )

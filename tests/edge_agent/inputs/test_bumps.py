@@ -25,14 +25,20 @@ def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
         place = 100.0 + SPEED * t - (0.0 if wheel < 2 else WHEELBASE)
         side = 1.0 if wheel % 2 else -1.0
         uneven = bumps * side * np.interp(place, 0.05 * np.arange(len(road)), road)
-        signals[:, S.OMEGA + wheel] = (SPEED + uneven + rng.normal(0.0, 0.02, len(t))) / CAR.wheel_radius
+        signals[:, S.OMEGA + wheel] = (
+            SPEED + uneven + rng.normal(0.0, 0.02, len(t))
+        ) / CAR.wheel_radius
     return t, signals
 
 
 @pytest.mark.parametrize(("bumps", "front_first"), [(0.1, 1), (0.0, 0)])
-def test_bumps_tell_front_from_rear_and_a_smooth_road_does_not(bumps: float, front_first: int) -> None:
+def test_bumps_tell_front_from_rear_and_a_smooth_road_does_not(
+    bumps: float, front_first: int
+) -> None:
     t, signals = uneven_drive(bumps)
     assert leading_axle(t, signals, CAR) == front_first
     exchanged = signals.copy()
-    exchanged[:, S.OMEGA : S.OMEGA + 4] = signals[:, [S.OMEGA + 2, S.OMEGA + 3, S.OMEGA, S.OMEGA + 1]]
+    exchanged[:, S.OMEGA : S.OMEGA + 4] = signals[
+        :, [S.OMEGA + 2, S.OMEGA + 3, S.OMEGA, S.OMEGA + 1]
+    ]
     assert leading_axle(t, exchanged, CAR) == -front_first

@@ -49,7 +49,11 @@ OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> wha
         "CGW1": {"CF_Gway_WiperHighSw": "wiper"},
     },
     "vw-mqb": {
-        "ESP_21": {"ABS_Bremsung": "abs_active", "ESP_Eingriff": "esc_active", "EDS_Eingriff": "tcs_active"},
+        "ESP_21": {
+            "ABS_Bremsung": "abs_active",
+            "ESP_Eingriff": "esc_active",
+            "EDS_Eingriff": "tcs_active",
+        },
         "Kombi_02": {"KBI_Aussen_Temp_gef": "air_temperature"},
         "Gateway_72": {"Wischer_vorne_aktiv": "wiper"},
     },
@@ -73,8 +77,12 @@ def frames_of(name: str) -> list[can.Message]:
         for message in database.messages:
             if message.name in SLOW and k % RATE:
                 continue
-            values: dict[str, float] = {signal.name: max(0.0, signal.offset or 0.0) for signal in message.signals}
-            values |= {s: told_at(t)[what] for s, what in OF_PROFILE[name].get(message.name, {}).items()}
+            values: dict[str, float] = {
+                signal.name: max(0.0, signal.offset or 0.0) for signal in message.signals
+            }
+            values |= {
+                s: told_at(t)[what] for s, what in OF_PROFILE[name].get(message.name, {}).items()
+            }
             data = message.encode(values, padding=True, strict=False)
             frames.append(
                 can.Message(
@@ -91,25 +99,33 @@ def frames_of(name: str) -> list[can.Message]:
 def imported(path: Path, profile: Profile, out: Path) -> SignalLog:
     """A source as a log, without the checks of what an estimator needs."""
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
-    merged = merge([read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0)
+    merged = merge(
+        [read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0
+    )
     write_log(out, merged, profile, [path.name])
     table = pq.read_table(out)
     context = np.full((table.num_rows, len(CONTEXT)), np.nan)
     for index, name in enumerate(CONTEXT):
         context[:, index] = np.array(table[name].to_pylist(), dtype=float)
-    return SignalLog(merged.t, np.full((table.num_rows, len(CHANNELS)), np.nan), None, context=context)
+    return SignalLog(
+        merged.t, np.full((table.num_rows, len(CHANNELS)), np.nan), None, context=context
+    )
 
 
 def assert_filled(log: SignalLog) -> None:
     """All context is there, and is what was true."""
     assert log.context is not None
     assert len(log.t) > 500
-    assert (np.isfinite(log.context).mean(axis=0) >= ENOUGH).all(), np.isfinite(log.context).mean(axis=0)
+    assert (np.isfinite(log.context).mean(axis=0) >= ENOUGH).all(), np.isfinite(log.context).mean(
+        axis=0
+    )
     assert np.nanmax(np.abs(log.context[:, C.AIR_TEMPERATURE] - AIR)) < 0.3
     assert np.nanmin(log.context[:, C.WIPER]) == pytest.approx(WIPES)
     for index, name in enumerate(FLAGS):
         first, last = FLAGS_AT[name]
-        clear = np.min(np.abs(log.t[:, None] - [first, last]), axis=1) > 0.1  # rows begin with the second reading
+        clear = (
+            np.min(np.abs(log.t[:, None] - [first, last]), axis=1) > 0.1
+        )  # rows begin with the second reading
         inside = (log.t >= first) & (log.t < last)
         known = np.isfinite(log.context[:, index]) & clear
         assert (log.context[known, index] == inside[known]).all(), name
@@ -117,7 +133,9 @@ def assert_filled(log: SignalLog) -> None:
 
 @pytest.mark.parametrize("name", OF_PROFILE)
 @pytest.mark.parametrize("kind", ["blf", "mf4", "bag"])
-def test_a_bus_fills_the_context_that_its_profile_reads(tmp_path: Path, name: str, kind: str) -> None:
+def test_a_bus_fills_the_context_that_its_profile_reads(
+    tmp_path: Path, name: str, kind: str
+) -> None:
     frames, profile = frames_of(name), load_profile(name)[0]
     writers: dict[str, Any] = {"blf": formats.as_log, "mf4": formats.as_mf4, "bag": formats.as_bag}
     path = writers[kind](tmp_path / ("bag" if kind == "bag" else f"a.{kind}"), frames)
@@ -126,7 +144,9 @@ def test_a_bus_fills_the_context_that_its_profile_reads(tmp_path: Path, name: st
 
 def plain_profile(names: dict[str, str]) -> Profile:
     """A profile that reads context, and one wheel, under these names."""
-    return Profile(name="p", channels={channel: Channel(signal=signal) for channel, signal in names.items()})
+    return Profile(
+        name="p", channels={channel: Channel(signal=signal) for channel, signal in names.items()}
+    )
 
 
 def test_a_measurement_file_fills_the_context(tmp_path: Path) -> None:
@@ -139,7 +159,11 @@ def test_a_measurement_file_fills_the_context(tmp_path: Path) -> None:
         values = np.array([told_at(x)[name] for x in t], dtype=np.uint8)
         mdf.append(asammdf.Signal(values, t, name=names[name]))
     slow = t[::RATE]
-    mdf.append(asammdf.Signal(np.full(len(slow), AIR * 1.8 + 32.0), slow, name=names["air_temperature"], unit="°F"))
+    mdf.append(
+        asammdf.Signal(
+            np.full(len(slow), AIR * 1.8 + 32.0), slow, name=names["air_temperature"], unit="°F"
+        )
+    )
     mdf.append(asammdf.Signal(np.full(len(slow), 100.0), slow, name=names["wiper"], unit="%"))
     mdf.save(tmp_path / "lab.mf4")
     mdf.close()
@@ -164,7 +188,9 @@ def test_topics_of_a_bag_fill_the_context(tmp_path: Path) -> None:
             for topic, connection in topics.items():
                 name = topic[1:]
                 message = (
-                    flag(bool(told_at(k / RATE)[name])) if name in FLAGS else number(told_at(k / RATE).get(name, 30.0))
+                    flag(bool(told_at(k / RATE)[name]))
+                    if name in FLAGS
+                    else number(told_at(k / RATE).get(name, 30.0))
                 )
                 writer.write(connection, ns, store.serialize_cdr(message, connection.msgtype))
     assert_filled(imported(tmp_path / "bag", plain_profile(names), tmp_path / "o.parquet"))
@@ -173,7 +199,9 @@ def test_topics_of_a_bag_fill_the_context(tmp_path: Path) -> None:
 def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
     t = np.arange(SECONDS * RATE) / RATE
     columns = {name: np.array([told_at(x)[name] for x in t]) for name in CONTEXT}
-    pq.write_table(pa.table({"t": t, "omega_fl": np.full(len(t), 30.0), **columns}), tmp_path / "a.parquet")
+    pq.write_table(
+        pa.table({"t": t, "omega_fl": np.full(len(t), 30.0), **columns}), tmp_path / "a.parquet"
+    )
     log = imported(
         tmp_path / "a.parquet",
         plain_profile({"omega_fl": "omega_fl"} | dict(zip(CONTEXT, CONTEXT, strict=True))),
@@ -218,7 +246,9 @@ def test_a_live_source_that_tells_no_context_leaves_it_unknown() -> None:
 
 def test_a_flag_that_is_told_when_it_changes_holds_only_where_the_profile_says_so() -> None:
     names = ("ax", *CONTEXT)
-    lasting = Profile(name="p", channels={n: Channel(signal=n, lasting=n in CONTEXT) for n in names})
+    lasting = Profile(
+        name="p", channels={n: Channel(signal=n, lasting=n in CONTEXT) for n in names}
+    )
     for profile, flags_known in ((lasting, True), (plain_profile({n: n for n in names}), False)):
         found = live_blocks(told_at(6.0), 100_000, 100, profile)[-100:]
         assert (np.isfinite(found[:, C.ABS]) == flags_known).all()
@@ -230,14 +260,21 @@ def test_a_databroker_tells_how_lasting_signals_stand_and_then_their_changes() -
     profile = load_profile("vss")[0]
     air, abs_ = (profile.channels[name].signals[0] for name in ("air_temperature", "abs_active"))
     with Databroker(f"127.0.0.1:{port}", [air, abs_, "Vehicle.Acceleration.Lateral"]) as broker:
-        broker.publish({air: AIR, abs_: 0.0, "Vehicle.Acceleration.Lateral": 5.0}, time.time_ns() - 3600 * NS)
+        broker.publish(
+            {air: AIR, abs_: 0.0, "Vehicle.Acceleration.Lateral": 5.0}, time.time_ns() - 3600 * NS
+        )
         (feed,), _, clock = open_sources([f"vss:127.0.0.1:{port}"], None)
         assert isinstance(feed, DatabrokerFeed)
         feed.start()
         until(lambda: feed.heard >= 2)
         standing = feed.take()
-        assert {name: series.values.tolist() for name, series in standing.items()} == {air: [AIR], abs_: [0.0]}
-        assert abs(float(standing[air].t[0]) - clock.now()) < 30.0, "the value of now, however old its stamp"
+        assert {name: series.values.tolist() for name, series in standing.items()} == {
+            air: [AIR],
+            abs_: [0.0],
+        }
+        assert abs(float(standing[air].t[0]) - clock.now()) < 30.0, (
+            "the value of now, however old its stamp"
+        )
         broker.publish({abs_: 1.0}, time.time_ns())
         until(lambda: feed.heard >= 3)
         assert feed.take()[abs_].values.tolist() == [1.0]
@@ -249,9 +286,17 @@ def test_a_reading_holds_for_a_while_and_is_unknown_then() -> None:
     t = np.array([0.9, 1.0, 2.05, 2.1, 3.0, 3.2])
     found = held_readings("abs_active", series, t, lasting=False)
     assert np.array_equal(found, [np.nan, 1.0, np.nan, 0.0, 0.0, np.nan], equal_nan=True)
-    assert held_readings("abs_active", series, t, lasting=True)[1:].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
+    assert held_readings("abs_active", series, t, lasting=True)[1:].tolist() == [
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+    ]
     assert np.isfinite(
-        held_readings("air_temperature", series, np.array([2.1 + HELD_S["air_temperature"]]), lasting=False)
+        held_readings(
+            "air_temperature", series, np.array([2.1 + HELD_S["air_temperature"]]), lasting=False
+        )
     )
     empty = Series(np.zeros(0), np.zeros(0))
     assert np.isnan(held_readings("wiper", empty, t, lasting=True)).all()
@@ -262,18 +307,24 @@ def test_values_that_cannot_be_true_are_unknown() -> None:
     assert np.array_equal(air, [np.nan, np.nan, 20.0, np.nan], equal_nan=True)
     assert context_values("wiper", np.array([-0.1, 0.5, 3.0]), None).tolist() == [0.0, 0.5, 1.0]
     assert np.array_equal(
-        context_values("esc_active", np.array([0.0, 1.0, 3.0, np.nan]), [3.0]), [0.0, 0.0, 1.0, np.nan], equal_nan=True
+        context_values("esc_active", np.array([0.0, 1.0, 3.0, np.nan]), [3.0]),
+        [0.0, 0.0, 1.0, np.nan],
+        equal_nan=True,
     )
 
 
 def test_context_changes_no_other_column_of_a_log(tmp_path: Path) -> None:
     frames, name = frames_of("hyundai-can"), "hyundai-can"
     profile = load_profile(name)[0]
-    bare = profile.model_copy(update={"channels": {n: c for n, c in profile.channels.items() if n not in CONTEXT}})
+    bare = profile.model_copy(
+        update={"channels": {n: c for n, c in profile.channels.items() if n not in CONTEXT}}
+    )
     path = formats.as_log(tmp_path / "a.blf", frames)
     tables = []
     for one in (profile, bare):
-        merged = merge([read_source(path, one, read_dbc(FOLDER / f"{name}.dbc"))], one, wheel_radius=0.3)
+        merged = merge(
+            [read_source(path, one, read_dbc(FOLDER / f"{name}.dbc"))], one, wheel_radius=0.3
+        )
         tables.append(merged)
     assert np.array_equal(tables[0].t, tables[1].t)
     assert tables[0].columns.keys() - tables[1].columns.keys() == set(CONTEXT)
@@ -289,19 +340,25 @@ def test_a_log_has_the_context_of_its_columns_and_none_without_them(tmp_path: Pa
     plain = read(a_log(50))
     assert plain.context is None
     assert next(plain.blocks(0)).context is None
-    log = read(a_log(50) | {"abs_active": [True] * 25 + [None] * 25, "air_temperature": np.full(50, 4.0)})
+    log = read(
+        a_log(50) | {"abs_active": [True] * 25 + [None] * 25, "air_temperature": np.full(50, 4.0)}
+    )
     assert log.context is not None
     assert np.array_equal(log.signals, plain.signals, equal_nan=True)
     assert np.array_equal(log.context[[0, 49], C.ABS], [1.0, np.nan], equal_nan=True)
     assert np.isnan(log.context[:, C.WIPER]).all()
     parts = [block.context for block in log.blocks(0, rows=20)]
     assert np.array_equal(
-        np.concatenate([part[:, 0] for part in parts if part is not None]), log.context, equal_nan=True
+        np.concatenate([part[:, 0] for part in parts if part is not None]),
+        log.context,
+        equal_nan=True,
     )
 
 
 def test_a_simulated_source_hands_over_what_it_knows() -> None:
-    block = context_block(4, 2, {"abs_active": np.array([[False, True]] * 4), "air_temperature": -3.0})
+    block = context_block(
+        4, 2, {"abs_active": np.array([[False, True]] * 4), "air_temperature": -3.0}
+    )
     assert block.shape == (4, 2, len(CONTEXT))
     assert block[:, :, C.ABS].tolist() == [[0.0, 1.0]] * 4
     assert (block[..., C.AIR_TEMPERATURE] == -3.0).all()
@@ -334,12 +391,20 @@ def test_names_of_context_signals_are_drafted() -> None:
         "TCS11.ABS_ACT": "abs_active", "ESP_21.ESP_Eingriff": "esc_active", "ESP_21.ASR_Anf": "tcs_active",
         "FATC11.CR_Fatc_OutTemp": "air_temperature", "Gateway_72.Wischer_vorne_aktiv": "wiper",
     }  # fmt: skip
-    others = ["TCS11.ABS_DEF", "TCS11.ESP_PAS", "X.Rear_Wiper_Active", "EMS12.TEMP_ENG", "Vehicle.ADAS.ABS.IsEnabled"]
+    others = [
+        "TCS11.ABS_DEF",
+        "TCS11.ESP_PAS",
+        "X.Rear_Wiper_Active",
+        "EMS12.TEMP_ENG",
+        "Vehicle.ADAS.ABS.IsEnabled",
+    ]
     drafted = draft(dict.fromkeys([*names, *others], ""), "p")
     assert {c.whole(str(c.signal)): name for name, c in drafted.channels.items()} == names
 
 
-def test_check_names_a_flag_that_is_always_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_names_a_flag_that_is_always_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pq.write_table(pa.table(a_log(3000) | {"esc_active": np.ones(3000)}), tmp_path / "log.parquet")
     (tmp_path / "log.json").write_text(CAR.model_dump_json(exclude_none=True))
     main(["check", str(tmp_path / "log.parquet")])

@@ -27,7 +27,9 @@ def frames_of(message: cantools.database.can.Message, data: list[bytes]) -> list
 
 
 def columns(data: list[bytes]) -> Bytes:
-    return np.frombuffer(b"".join(frame.ljust(LONGEST, b"\0") for frame in data), np.uint8).reshape(-1, LONGEST)
+    return np.frombuffer(b"".join(frame.ljust(LONGEST, b"\0") for frame in data), np.uint8).reshape(
+        -1, LONGEST
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in shipped() if load_profile(name)[0].dbc])
@@ -54,7 +56,9 @@ def test_recorded_frames_decode_as_by_cantools() -> None:
         data = [bytes(m.data) for m in recorded if m.arbitration_id == message.frame_id]
         assert len(data) == 4974
         decoded = frames_of(message, data)
-        for signal, values in ours[message.name].decode(columns(data), list(ours[message.name].signals)).items():
+        for signal, values in (
+            ours[message.name].decode(columns(data), list(ours[message.name].signals)).items()
+        ):
             assert [float(row[signal]) for row in decoded] == values.tolist(), signal
 
 

@@ -29,7 +29,9 @@ def rough() -> Recorded:
 
 def write(path: Path, drive: Recorded) -> list[str]:
     columns = {"t": pa.array(drive.t)}
-    columns |= {name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
+    columns |= {
+        name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)
+    }
     pq.write_table(pa.table(columns), path)
     path.with_suffix(".json").write_text(drive.vehicle.model_dump_json(exclude_none=True))
     return [str(path), "--vehicle", str(path.with_suffix(".json"))]
@@ -59,20 +61,27 @@ def test_a_standing_car_tells_nothing_and_does_not_pass(rough: Recorded) -> None
 
 
 @pytest.mark.parametrize(
-    "name", ["yaw rate in deg/s", "a_y flipped", "steering late", "radius of the file", "left and right"]
+    "name",
+    ["yaw rate in deg/s", "a_y flipped", "steering late", "radius of the file", "left and right"],
 )
-def test_a_fix_makes_the_drive_pass(rough: Recorded, tmp_path: Path, name: str, capsys: Output) -> None:
+def test_a_fix_makes_the_drive_pass(
+    rough: Recorded, tmp_path: Path, name: str, capsys: Output
+) -> None:
     log = write(tmp_path / "bad.parquet", PLANTED[name].spoil(rough))
     page, profile = tmp_path / "page.html", tmp_path / "fixed.json"
     assert main(["check", *log, "--fix", str(profile), "--out", str(page)]) == 1
     assert PLANTED[name].kind in capsys.readouterr().out
     assert page.read_text().count("<svg") >= 5
     good = str(tmp_path / "good.parquet")
-    assert main(["import", log[0], "--profile", str(profile), "--vehicle", log[2], "--out", good]) == 0
+    assert (
+        main(["import", log[0], "--profile", str(profile), "--vehicle", log[2], "--out", good]) == 0
+    )
     assert main(["check", good, *log[1:]]) == 0
 
 
-def test_what_the_doctor_found_is_json_for_a_program(rough: Recorded, tmp_path: Path, capsys: Output) -> None:
+def test_what_the_doctor_found_is_json_for_a_program(
+    rough: Recorded, tmp_path: Path, capsys: Output
+) -> None:
     for name, drive in (("good", rough), ("bad", PLANTED["a_y flipped"].spoil(rough))):
         log = write(tmp_path / f"{name}.parquet", drive)
         assert main(["check", *log, "--json"]) == (1 if name == "bad" else 0)
@@ -84,7 +93,9 @@ def test_what_the_doctor_found_is_json_for_a_program(rough: Recorded, tmp_path: 
     assert "ay" not in said["sound"]
 
 
-@pytest.mark.parametrize("manoeuvre", ["slalom", "sine", "straight", "constant-radius", "acceleration", "braking"])
+@pytest.mark.parametrize(
+    "manoeuvre", ["slalom", "sine", "straight", "constant-radius", "acceleration", "braking"]
+)
 @pytest.mark.parametrize("mu", [None, 0.15])
 def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | None) -> None:
     log, vehicle = simulate_manoeuvre(manoeuvre, mu=mu, seed=3, duration_s=25.0)
@@ -114,7 +125,9 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
     """The README's five lines on the real minute."""
-    log, page, out = (str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet"))
+    log, page, out = (
+        str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet")
+    )
     car = ["--vehicle", str(VEHICLE)]
     config = {"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}
     (tmp_path / "agent.json").write_text(json.dumps(config))
@@ -147,7 +160,9 @@ def test_what_has_not_passed_is_not_published_unless_it_is_trusted(
     assert service.batches
 
 
-def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(tmp_path: Path, capsys: Output) -> None:
+def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(
+    tmp_path: Path, capsys: Output
+) -> None:
     cut = drives(1, 24, rough=False, seconds=40)[0]
     good = [
         "replay",
@@ -167,9 +182,20 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(tmp_pat
 @pytest.mark.campaign
 @pytest.mark.timeout(600)  # processes are started, and kernels may have to be compiled
 def test_only_the_inputs_are_evaluated_where_so_asked(tmp_path: Path) -> None:
-    words = ["evaluate", "--only", "inputs", "--quick", "--recorded", str(BLF), "--out", str(tmp_path)]
+    words = [
+        "evaluate",
+        "--only",
+        "inputs",
+        "--quick",
+        "--recorded",
+        str(BLF),
+        "--out",
+        str(tmp_path),
+    ]
     assert main(words) in (0, 1)
-    figures = {row["name"]: row["value"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]}
+    figures = {
+        row["name"]: row["value"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]
+    }
     assert figures["doctor.tries"] == 2 * len(PLANTED)
     assert figures["doctor.faults_named"] > 0.9
     assert figures["inputs.decode_errors"] == 0

@@ -70,7 +70,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("name", "text"), [("a.vbo", VBO), ("a.txt", VBO), ("a.csv", VBO), ("b.csv", CSV_OF_VBO)])
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.vbo", VBO), ("a.txt", VBO), ("a.csv", VBO), ("b.csv", CSV_OF_VBO)]
+)
 def test_vbo_is_recognised_with_its_own_units(tmp_path: Path, name: str, text: str) -> None:
     recording = read_source(write(tmp_path / name, text), None, None)
     assert recording.signals["latitude"].values[0] == pytest.approx(60.175)
@@ -104,7 +106,9 @@ def test_racechrono_keeps_units_and_sources(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("title", ["# time(s)", "INS_time_sec", "Time [s]"])
 def test_a_column_of_time_is_found_by_its_word(tmp_path: Path, title: str) -> None:
-    recording = read_source(write(tmp_path / "a.csv", f"{title},ax\n0.0,1.0\n0.1,2.0\n"), None, None)
+    recording = read_source(
+        write(tmp_path / "a.csv", f"{title},ax\n0.0,1.0\n0.1,2.0\n"), None, None
+    )
     assert np.allclose(recording.signals["ax"].t, [0.0, 0.1])
 
 
@@ -138,6 +142,10 @@ def test_an_unfinished_measurement_is_read(tmp_path: Path) -> None:
 
 
 def test_libraries_do_not_report_what_nobody_asked(tmp_path: Path) -> None:
-    read_source(write(tmp_path / "a.trc", ";$FILEVERSION=1.1\n1)  10.0  Rx  00AA  2  10 27\n"), None, DATABASE)
+    read_source(
+        write(tmp_path / "a.trc", ";$FILEVERSION=1.1\n1)  10.0  Rx  00AA  2  10 27\n"),
+        None,
+        DATABASE,
+    )
     assert not logging.getLogger("can").isEnabledFor(logging.INFO)
     assert not logging.getLogger("numexpr").isEnabledFor(logging.INFO)

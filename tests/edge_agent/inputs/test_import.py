@@ -28,7 +28,10 @@ FIRST = 1500  # frames; six seconds
 
 
 def bring(out: Path, *sources: Path, more: tuple[str, ...] = ("--profile", "toyota")) -> pa.Table:
-    assert main(["import", *map(str, sources), *more, "--vehicle", str(VEHICLE), "--out", str(out)]) == 0
+    assert (
+        main(["import", *map(str, sources), *more, "--vehicle", str(VEHICLE), "--out", str(out)])
+        == 0
+    )
     return pq.read_table(out)
 
 
@@ -68,14 +71,22 @@ WRITERS: dict[str, Callable[[Path, list[can.Message]], Path]] = {
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_one_drive_is_one_log_in_every_format(tmp_path: Path, some: list[can.Message], kind: str) -> None:
+def test_one_drive_is_one_log_in_every_format(
+    tmp_path: Path, some: list[can.Message], kind: str
+) -> None:
     whole = bring(tmp_path / "blf.parquet", formats.as_log(tmp_path / "a.blf", some))
     other = bring(tmp_path / "other.parquet", WRITERS[kind](tmp_path, some))
     assert whole.num_rows > 500
-    assert [n for n in other.column_names if n[0] != "t"] == [n for n in whole.column_names if n[0] != "t"]
-    close = 1e-3 if kind == "trc" else 1e-9  # a TRC's times have four digits of a millisecond at the most
+    assert [n for n in other.column_names if n[0] != "t"] == [
+        n for n in whole.column_names if n[0] != "t"
+    ]
+    close = (
+        1e-3 if kind == "trc" else 1e-9
+    )  # a TRC's times have four digits of a millisecond at the most
     for name in whole.column_names[1:]:
-        assert np.allclose(column(whole, name), column(other, name), rtol=0, atol=close, equal_nan=True), name
+        assert np.allclose(
+            column(whole, name), column(other, name), rtol=0, atol=close, equal_nan=True
+        ), name
 
 
 @pytest.mark.parametrize("mark", [",", ";"])
@@ -87,7 +98,9 @@ def test_a_log_as_csv_is_the_same_log(tmp_path: Path, some: list[can.Message], m
         assert whole[name].equals(other[name]), name
 
 
-def test_a_measurement_file_and_a_bag_of_sensors_are_drafted_from_their_names(tmp_path: Path, capsys: Output) -> None:
+def test_a_measurement_file_and_a_bag_of_sensors_are_drafted_from_their_names(
+    tmp_path: Path, capsys: Output
+) -> None:
     import asammdf
 
     t = np.arange(300) / 100.0
@@ -102,10 +115,28 @@ def test_a_measurement_file_and_a_bag_of_sensors_are_drafted_from_their_names(tm
     vehicle = json.loads(VEHICLE.read_text()) | {"steering_ratio": 16.0}
     (tmp_path / "car.json").write_text(json.dumps(vehicle))
     out = tmp_path / "lab.parquet"
-    assert main(["import", str(tmp_path / "lab.mf4"), "--vehicle", str(tmp_path / "car.json"), "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "import",
+                str(tmp_path / "lab.mf4"),
+                "--vehicle",
+                str(tmp_path / "car.json"),
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     table = pq.read_table(out)
     means = {name: float(np.mean(column(table, name))) for name in table.column_names[1:]}
-    expected = {"ax": 0.980665, "ay": 0.2, "yaw_rate": np.radians(3), "omega_fl": 10 / 0.345, "delta_fl": np.radians(1)}
+    expected = {
+        "ax": 0.980665,
+        "ay": 0.2,
+        "yaw_rate": np.radians(3),
+        "omega_fl": 10 / 0.345,
+        "delta_fl": np.radians(1),
+    }
     assert {name: means[name] for name in expected} == pytest.approx(expected, rel=1e-2)
     assert "drafted from names" in capsys.readouterr().out
     Profile.model_validate_json((tmp_path / "lab.profile.json").read_text())
@@ -137,7 +168,9 @@ def test_sensor_topics_of_a_bag_keep_their_own_stamps(tmp_path: Path) -> None:
     assert np.allclose(np.diff(column(table, "yaw_rate")), 0.01, atol=1e-9)
 
 
-def test_gpsd_reports_are_the_same_fixes_as_sentences(tmp_path: Path, some: list[can.Message]) -> None:
+def test_gpsd_reports_are_the_same_fixes_as_sentences(
+    tmp_path: Path, some: list[can.Message]
+) -> None:
     from edge_agent.inputs.readers.gnss import read_gnss
 
     fixes = read_gnss(NMEA)
@@ -146,7 +179,13 @@ def test_gpsd_reports_are_the_same_fixes_as_sentences(tmp_path: Path, some: list
     for k, t in enumerate(fixes.signals["latitude"].t):
         when = np.datetime64(fixes.start_ns + round(t * 1e9), "ns").astype("datetime64[ms]")
         one = {name: series.values[k] for name, series in fixes.signals.items()}
-        report = {"class": "TPV", "mode": 3, "time": f"{when}Z", "lat": one["latitude"], "lon": one["longitude"]}
+        report = {
+            "class": "TPV",
+            "mode": 3,
+            "time": f"{when}Z",
+            "lat": one["latitude"],
+            "lon": one["longitude"],
+        }
         lines.append(json.dumps(report | {"speed": one["speed"], "track": one["course"]}))
     (tmp_path / "a.gpsd").write_text("\n".join([*lines, '{"class":"TPV"', "\0"]))
     again = read_gnss(tmp_path / "a.gpsd")
@@ -185,15 +224,30 @@ def test_clocks_that_do_not_meet_are_an_error_with_its_remedy(
         text[k] = f"${body}*{total:02X}"
     (tmp_path / "late.nmea").write_text("\n".join(text))
     log = formats.as_log(tmp_path / "a.blf", some)
-    arguments = ["import", str(log), str(tmp_path / "late.nmea"), "--profile", "toyota", "--vehicle", str(VEHICLE)]
+    arguments = [
+        "import",
+        str(log),
+        str(tmp_path / "late.nmea"),
+        "--profile",
+        "toyota",
+        "--vehicle",
+        str(VEHICLE),
+    ]
     assert main([*arguments, "--out", str(tmp_path / "o.parquet")]) == 2
     assert "--clock late.nmea=" in capsys.readouterr().err
-    assert main([*arguments, "--out", str(tmp_path / "o.parquet"), "--clock", "late.nmea=-2764800"]) == 0
+    assert (
+        main([*arguments, "--out", str(tmp_path / "o.parquet"), "--clock", "late.nmea=-2764800"])
+        == 0
+    )
 
 
-def test_a_rim_speed_without_a_radius_is_an_error(tmp_path: Path, some: list[can.Message], capsys: Output) -> None:
+def test_a_rim_speed_without_a_radius_is_an_error(
+    tmp_path: Path, some: list[can.Message], capsys: Output
+) -> None:
     log = formats.as_log(tmp_path / "a.blf", some)
-    assert main(["import", str(log), "--profile", "toyota", "--out", str(tmp_path / "o.parquet")]) == 2
+    assert (
+        main(["import", str(log), "--profile", "toyota", "--out", str(tmp_path / "o.parquet")]) == 2
+    )
     assert "radius" in capsys.readouterr().err
 
 
@@ -205,15 +259,37 @@ def test_the_shipped_profiles_are_listed(capsys: Output) -> None:
 
 
 def test_another_database_and_a_named_draft(tmp_path: Path, some: list[can.Message]) -> None:
-    (tmp_path / "p.dbc").write_text((FOLDER / "toyota.dbc").read_text().replace("(0.244,-125)", "(0.488,-250)"))
+    (tmp_path / "p.dbc").write_text(
+        (FOLDER / "toyota.dbc").read_text().replace("(0.244,-125)", "(0.488,-250)")
+    )
     log = formats.as_log(tmp_path / "a.blf", some)
     plain = bring(tmp_path / "a.parquet", log)
-    other = bring(tmp_path / "b.parquet", log, more=("--profile", "toyota", "--dbc", str(tmp_path / "p.dbc")))
+    other = bring(
+        tmp_path / "b.parquet", log, more=("--profile", "toyota", "--dbc", str(tmp_path / "p.dbc"))
+    )
     assert np.allclose(2.0 * column(plain, "yaw_rate"), column(other, "yaw_rate"), equal_nan=True)
-    arguments = ["import", str(log), "--dbc", str(FOLDER / "toyota.dbc"), "--out", str(tmp_path / "c.parquet")]
+    arguments = [
+        "import",
+        str(log),
+        "--dbc",
+        str(FOLDER / "toyota.dbc"),
+        "--out",
+        str(tmp_path / "c.parquet"),
+    ]
     vehicle = json.loads(VEHICLE.read_text()) | {"steering_ratio": 16.88}
     (tmp_path / "car.json").write_text(json.dumps(vehicle))
-    assert main([*arguments, "--vehicle", str(tmp_path / "car.json"), "--draft", str(tmp_path / "d" / "p.json")]) == 0
+    assert (
+        main(
+            [
+                *arguments,
+                "--vehicle",
+                str(tmp_path / "car.json"),
+                "--draft",
+                str(tmp_path / "d" / "p.json"),
+            ]
+        )
+        == 0
+    )
     drafted, _ = load_profile(str(tmp_path / "d" / "p.json"))
     assert set(drafted.channels) == set(load_profile("toyota")[0].channels)
 
@@ -229,7 +305,9 @@ def test_another_database_and_a_named_draft(tmp_path: Path, some: list[can.Messa
     ],
 )
 def test_a_profile_is_checked(tmp_path: Path, change: dict[str, Any], named: str) -> None:
-    (tmp_path / "p.json").write_text(json.dumps({"version": 1, "name": "p", "channels": {}} | change))
+    (tmp_path / "p.json").write_text(
+        json.dumps({"version": 1, "name": "p", "channels": {}} | change)
+    )
     with pytest.raises(InputError, match=named):
         load_profile(str(tmp_path / "p.json"))
 
@@ -237,7 +315,8 @@ def test_a_profile_is_checked(tmp_path: Path, change: dict[str, Any], named: str
 def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
     t = np.arange(4) / 10.0
     pq.write_table(
-        pa.table({"t": t, "r": [1.0, 1.0, 1.0, 1.0], "s": [0, 1, 0, 1], "ok": [0, 0, 1, 1]}), tmp_path / "a.parquet"
+        pa.table({"t": t, "r": [1.0, 1.0, 1.0, 1.0], "s": [0, 1, 0, 1], "ok": [0, 0, 1, 1]}),
+        tmp_path / "a.parquet",
     )
     channel = {
         "signal": "r",
@@ -247,10 +326,16 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
         "scale": 2.0,
         "offset": 0.5,
     }
-    (tmp_path / "p.json").write_text(json.dumps({"version": 1, "name": "p", "channels": {"yaw_rate": channel}}))
-    table = bring(tmp_path / "o.parquet", tmp_path / "a.parquet", more=("--profile", str(tmp_path / "p.json")))
+    (tmp_path / "p.json").write_text(
+        json.dumps({"version": 1, "name": "p", "channels": {"yaw_rate": channel}})
+    )
+    table = bring(
+        tmp_path / "o.parquet", tmp_path / "a.parquet", more=("--profile", str(tmp_path / "p.json"))
+    )
     two = np.radians(2.0)
-    assert np.allclose(column(table, "yaw_rate"), [two + 0.5, 0.5 - two, np.nan, np.nan], equal_nan=True)
+    assert np.allclose(
+        column(table, "yaw_rate"), [two + 0.5, 0.5 - two, np.nan, np.nan], equal_nan=True
+    )
 
 
 def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
@@ -266,9 +351,13 @@ def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize("kind", ["blf", "asc", "log", "trc", "mf4", "mcap", "csv", "parquet", "nmea"])
+@pytest.mark.parametrize(
+    "kind", ["blf", "asc", "log", "trc", "mf4", "mcap", "csv", "parquet", "nmea"]
+)
 @pytest.mark.filterwarnings("ignore")
-def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(tmp_path: Path, kind: str) -> None:
+def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
+    tmp_path: Path, kind: str
+) -> None:
     few, rng = formats.frames(60), np.random.default_rng(5)
     good = tmp_path / f"good.{kind}"
     if kind in ("csv", "parquet"):
@@ -311,8 +400,14 @@ def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("part", ["*.db3", "metadata.yaml"])
-def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(tmp_path: Path, part: str) -> None:
-    folder, rng, refused = formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3"), np.random.default_rng(6), 0
+def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(
+    tmp_path: Path, part: str
+) -> None:
+    folder, rng, refused = (
+        formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3"),
+        np.random.default_rng(6),
+        0,
+    )
     file = next(folder.glob(part))
     data = file.read_bytes()
     profile, database = load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc")
@@ -326,20 +421,27 @@ def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(t
     assert refused > 0
 
 
-def test_a_hostile_database_or_profile_is_one_clear_error_or_what_is_left_of_it(tmp_path: Path) -> None:
+def test_a_hostile_database_or_profile_is_one_clear_error_or_what_is_left_of_it(
+    tmp_path: Path,
+) -> None:
     rng, refused = np.random.default_rng(7), 0
     dbc, profile = (FOLDER / "toyota.dbc").read_bytes(), (FOLDER / "toyota.json").read_bytes()
     for k in range(60):
         kind = ("cut", "full", "changed")[k % 3]
         (tmp_path / "p.dbc").write_bytes(broken(dbc, kind, rng))
         (tmp_path / "p.json").write_bytes(broken(profile, kind, rng))
-        for read in (lambda: read_dbc(tmp_path / "p.dbc"), lambda: load_profile(str(tmp_path / "p.json"))):
+        for read in (
+            lambda: read_dbc(tmp_path / "p.dbc"),
+            lambda: load_profile(str(tmp_path / "p.json")),
+        ):
             try:
                 read()
             except InputError:
                 refused += 1
     assert 20 < refused < 120
-    (tmp_path / "p.dbc").write_bytes(b"BO_ 1 A: 8 X\n" + b' SG_ S : 0|8@1+ (1,0) [0|0] "" X\n' * 200_000)
+    (tmp_path / "p.dbc").write_bytes(
+        b"BO_ 1 A: 8 X\n" + b' SG_ S : 0|8@1+ (1,0) [0|0] "" X\n' * 200_000
+    )
     assert len(read_dbc(tmp_path / "p.dbc")["A"].signals) == 1
     (tmp_path / "p.json").write_bytes(b'{"channels":' * 50_000)
     with pytest.raises(InputError):

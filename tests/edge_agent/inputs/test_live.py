@@ -60,7 +60,9 @@ def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> No
                 next(patience)
             blocks.close()
         assert got[..., S.OMEGA : S.OMEGA + 4] == pytest.approx(SPEED / RADIUS, rel=1e-6)
-        assert got[..., S.AY] == pytest.approx(SPEED * got[..., S.YAW_RATE], abs=1e-2)  # arrivals are unsteady
+        assert got[..., S.AY] == pytest.approx(
+            SPEED * got[..., S.YAW_RATE], abs=1e-2
+        )  # arrivals are unsteady
         assert got[..., S.DELTA] == pytest.approx(2.7 * got[..., S.YAW_RATE] / SPEED, abs=1e-3)
 
 
@@ -91,7 +93,9 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
     from schemas.runtime.zenoh_session import open_session
 
     router = Router()
-    feed = Ros2Feed("ros2:", HostClock(), router.settings, domain=0, signals=["/imu.angular_velocity.z"])
+    feed = Ros2Feed(
+        "ros2:", HostClock(), router.settings, domain=0, signals=["/imu.angular_velocity.z"]
+    )
     feed.start()
     session = open_session(ZenohSettings(connect=[router.endpoint]))
     assert session is not None
@@ -156,7 +160,9 @@ def test_a_databroker_is_asked_for_what_it_knows_and_old_values_are_no_readings(
         until(lambda: broker.subscribers)
         broker.publish({paths[1]: 2.0}, time.time_ns())
         until(lambda: feed.heard)
-        assert {name: series.values.tolist() for name, series in feed.take().items()} == {paths[1]: [2.0]}
+        assert {name: series.values.tolist() for name, series in feed.take().items()} == {
+            paths[1]: [2.0]
+        }
         feed.close()
     assert "does not know Vehicle.AngularVelocity.Yaw" in caplog.text
 
@@ -170,7 +176,9 @@ def test_a_databroker_is_asked_for_what_it_knows_and_old_values_are_no_readings(
         ("can:virtual/a", "no such profile", "profile"), ("ros2:?messages=/nowhere", "vss", "topic"),
     ],
 )  # fmt: skip
-def test_a_source_that_makes_no_sense_is_one_clear_error(source: str, profile: str | None, named: str) -> None:
+def test_a_source_that_makes_no_sense_is_one_clear_error(
+    source: str, profile: str | None, named: str
+) -> None:
     assert is_live(source)
     with pytest.raises(InputError, match=named):
         open_sources([source], profile)
@@ -191,12 +199,36 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
     (bus, can), (receiver, gpsd) = addresses("can"), addresses("gpsd")
     name, dbc = written("can", tmp_path)
     (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
-    config = {"zenoh": service.router.settings.model_dump(), "spool": str(tmp_path / "s.sqlite"), "flush_s": 0.1}
+    config = {
+        "zenoh": service.router.settings.model_dump(),
+        "spool": str(tmp_path / "s.sqlite"),
+        "flush_s": 0.1,
+    }
     (tmp_path / "agent.json").write_text(json.dumps(config))
-    words = ["run", "--source", can, "--source", gpsd, "--profile", name, "--dbc", str(dbc), "--trust"]
-    words += ["--vehicle", str(tmp_path / "car.json"), "--config", str(tmp_path / "agent.json"), "--estimator", "ckf"]
+    words = [
+        "run",
+        "--source",
+        can,
+        "--source",
+        gpsd,
+        "--profile",
+        name,
+        "--dbc",
+        str(dbc),
+        "--trust",
+    ]
+    words += [
+        "--vehicle",
+        str(tmp_path / "car.json"),
+        "--config",
+        str(tmp_path / "agent.json"),
+        "--estimator",
+        "ckf",
+    ]
     command = [sys.executable, "-m", "edge_agent.cli"]
-    agent = subprocess.Popen([*command, *words, "--name", "car-one"], stdout=subprocess.PIPE, text=True)
+    agent = subprocess.Popen(
+        [*command, *words, "--name", "car-one"], stdout=subprocess.PIPE, text=True
+    )
     with peer("can", bus, 100_000) as one, peer("gpsd", receiver, 100_000, 5.0) as other:
         for running in (one, other):
             running.until("ready")
@@ -209,9 +241,24 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
     assert {batch.vehicle for batch in service.batches} == {"car-one"}
 
 
-def test_live_sources_and_a_log_do_not_go_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_sources_and_a_log_do_not_go_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
-    assert main(["run", "--source", "gpsd:", "--source", "simulated", "--vehicle", str(tmp_path / "car.json")]) == 2
+    assert (
+        main(
+            [
+                "run",
+                "--source",
+                "gpsd:",
+                "--source",
+                "simulated",
+                "--vehicle",
+                str(tmp_path / "car.json"),
+            ]
+        )
+        == 2
+    )
     assert "together" in capsys.readouterr().err
     assert main(["run", "--source", "gpsd:", "--profile", "toyota"]) == 2
     assert "--vehicle" in capsys.readouterr().err
@@ -221,7 +268,14 @@ def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Pa
     from tests.schemas.test_documents import descriptor
 
     folder = Path(live.__file__).parent / "kuksa"
-    words = ["-m", "grpc_tools.protoc", "-I", str(folder), f"--python_out={tmp_path}", "broker.proto"]
+    words = [
+        "-m",
+        "grpc_tools.protoc",
+        "-I",
+        str(folder),
+        f"--python_out={tmp_path}",
+        "broker.proto",
+    ]
     subprocess.run([sys.executable, *words], check=True)
     made, kept = ((place / "broker_pb2.py").read_text() for place in (tmp_path, folder))
     assert descriptor(made) == descriptor(kept)

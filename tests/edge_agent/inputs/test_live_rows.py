@@ -44,7 +44,9 @@ class Scripted(Feed):
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
         names = {name for _, values in heard for name in values}
-        found = {name: [(t, values[name]) for t, values in heard if name in values] for name in names}
+        found = {
+            name: [(t, values[name]) for t, values in heard if name in values] for name in names
+        }
         return {name: Series(*np.array(pairs).T) for name, pairs in found.items()}
 
     def tell(self, t: float, **values: float) -> None:
@@ -57,14 +59,23 @@ def clock() -> Steered:
 
 
 def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None = None) -> LiveRows:
-    profile = Profile(name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl")})
+    profile = Profile(
+        name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl")}
+    )
     return LiveRows(feeds, profile, CAR, clock, wait=wait or clock.move)
 
 
-def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> None:
+def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> (
+    None
+):
     own, other = Stamps(), Stamps()
     delays = [0.3, 0.05, 0.2, 0.11]
-    assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [10.0, 11.0, 12.0, 13.0]
+    assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [
+        10.0,
+        11.0,
+        12.0,
+        13.0,
+    ]
     places = [other.place(k - 5000.0, k + delay) for k, delay in enumerate(delays)]
     assert places[1:] == pytest.approx([1.05, 2.05, 3.05])
     early = Stamps()
@@ -82,7 +93,9 @@ def test_a_clock_that_is_set_under_way_is_followed() -> None:
     assert placed == pytest.approx(k + 0.02)
 
 
-def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(clock: Steered) -> None:
+def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(
+    clock: Steered,
+) -> None:
     feed, last = Scripted("bus", clock), 4.0
     ticks = iter(np.arange(0.0, last + 0.01, 0.02).tolist())  # 50 Hz
     due = [next(ticks)]
@@ -98,7 +111,9 @@ def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(clo
     rows = rows_of(clock, feed, wait=wait)
     blocks = rows.blocks()
     got = [next(blocks) for _ in range(60)]
-    t, signals = (np.concatenate([getattr(block, name)[:, 0] for block in got]) for name in ("t", "signals"))
+    t, signals = (
+        np.concatenate([getattr(block, name)[:, 0] for block in got]) for name in ("t", "signals")
+    )
     told = t <= last + 1e-9
     assert np.allclose(signals[told, S.AX], 5.0 * t[told], atol=1e-6)
     assert np.isnan(signals[~told, S.AX]).all()
@@ -131,7 +146,9 @@ def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> N
     for _ in range(8):
         next(blocks)
     now = clock.now()
-    receiver.tell(now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0)  # north, and its row has gone
+    receiver.tell(
+        now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0
+    )  # north, and its row has gone
     block = next(blocks)
     place = np.isfinite(block.signals[:, 0, S.LATITUDE])
     assert np.flatnonzero(place).tolist() == [0]
@@ -152,7 +169,9 @@ def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> No
     for _ in range(10):
         receiver.tell(clock.now() + 86_400.0, latitude=50.0, longitude=10.0, speed=0.0, course=0.0)
         block = next(blocks)
-    assert (block.time[0, 0] - clock.start_ns) / NS == pytest.approx(86_400.0 + block.t[0, 0], abs=0.01)
+    assert (block.time[0, 0] - clock.start_ns) / NS == pytest.approx(
+        86_400.0 + block.t[0, 0], abs=0.01
+    )
     blocks.close()
 
 
@@ -170,7 +189,9 @@ class Failing(Scripted):
             self.stopping.wait()
 
 
-def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     feed = Failing("bus", HostClock())
     with caplog.at_level(logging.WARNING):
         feed.start()
@@ -182,7 +203,9 @@ def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(caplog: pyte
     ]  # fmt: skip
 
 
-def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counted(clock: Steered) -> None:
+def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counted(
+    clock: Steered,
+) -> None:
     feed = Scripted("bus", clock)
     rows = rows_of(clock, feed)
     blocks = rows.blocks()
@@ -212,7 +235,9 @@ class Hanging(Scripted):
         self.released.wait()
 
 
-def test_a_source_that_hangs_is_left_behind_and_known_to_be(clock: Steered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_that_hangs_is_left_behind_and_known_to_be(
+    clock: Steered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(feed, "LEAVE_S", 0.01)
     hanging, other = Hanging("hanging", clock), Scripted("other", clock)
     for source in (hanging, other):

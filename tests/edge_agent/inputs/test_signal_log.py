@@ -34,9 +34,18 @@ def test_the_channels_come_in_their_order(tmp_path: Path) -> None:
     assert log.start_ns is None
 
 
-def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(tmp_path: Path) -> None:
-    columns = {name: c for name, c in a_log(5).items() if not name.startswith(("torque", "latitude", "yaw"))}
-    columns |= {"yaw_rate": pa.array([0.1, None, 0.1, 0.1, 0.1]), "ax": np.array([1.0, np.inf, np.nan, -np.inf, 1.0])}
+def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(
+    tmp_path: Path,
+) -> None:
+    columns = {
+        name: c
+        for name, c in a_log(5).items()
+        if not name.startswith(("torque", "latitude", "yaw"))
+    }
+    columns |= {
+        "yaw_rate": pa.array([0.1, None, 0.1, 0.1, 0.1]),
+        "ax": np.array([1.0, np.inf, np.nan, -np.inf, 1.0]),
+    }
     log = read(tmp_path, columns)
     assert np.isnan(log.signals[:, [S.LATITUDE, S.YAW, S.TORQUE, S.TORQUE + 3]]).all()
     assert np.isnan(log.signals[:, S.YAW_RATE]).tolist() == [False, True, False, False, False]
@@ -55,7 +64,9 @@ def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(tm
 def test_steering_without_a_column_is_the_other_front_wheels_or_none_at_the_rear(
     tmp_path: Path, without: tuple[str, ...], expected: list[float]
 ) -> None:
-    columns = a_log(3) | {name: np.full(3, 0.1 * (i + 1)) for i, name in enumerate(per_wheel("delta"))}
+    columns = a_log(3) | {
+        name: np.full(3, 0.1 * (i + 1)) for i, name in enumerate(per_wheel("delta"))
+    }
     log = read(tmp_path, {name: c for name, c in columns.items() if name not in without})
     assert log.signals[0, S.DELTA : S.DELTA + 4].tolist() == pytest.approx(expected)
 
@@ -73,7 +84,9 @@ MOMENTS = 1_767_225_600 * NS + np.array([0, 10, 25]) * 10_000_000
     ],
     ids=["ns UTC", "us", "int64 ns", "float s"],
 )
-def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(tmp_path: Path, column: pa.Array[Any]) -> None:
+def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(
+    tmp_path: Path, column: pa.Array[Any]
+) -> None:
     columns = {name: c for name, c in a_log(3).items() if name != "t"} | {"timestamp": column}
     log = read(tmp_path, columns)
     assert np.allclose(log.t, [0.0, 0.1, 0.25], atol=1e-6)

@@ -13,7 +13,10 @@ from schemas.mugrid import STEPS_PER_NAT
 
 def test_a_longer_way_costs_more_and_a_route_less_than_none() -> None:
     known = cost.streets()
-    short, long = (cost.drive(np.random.default_rng(1), known, metres, routed=True)[0] for metres in (300.0, 1500.0))
+    short, long = (
+        cost.drive(np.random.default_rng(1), known, metres, routed=True)[0]
+        for metres in (300.0, 1500.0)
+    )
     assert 0.0 < short < long
     figures = {figure.name: figure.value for figure in cost.figures(1, 1000.0)}
     assert figures["ahead.mb_per_day"] < figures["ahead.mb_per_day.unrouted"]
@@ -31,9 +34,14 @@ def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
     track = approaches._Track([10.0 * k for k in range(30)], [10.0] * 30, mu, mu)
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (1, 0), "who is not told is not warned"
-    track.raised = {"ice": approaches._Raised(12, 80.0, 50.0), "nothing": approaches._Raised(2, 30.0, 20.0, ended=8)}
+    track.raised = {
+        "ice": approaches._Raised(12, 80.0, 50.0),
+        "nothing": approaches._Raised(2, 30.0, 20.0, ended=8),
+    }
     approaches._judge(track, deaf)
-    assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), "the first in time; the second of nothing"
+    assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), (
+        "the first in time; the second of nothing"
+    )
     track.raised["ice"].ended = 18
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (3, 1), "a warning that was taken back is none"
@@ -59,7 +67,9 @@ def test_a_map_that_is_right_helps_at_entry_and_nothing_of_it_is_published() -> 
     with_, without = entry.entry_errors(trace, known, entry.START_NS).mean(axis=0)
     assert with_ < without
     assert entry.published_change(fleet, trace, 6.0) == 0.0
-    other = entry.FilterTrace(trace.place, trace.own, trace.visit, trace.truth, [bytes(32)] * len(trace.published))
+    other = entry.FilterTrace(
+        trace.place, trace.own, trace.visit, trace.truth, [bytes(32)] * len(trace.published)
+    )
     assert entry.published_change(fleet, other, 6.0) > 1.0 / STEPS_PER_NAT, "a change would be seen"
 
 

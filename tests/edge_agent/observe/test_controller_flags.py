@@ -7,14 +7,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from edge_agent.observe.controller_flags import OFF_S, STANDING_S, doubted_flags, new_flag_records, trusted_context
+from edge_agent.observe.controller_flags import (
+    OFF_S,
+    STANDING_S,
+    doubted_flags,
+    new_flag_records,
+    trusted_context,
+)
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT, FLAGS, C, S
 
 RATE = 100
 
 
-def drive(on: FloatArray, omega: FloatArray | float = 50.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def drive(
+    on: FloatArray, omega: FloatArray | float = 50.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times, signals and context of one car whose ABS flag is `on` (T,)."""
     t = np.arange(len(on))[:, None] / RATE
     signals = np.full((len(on), 1, len(CHANNELS)), np.nan)
@@ -36,7 +44,9 @@ def test_context_has_the_flags_first() -> None:
 
 
 def test_interventions_of_a_winter_drive_are_passed_on_as_they_are() -> None:
-    on = seconds((30.0, 0.0), (2.0, 1.0), (20.0, 0.0), (25.0, 1.0), (60.0, 0.0), (4.0, 1.0), (5.0, 0.0))
+    on = seconds(
+        (30.0, 0.0), (2.0, 1.0), (20.0, 0.0), (25.0, 1.0), (60.0, 0.0), (4.0, 1.0), (5.0, 0.0)
+    )
     given = drive(on)
     records, found = trusted_context(new_flag_records(1), *given)
     assert np.array_equal(found, given[2], equal_nan=True)

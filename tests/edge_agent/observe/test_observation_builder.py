@@ -10,7 +10,13 @@ import pytest
 
 from edge_agent.inputs.context import context_block
 from edge_agent.observe.cell_tracker import NOWHERE, locate
-from edge_agent.observe.observation_builder import FELT_STD, WHEEL_SHARE, OpenVisits, RecordBlock, observe
+from edge_agent.observe.observation_builder import (
+    FELT_STD,
+    WHEEL_SHARE,
+    OpenVisits,
+    RecordBlock,
+    observe,
+)
 from schemas import grid, mugrid
 from schemas.config import AgentConfig
 from schemas.signals import S
@@ -24,8 +30,12 @@ if TYPE_CHECKING:
 
 def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
     """Columns of several blocks, one after the other, with vehicle and urgent."""
-    columns = {name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns}
-    whose = {name: np.concatenate([getattr(r, name) for r in records]) for name in ("vehicle", "urgent")}
+    columns = {
+        name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns
+    }
+    whose = {
+        name: np.concatenate([getattr(r, name) for r in records]) for name in ("vehicle", "urgent")
+    }
     return columns | whose
 
 
@@ -66,10 +76,14 @@ def test_an_observation_tells_its_visit() -> None:
     assert columns["leave_time"][1] == START_NS + (second - 1) * 100_000_000
     assert columns["mu"][1] == np.float32(reported.mu[second - 1, 0])
     assert columns["mu_upper"][1] == np.float32(reported.mu_upper[second - 1, 0])
-    assert columns["speed"][1] == pytest.approx(np.hypot(reported.vx, reported.vy)[first:second].mean(), rel=1e-6)
+    assert columns["speed"][1] == pytest.approx(
+        np.hypot(reported.vx, reported.vy)[first:second].mean(), rel=1e-6
+    )
     assert columns["health"][1] == np.bitwise_or.reduce(reported.health[first:second, 0])
     assert reported.evidence is not None
-    assert np.array_equal(columns["log_likelihood"][1], mugrid.encode_log_likelihood(reported.evidence[second, 0]))
+    assert np.array_equal(
+        columns["log_likelihood"][1], mugrid.encode_log_likelihood(reported.evidence[second, 0])
+    )
     assert columns["sector"].tolist() == [0] * len(columns["sector"])
 
 
@@ -95,7 +109,9 @@ def test_a_bank_without_evidence_sends_no_likelihood() -> None:
 
 def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     block, reported = wanderers(100, 2), estimates(100, 2)
-    unknown = type(reported)(**{**vars(reported), "evidence": np.full_like(reported.evidence, np.nan)})
+    unknown = type(reported)(
+        **{**vars(reported), "evidence": np.full_like(reported.evidence, np.nan)}
+    )
     _, observations, _ = Watch.of(2).step(block, unknown)
     assert not observations.columns["log_likelihood"].any()
     assert observations.columns["log_likelihood"].shape[1] == mugrid.BINS
@@ -108,7 +124,9 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
     """The interval is mu ± 0.05, and slippery means below 0.4."""
-    _, observations, states = Watch.of(3).step(wanderers(150, 3), estimates(150, 3, mu=mu, used=used))
+    _, observations, states = Watch.of(3).step(
+        wanderers(150, 3), estimates(150, 3, mu=mu, used=used)
+    )
     assert set(observations.urgent.tolist()) == {urgent}
     assert not states.urgent.any()
 
@@ -117,12 +135,17 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     """Braking ends just before the border; the estimator's window still shows it for a second."""
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
-    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
+    block, reported = (
+        ground(east, np.zeros_like(east), np.zeros_like(east)),
+        estimates(samples, 1, mu=0.9),
+    )
     used = np.full((samples, 1), 0.1)
     located, *_ = Watch.of(1).step(block, reported)
     border = np.flatnonzero(located.closes[:, 0])[1]
     used[border - 5 : border + 9] = 0.7
-    _, observations, _ = Watch.of(1).step(block, type(reported)(**{**vars(reported), "mu_utilised": used}))
+    _, observations, _ = Watch.of(1).step(
+        block, type(reported)(**{**vars(reported), "mu_utilised": used})
+    )
     assert observations.columns["mu_utilised"][:2].tolist() == pytest.approx([0.7, 0.1])
 
 
@@ -130,7 +153,10 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
     """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of the ice."""
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
-    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
+    block, reported = (
+        ground(east, np.zeros_like(east), np.zeros_like(east)),
+        estimates(samples, 1, mu=0.9),
+    )
     used = type(reported)(**{**vars(reported), "mu_utilised": np.full((samples, 1), 0.8)})
     told = []
     for felt in (0.1, 0.8, np.nan):
@@ -138,7 +164,9 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
         signals[..., S.AX], signals[..., S.AY] = -felt * GRAVITY, 0.0
         _, located = locate(Watch.of(1).tracks, block.t, block.signals)
         reading = cast("Estimates", used)
-        _, records, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals)
+        _, records, _ = observe(
+            OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals
+        )
         told.append(float(records.columns["mu_utilised"][0]))
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
@@ -146,12 +174,17 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
 def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
     """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and feels `observed` (T,) g."""
     flat = np.zeros_like(east)
-    block, reported = ground(east, flat, flat, rate_hz=100.0, fix_every=10), estimates(len(east), 1, used=0.9)
+    block, reported = (
+        ground(east, flat, flat, rate_hz=100.0, fix_every=10),
+        estimates(len(east), 1, used=0.9),
+    )
     signals = block.signals.copy()
     signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
     _, located = locate(Watch.of(1).tracks, block.t, signals)
     reading = cast("Estimates", type(reported)(**{**vars(reported), "vx": flat + 10.0, "vy": flat}))
-    _, records, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals)
+    _, records, _ = observe(
+        OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals
+    )
     return [float(used) for used in records.columns["mu_utilised"]]
 
 
@@ -178,12 +211,17 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 
 
 @pytest.mark.parametrize("cut", [None, 31, 33])
-def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_of_the_lesser(cut: int | None) -> None:
+def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_of_the_lesser(
+    cut: int | None,
+) -> None:
     """From ice to dry road within the second visit: it was one or the other, and no more than the ice is told as used,
     though the brakes took .7 before the change was seen."""
     samples = 40
     east = np.arange(samples)[:, None] * 0.5
-    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.8)
+    block, reported = (
+        ground(east, np.zeros_like(east), np.zeros_like(east)),
+        estimates(samples, 1, mu=0.8),
+    )
     located, *_ = Watch.of(1).step(block, reported)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     ice, dry = (-0.5 * np.square((mugrid.CENTRES - mu) / 0.05) for mu in (0.15, 0.8))
@@ -231,23 +269,36 @@ def test_an_observation_tells_what_controllers_and_surroundings_said_in_its_visi
     block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
     _, located = locate(Watch.of(1).tracks, block.t, block.signals)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
-    given = {"abs_active": np.zeros((samples, 1)), "air_temperature": np.linspace(-2.0, 0.0, samples)[:, None]}
+    given = {
+        "abs_active": np.zeros((samples, 1)),
+        "air_temperature": np.linspace(-2.0, 0.0, samples)[:, None],
+    }
     given["abs_active"][first - 1] = 1.0
     given["abs_active"][first + 1 : second] = np.nan
     given["wiper"] = np.where(np.arange(samples)[:, None] < first, 0.5, np.nan)
     context = context_block(samples, 1, given)
     reading = cast("Estimates", reported)
-    _, told, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals, context)
+    _, told, _ = observe(
+        OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals, context
+    )
     columns = told.columns
     assert columns["abs_active"][:2].tolist() == [1, -1]
-    assert columns["esc_active"].tolist() == columns["tcs_active"].tolist() == [-1] * len(told.vehicle)
-    expected = [given["air_temperature"][rows, 0].mean() for rows in (slice(0, first), slice(first, second))]
+    assert (
+        columns["esc_active"].tolist() == columns["tcs_active"].tolist() == [-1] * len(told.vehicle)
+    )
+    expected = [
+        given["air_temperature"][rows, 0].mean() for rows in (slice(0, first), slice(first, second))
+    ]
     assert columns["air_temperature"][:2].tolist() == pytest.approx(expected)
     assert columns["wiper"][0] == 0.5
     assert np.isnan(columns["wiper"][1])
-    _, plain, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals)
+    _, plain, _ = observe(
+        OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals
+    )
     same = columns.keys() - {"abs_active", "air_temperature", "wiper"}
     for name in same:
-        assert np.array_equal(columns[name], plain.columns[name], equal_nan=columns[name].dtype.kind == "f"), name
+        assert np.array_equal(
+            columns[name], plain.columns[name], equal_nan=columns[name].dtype.kind == "f"
+        ), name
     assert plain.columns["abs_active"].tolist() == [-1] * len(told.vehicle)
     assert np.isnan(plain.columns["air_temperature"]).all()

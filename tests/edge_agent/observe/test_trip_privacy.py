@@ -35,8 +35,12 @@ def test_without_the_setting_every_record_passes_at_once() -> None:
     assert reported(TripEnds(1, 0.0, 0.0), 20) == list(range(1, 21))
 
 
-@pytest.mark.parametrize(("metres", "seconds", "cut"), [(50.0, 0.0, 5.0), (0.0, 7.0, 7.0), (30.0, 8.0, 8.0)])
-def test_both_ends_are_cut_by_the_larger_of_way_and_time(metres: float, seconds: float, cut: float) -> None:
+@pytest.mark.parametrize(
+    ("metres", "seconds", "cut"), [(50.0, 0.0, 5.0), (0.0, 7.0, 7.0), (30.0, 8.0, 8.0)]
+)
+def test_both_ends_are_cut_by_the_larger_of_way_and_time(
+    metres: float, seconds: float, cut: float
+) -> None:
     found = reported(TripEnds(1, metres, seconds), 40)
     assert min(found) == pytest.approx(cut, abs=1.01)
     assert max(found) == pytest.approx(40.0 - cut, abs=1.01)

@@ -21,10 +21,20 @@ BOOT = 5
 
 
 def draft(
-    vehicle: str = "car-a", kind: Kind = Kind.OBSERVATION, region: int = REGION, records: int = 1, size: int = 0
+    vehicle: str = "car-a",
+    kind: Kind = Kind.OBSERVATION,
+    region: int = REGION,
+    records: int = 1,
+    size: int = 0,
 ) -> Draft:
     """A batch whose payload spells its seq and first_held."""
-    return Draft(vehicle, kind, region, records, lambda seq, first_held: f"{seq}/{first_held}".encode() + b"." * size)
+    return Draft(
+        vehicle,
+        kind,
+        region,
+        records,
+        lambda seq, first_held: f"{seq}/{first_held}".encode() + b"." * size,
+    )
 
 
 def stream(vehicle: str = "car-a", kind: Kind = Kind.OBSERVATION, boot: int = BOOT) -> Stream:
@@ -42,7 +52,9 @@ def path(tmp_path: Path) -> Path:
 
 def test_seq_is_dense_from_one_in_each_stream(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
-    held = outbox.store([draft(), draft(kind=Kind.STATE), draft(), draft("car-b"), draft(region=9)], now=0.0)
+    held = outbox.store(
+        [draft(), draft(kind=Kind.STATE), draft(), draft("car-b"), draft(region=9)], now=0.0
+    )
     held += outbox.store([draft(), draft(kind=Kind.STATE)], now=0.0)
     outbox.close()
     by_stream: dict[Stream, list[int]] = {}
@@ -104,7 +116,9 @@ os.kill(os.getpid(), signal.SIGKILL)
     outbox = Outbox(path, boot=BOOT + 1)
     assert outbox.records({"car-a"}) == 12
     left = outbox.due(now=0.0, limit=10)
-    assert [(b.stream.boot, b.seq, b.payload) for b in left] == [(BOOT, s, b"kept %d" % s) for s in (1, 2, 3, 4)]
+    assert [(b.stream.boot, b.seq, b.payload) for b in left] == [
+        (BOOT, s, b"kept %d" % s) for s in (1, 2, 3, 4)
+    ]
     assert outbox.store([draft()], now=0.0)[0].seq == 1
     assert outbox.settle(stream(), [(1, 4)]) == 12
     assert outbox.batches == 1
@@ -145,7 +159,9 @@ def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
         put += [(second, batch.seq) for batch in outbox.due(began + second, limit=64)]
     assert 20 <= len(put) <= 50
     assert put[-1][0] - put[-2][0] <= LONGEST_PROBE_S * (1 + JITTER) + 5
-    assert len({seq for _, seq in put}) > 5  # not always the same: one may be such that nobody can answer it
+    assert (
+        len({seq for _, seq in put}) > 5
+    )  # not always the same: one may be such that nobody can answer it
     outbox.close()
 
 
@@ -189,9 +205,9 @@ def test_reconnect_sends_everything_again_oldest_first_and_once(path: Path) -> N
     outbox.reoffer("car-a", now=1.0)
     assert seqs(outbox.due(now=1.0, limit=9)) == [1, 2, 3, 4, 5]
     assert outbox.due(now=1.0, limit=9) == []
-    assert [b.stream.vehicle for b in outbox.due(now=4.0 * (1 + JITTER) - 0.01, limit=9) if b.seq == 1].count(
-        "car-a"
-    ) <= 1
+    assert [
+        b.stream.vehicle for b in outbox.due(now=4.0 * (1 + JITTER) - 0.01, limit=9) if b.seq == 1
+    ].count("car-a") <= 1
     outbox.close()
 
 
@@ -286,7 +302,9 @@ def test_a_batch_that_cannot_be_encoded_leaves_no_gap(path: Path) -> None:
 
 def test_one_outbox_never_serves_two_agents(path: Path) -> None:
     outbox = Outbox(path)
-    with pytest.raises(InputError, match="spool: .* is used by another agent; give each agent its own"):
+    with pytest.raises(
+        InputError, match="spool: .* is used by another agent; give each agent its own"
+    ):
         Outbox(path)
     outbox.close()
     Outbox(path).close()
@@ -329,7 +347,9 @@ def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) ->
     """A day of a vehicle is 170 000 batches."""
     count = 20_000
     outbox = Outbox(path, boot=BOOT)
-    outbox.store([draft(kind=(Kind.STATE, Kind.OBSERVATION)[k % 2], size=200) for k in range(count)], now=0.0)
+    outbox.store(
+        [draft(kind=(Kind.STATE, Kind.OBSERVATION)[k % 2], size=200) for k in range(count)], now=0.0
+    )
     outbox.close()
     tracemalloc.start()
     try:

@@ -30,13 +30,17 @@ Make = Callable[..., Publisher]
 
 def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
     """Observations and states of a random drive of three vehicles."""
-    _, observations, states = Watch.of(3).step(wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8))
+    _, observations, states = Watch.of(3).step(
+        wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8)
+    )
     return observations, states
 
 
 def rows(batches: list[Batch], kind: Kind) -> int:
     """Records received, each identity once."""
-    return sum({(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values())
+    return sum(
+        {(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values()
+    )
 
 
 def settings(router: Router, tmp_path: Path, **changes: object) -> AgentConfig:
@@ -45,7 +49,9 @@ def settings(router: Router, tmp_path: Path, **changes: object) -> AgentConfig:
 
 
 def publisher_of(config: AgentConfig, names: tuple[str, ...] = NAMES) -> Publisher:
-    publisher = Publisher(names, Outbox(config.spool, first_resend_s=config.resend_s), config, "test")
+    publisher = Publisher(
+        names, Outbox(config.spool, first_resend_s=config.resend_s), config, "test"
+    )
     publisher.start()
     return publisher
 
@@ -63,17 +69,25 @@ def test_every_record_arrives_once_under_its_vehicles_key_and_is_settled(
     assert rows(service.batches, Kind.STATE) == len(states.vehicle)
     for key, batch in zip(service.keys, service.batches, strict=True):
         parsed = keys.parse(key)
-        assert (parsed.name, parsed.quadint, parsed.topic.name) == (batch.vehicle, batch.region, batch.kind)
+        assert (parsed.name, parsed.quadint, parsed.topic.name) == (
+            batch.vehicle,
+            batch.region,
+            batch.kind,
+        )
         assert batch.estimator == "test"
 
 
-def test_columns_arrive_as_they_were_observed(router: Router, service: Service, tmp_path: Path) -> None:
+def test_columns_arrive_as_they_were_observed(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     observations, _ = drive()
     publisher.offer(observations)
     assert publisher.close(within_s=10.0)
     for n, name in enumerate(NAMES):
-        mine = sorted((b for b in service.batches if b.vehicle == name), key=lambda b: (b.region, b.seq))
+        mine = sorted(
+            (b for b in service.batches if b.vehicle == name), key=lambda b: (b.region, b.seq)
+        )
         regions = grid.region_of(observations.columns["cell"])
         order = np.lexsort([np.arange(len(regions)), regions])
         chosen = order[observations.vehicle[order] == n]
@@ -204,7 +218,9 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     publisher.offer(observations)
     service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
     mine = next(b for b in service.batches if b.vehicle == "car-a")
-    settled = StreamAck(mine.boot, mine.kind, mine.region, ((mine.seq, mine.seq),), late=((mine.seq, mine.seq),))
+    settled = StreamAck(
+        mine.boot, mine.kind, mine.region, ((mine.seq, mine.seq),), late=((mine.seq, mine.seq),)
+    )
     assert health_problems(publisher, Progress()) == []
     with caplog.at_level(logging.WARNING):
         service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() + 130 * NS))
@@ -244,9 +260,15 @@ def test_a_full_disk_is_waited_for(
         assert seqs == set(range(1, len(seqs) + 1))
 
 
-def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(router: Router, service: Service, tmp_path: Path) -> None:
+def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
     def alive() -> set[str]:
-        return {str(r.ok.key_expr) for r in service.session.liveliness().get(f"{keys.ROOT}/alive/*") if r.ok}
+        return {
+            str(r.ok.key_expr)
+            for r in service.session.liveliness().get(f"{keys.ROOT}/alive/*")
+            if r.ok
+        }
 
     publisher = publisher_of(settings(router, tmp_path))
     until(lambda: alive() == {keys.alive_key(name) for name in NAMES})
@@ -272,7 +294,9 @@ def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
     assert len(chosen) == records
     columns = {name: column[chosen] for name, column in observations.columns.items()}
     columns["cell"] = np.full(records, columns["cell"][0])
-    return RecordBlock(Kind.OBSERVATION, columns, observations.vehicle[chosen], np.full(records, urgent))
+    return RecordBlock(
+        Kind.OBSERVATION, columns, observations.vehicle[chosen], np.full(records, urgent)
+    )
 
 
 def test_a_batch_waits_for_its_time_or_for_fifty_records() -> None:

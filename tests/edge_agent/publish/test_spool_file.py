@@ -22,7 +22,13 @@ def stored(path: Path) -> dict[int, bytes]:
     random_ = random.Random(7)
     payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]
     outbox = Outbox(path, boot=5)
-    outbox.store([Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f, p=p: p) for p in payloads], 0.0)  # type: ignore[misc]
+    outbox.store(
+        [
+            Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f, p=p: p)  # type: ignore[misc]
+            for p in payloads
+        ],
+        0.0,
+    )
     outbox.close()
     return dict(enumerate(payloads, 1))
 
@@ -46,7 +52,10 @@ def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) 
         held = found(outbox.held_batches())
         assert held.items() <= whole.items(), "a batch is not what was stored"
         least = min(least, len(held))
-        assert outbox.store([Draft("car-a", Kind.STATE, 77, 1, lambda s, f: b"goes on")], 0.0)[0].seq == 1
+        assert (
+            outbox.store([Draft("car-a", Kind.STATE, 77, 1, lambda s, f: b"goes on")], 0.0)[0].seq
+            == 1
+        )
         outbox.close()
         assert len(list(folder.glob("spool.sqlite.damaged-*"))) == outbox.counts.damages
     assert noticed > pages // 5

@@ -20,7 +20,18 @@ from tests.edge_agent.service import Router, Service
 from tests.waiting import matched, until
 
 START = 1_800_000_000 * NS
-WORDS = ["run", "--scenario", "test", "--estimator", "ckf", "--name", "car-one", "--duration", "6", "--vss"]
+WORDS = [
+    "run",
+    "--scenario",
+    "test",
+    "--estimator",
+    "ckf",
+    "--name",
+    "car-one",
+    "--duration",
+    "6",
+    "--vss",
+]
 
 
 def grip(mu: float, lower: float, upper: float, used: float, seconds: float = 0.0) -> Grip:
@@ -29,11 +40,19 @@ def grip(mu: float, lower: float, upper: float, used: float, seconds: float = 0.
 
 
 def names(known: dict[str, float]) -> dict[str, float]:
-    return {name.removeprefix(f"{BRANCH}."): value for name, value in known.items() if name.startswith(BRANCH)}
+    return {
+        name.removeprefix(f"{BRANCH}."): value
+        for name, value in known.items()
+        if name.startswith(BRANCH)
+    }
 
 
 def test_quantiles_are_percent_and_clipped() -> None:
-    assert names(road_friction(0.312, 0.25, 0.4, 0.3)) == {"MostProbable": 31.2, "LowerBound": 25.0, "UpperBound": 40.0}
+    assert names(road_friction(0.312, 0.25, 0.4, 0.3)) == {
+        "MostProbable": 31.2,
+        "LowerBound": 25.0,
+        "UpperBound": 40.0,
+    }
     assert names(road_friction(1.05, 0.9, 1.18, 1.0)) == {
         "MostProbable": 100.0,
         "LowerBound": 90.0,
@@ -70,7 +89,9 @@ def test_it_is_put_where_somebody_listens_as_it_is_printed(router: Router) -> No
     ):
         output.attach("car-one", car)
         output.tell(grip(0.3, 0.2, 0.4, 0.3))
-        dashboard.declare_subscriber(keys.vss_key("car-one"), lambda sample: heard.append(sample.payload.to_string()))
+        dashboard.declare_subscriber(
+            keys.vss_key("car-one"), lambda sample: heard.append(sample.payload.to_string())
+        )
         matched(output.publishers["car-one"])
         output.tell(grip(0.3, 0.2, 0.4, 0.3, 1.0))
         until(lambda: heard)
@@ -83,7 +104,9 @@ def test_the_command_prints_lines_of_the_drive(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "agent.json"
-    config.write_text(json.dumps({"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}))
+    config.write_text(
+        json.dumps({"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")})
+    )
     with Service(router):
         assert main([*WORDS, "--config", str(config)]) == 0
     *lines, _ = capsys.readouterr().out.splitlines()

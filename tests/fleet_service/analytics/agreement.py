@@ -22,8 +22,21 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     """Return the difference, or None."""
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
-        return f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
-    keys = ["day", "cell", "sector", "onset", "vehicle", "period", "basis", "age_h", "temperature", "frame"]
+        return (
+            f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
+        )
+    keys = [
+        "day",
+        "cell",
+        "sector",
+        "onset",
+        "vehicle",
+        "period",
+        "basis",
+        "age_h",
+        "temperature",
+        "frame",
+    ]
     by: list[tuple[str, Literal["ascending", "descending"]]] = [
         (name, "ascending") for name in keys if name in one.schema.names
     ]
@@ -33,7 +46,9 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     for name in one.schema.names:
         a, b = one[name].to_pylist(), other[name].to_pylist()
         if pa.types.is_floating(one[name].type):
-            x, y = (np.array([np.nan if v is None else float(v) for v in column]) for column in (a, b))
+            x, y = (
+                np.array([np.nan if v is None else float(v) for v in column]) for column in (a, b)
+            )
             if not np.allclose(x, y, RELATIVE, ABSOLUTE, equal_nan=True):
                 return f"{name}: by up to {np.nanmax(np.abs(x - y)):.3g}"
         elif a != b:
@@ -50,9 +65,22 @@ def roads_along(cells: IntArray) -> pa.Table:
         for k in range(0, len(on) - 1, 40):
             ends = grid.interleave(on[[k, min(k + 40, len(on) - 1)]], np.full(2, line))
             latitude, longitude = grid.centre(ends)
-            found.append(DirectedLink(f"{line}-{k}", "forward", f"road {line}", "primary", latitude, longitude))
             found.append(
-                DirectedLink(f"{line}-{k}", "backward", f"road {line}", "primary", latitude[::-1], longitude[::-1])
+                DirectedLink(
+                    f"{line}-{k}", "forward", f"road {line}", "primary", latitude, longitude
+                )
             )
-    found.append(DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01])))
+            found.append(
+                DirectedLink(
+                    f"{line}-{k}",
+                    "backward",
+                    f"road {line}",
+                    "primary",
+                    latitude[::-1],
+                    longitude[::-1],
+                )
+            )
+    found.append(
+        DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01]))
+    )
     return join_roads(RoadNetwork(found, {}))

@@ -43,14 +43,20 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 def rebuilt_map(out: Path) -> pa.Table:
     """All zones of a rebuilt map, in the order of a map."""
-    parts = [pq.read_table(path, partitioning=None) for path in sorted((out / "map").glob("*/*/*.parquet"))]
+    parts = [
+        pq.read_table(path, partitioning=None)
+        for path in sorted((out / "map").glob("*/*/*.parquet"))
+    ]
     whole = pa.concat_tables([part.replace_schema_metadata(None) for part in parts])
     return whole.sort_by([("cell", "ascending"), ("sector", "ascending")])
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
     """The largest difference of a number of two maps; infinite where their cells, or what is null, are not the same."""
-    if not all(ours[name].equals(theirs[name]) for name in ("cell", "sector", "basis", "first_time", "last_time")):
+    if not all(
+        ours[name].equals(theirs[name])
+        for name in ("cell", "sector", "basis", "first_time", "last_time")
+    ):
         return np.inf
     worst = 0.0
     for name in NUMBERS:
@@ -63,4 +69,8 @@ def difference(ours: pa.Table, theirs: pa.Table) -> float:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file below a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }

@@ -58,7 +58,11 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def rows(archive: Path) -> pd.DataFrame:
     """All rows; `time` in whole seconds, `value`: whether mu was told, as the contract says it."""
-    frame = pa.concat_tables(reading.read(archive, Kind.OBSERVATION)).drop_columns(["log_likelihood"]).to_pandas()
+    frame = (
+        pa.concat_tables(reading.read(archive, Kind.OBSERVATION))
+        .drop_columns(["log_likelihood"])
+        .to_pandas()
+    )
     frame["time"] = frame["leave_time"].astype("datetime64[us, UTC]").astype("int64") // 10**6
     frame["value"] = frame["mu_utilised"].astype(float) >= 0.6 * frame["mu"].astype(float) - 1e-6
     frame["mu"] = frame["mu"].astype(float)
@@ -95,7 +99,10 @@ def asked(archive: Path) -> Callable[..., pa.Table]:
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
         said: list[str] = []
-        found = QUESTIONS[name].ask(QueryEngine(engine, archive, part), Options(report=said.append, **options))  # type: ignore[arg-type]
+        found = QUESTIONS[name].ask(
+            QueryEngine(engine, archive, part),
+            Options(report=said.append, **options),  # type: ignore[arg-type]
+        )
         return found.replace_schema_metadata({"said": "\n".join(said)})
 
     return ask

@@ -28,11 +28,15 @@ def analyze(archive: Path, *words: str) -> int:
     return main(["analyze", words[0], "--archive", str(archive), *DAYS, *words[1:]])
 
 
-@pytest.mark.parametrize("name", sorted(set(QUESTIONS) - {"contract"}))  # which wants roads: roads/test_contract.py
+@pytest.mark.parametrize(
+    "name", sorted(set(QUESTIONS) - {"contract"})
+)  # which wants roads: roads/test_contract.py
 def test_every_question_prints_a_table_and_says_what_it_reads(
     archive: Path, stations: Path, name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    more = {"before-after": ["--at", "2026-01-28"], "weather": ["--stations", str(stations)]}.get(name, [])
+    more = {"before-after": ["--at", "2026-01-28"], "weather": ["--stations", str(stations)]}.get(
+        name, []
+    )
     out = tmp_path / "answer.parquet"
     assert analyze(archive, name, *more, "--out", str(out)) == 0
     said = capsys.readouterr()
@@ -44,7 +48,9 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else explained(name)
 
 
-MAP = {field.name for field in tables.MAP_CELL}  # that map-columns.md explains: tests/deploy/test_docs.py
+MAP = {
+    field.name for field in tables.MAP_CELL
+}  # that map-columns.md explains: tests/deploy/test_docs.py
 
 
 def explained(question: str) -> set[str]:
@@ -68,13 +74,17 @@ def test_an_answer_with_a_place_becomes_geoparquet_geojson_and_a_map(
     assert "http" not in page.replace("http-equiv", "")
     data = json.loads(page.split("const data = ")[1].split(";\n")[0])
     assert len(data["panels"][0]["values"]) == len(data["rows"]) == len(frame)
-    assert len(data["boxes"]) == frame["cells"].sum() == sum(len(one.geoms) for one in frame.geometry)
+    assert (
+        len(data["boxes"]) == frame["cells"].sum() == sum(len(one.geoms) for one in frame.geometry)
+    )
     assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
     assert "<svg" in (tmp_path / "worst.svg").read_text()
     capsys.readouterr()
 
 
-def test_a_day_becomes_a_page_with_frames(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_day_becomes_a_page_with_frames(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "day.html"
     assert analyze(archive, "replay", "--step", "21600", "--out", str(out)) == 0
     data = json.loads(out.read_text().split("const data = ")[1].split(";\n")[0])
@@ -110,7 +120,9 @@ def test_the_first_question_as_geojson_has_its_days_as_text(archive: Path, tmp_p
 
 
 @pytest.mark.parametrize("step", ["-5", "0.0001", "nan", "inf"])
-def test_a_step_that_is_none_is_refused_at_once(archive: Path, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_step_that_is_none_is_refused_at_once(
+    archive: Path, step: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert analyze(archive, "replay", "--step", step) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("error: step: ")
 
@@ -130,7 +142,9 @@ def test_a_file_that_could_not_be_finished_is_none(tmp_path: Path) -> None:
     table = geo.with_cells(pa.table({"cell": [CELL], "odd": [b"\x00"], "mu": [float("nan")]}))
     path = tmp_path / "a.geojson"
     path.write_text("as it was")
-    broken = table.set_column(table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01"]))
+    broken = table.set_column(
+        table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01"])
+    )
     with pytest.raises((ValueError, struct.error)):
         extract.write(broken, path)
     assert path.read_text() == "as it was"

@@ -39,7 +39,11 @@ def test_the_fit_finds_the_rate_and_the_misreadings_of_a_known_process() -> None
 
 def counted(days: list[FloatArray]) -> pa.Table:
     rows = [
-        {"day": f"2026-01-{day + 1:02}", "octave": octave, **dict(zip(NAMES, counts.tolist(), strict=True))}
+        {
+            "day": f"2026-01-{day + 1:02}",
+            "octave": octave,
+            **dict(zip(NAMES, counts.tolist(), strict=True)),
+        }
         for day, one in enumerate(days)
         for octave, counts in enumerate(one)
         if counts[0] > 0
@@ -74,7 +78,9 @@ def test_few_days_have_no_interval() -> None:
 
 def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.DataFrame) -> None:
     found = asked("change-rates").to_pandas()
-    told = rows[rows["value"]].sort_values(["cell", "sector", "time", "vehicle", "boot", "seq", "row"])
+    told = rows[rows["value"]].sort_values(
+        ["cell", "sector", "time", "vehicle", "boot", "seq", "row"]
+    )
     before = told.groupby(["cell", "sector"])[["time", "vehicle", "mu"]].shift()
     apart = told["time"] - before["time"]
     pair = (before["vehicle"] != told["vehicle"]) & (apart >= 1) & (apart <= LONGEST_S)

@@ -10,7 +10,9 @@ from fleet_service.analytics import example
 from fleet_service.analytics.synthetic import SyntheticFleet
 
 
-def test_the_example_draws_its_figures(tmp_path: Path, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_draws_its_figures(
+    tmp_path: Path, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert example.main(["--archive", str(archive), "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {
         "grip.html", "worst.html", "spells.png", "before-after.png", "vehicles.png",

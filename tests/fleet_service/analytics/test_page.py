@@ -28,13 +28,24 @@ def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     more: dict[str, list[str]] = {name: [] for name in PLACED} | {"frames": ["--step", "21600"]}
     for name, words in more.items():
         question = "replay" if name == "frames" else name
-        command = ["analyze", question, "--archive", str(archive), *DAYS, *words, "--out", str(folder / f"{name}.html")]
+        command = [
+            "analyze",
+            question,
+            "--archive",
+            str(archive),
+            *DAYS,
+            *words,
+            "--out",
+            str(folder / f"{name}.html"),
+        ]
         assert main(command) == 0
     return {name: folder / f"{name}.html" for name in more}
 
 
 @pytest.mark.parametrize("name", [*PLACED, "frames"])
-def test_a_page_opens_without_an_error_or_a_network_and_draws_its_cells(pages: dict[str, Path], name: str) -> None:
+def test_a_page_opens_without_an_error_or_a_network_and_draws_its_cells(
+    pages: dict[str, Path], name: str
+) -> None:
     with opened(pages[name]) as found:
         assert found.errors == []
         assert found.requests == [pages[name].resolve().as_uri()]
@@ -46,7 +57,9 @@ def test_a_page_opens_without_an_error_or_a_network_and_draws_its_cells(pages: d
 def cells(values: list[float | None], lasting: list[bool] | None = None) -> DrawnCells:
     boxes = np.stack(grid.bounds(CELL + np.arange(len(values))), axis=1).tolist()
     rows = [[str(value)] for value in values]
-    return DrawnCells(boxes, [0, 1, 2, 3][: len(values)], {"map": values}, ["mu"], rows, lasting=lasting)
+    return DrawnCells(
+        boxes, [0, 1, 2, 3][: len(values)], {"map": values}, ["mu"], rows, lasting=lasting
+    )
 
 
 def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> None:
@@ -116,20 +129,35 @@ def test_each_frame_is_drawn_alone_and_the_slider_changes_it(pages: dict[str, Pa
 
 def test_frames_seconds_apart_are_frames_of_their_own() -> None:
     frame = pa.array([0, 10_000_000, 20_000_000]).cast(pa.timestamp("us", "UTC"))
-    columns = {"cell": [CELL] * 3, "sector": [0] * 3, "mu": [0.2, 0.5, 0.9], "p_slippery": [1.0, 0.5, 0.0]}
+    columns = {
+        "cell": [CELL] * 3,
+        "sector": [0] * 3,
+        "mu": [0.2, 0.5, 0.9],
+        "p_slippery": [1.0, 0.5, 0.0],
+    }
     text = output.page(pa.table({**columns, "frame": frame}), QUESTIONS["replay"])
     assert '"frames": ["1970-01-01 00:00:00", "1970-01-01 00:00:10", "1970-01-01 00:00:20"]' in text
     assert '"frame": [0, 1, 2]' in text
 
 
 def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_path: Path) -> None:
-    bent = grid.interleave(np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000).tolist()
-    worst = pa.table({"cell": [bent[0]], "sector": [0], "mu": [0.2], "score": [1.0], "members": [bent]})
+    bent = grid.interleave(
+        np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000
+    ).tolist()
+    worst = pa.table(
+        {"cell": [bent[0]], "sector": [0], "mu": [0.2], "score": [1.0], "members": [bent]}
+    )
     (tmp_path / "worst.html").write_text(output.page(worst, QUESTIONS["worst"]))
     with opened(tmp_path / "worst.html") as found:
         assert found.drawn == len(bent)
     spells = pa.table(
-        {"cell": [CELL, CELL + 1], "sector": [0, 0], "onset": [0, 1], "duration_s": [60, 600], "lasts": [False, True]}
+        {
+            "cell": [CELL, CELL + 1],
+            "sector": [0, 0],
+            "onset": [0, 1],
+            "duration_s": [60, 600],
+            "lasts": [False, True],
+        }
     )
     (tmp_path / "spells.html").write_text(output.page(spells, QUESTIONS["spells"]))
     with opened(tmp_path / "spells.html") as found:

@@ -13,7 +13,9 @@ from fleet_service.analytics import plots
 from schemas import grid
 from tests.fleet_service.examples import CELL
 
-BENT = grid.interleave(np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000).tolist()
+BENT = grid.interleave(
+    np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000
+).tolist()
 NOON_US = 1_769_515_200_000_000  # 27 January 2026
 
 
@@ -33,8 +35,17 @@ def named(axes: Axes) -> list[str]:
 
 
 def test_worst_draws_cells_of_each_stretch_without_connecting_lines() -> None:
-    one = {"sector": 1, "mu": 0.2, "length_m": 50.0, "share_slippery": 0.9, "share_lower": 0.7, "values": 12}
-    figure = drawn("worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}]))
+    one = {
+        "sector": 1,
+        "mu": 0.2,
+        "length_m": 50.0,
+        "share_slippery": 0.9,
+        "share_lower": 0.7,
+        "values": 12,
+    }
+    figure = drawn(
+        "worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}])
+    )
     first, second = (axes for axes in figure.axes if axes.get_xlabel() == "east [m]")
     assert [shapes(first), shapes(second)] == [5, 2]
     assert not first.lines
@@ -52,11 +63,23 @@ def test_grip_of_a_day_shows_that_day_and_cells_with_bounds_only() -> None:
 
 def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
     frames = pa.array([NOON_US, NOON_US, NOON_US + 10_000_000], pa.timestamp("us", tz="UTC"))
-    table = pa.table({"frame": frames, "cell": [CELL, CELL + 1, CELL], "sector": [0, 0, 0], "mu": [0.3, None, 0.4]})
+    table = pa.table(
+        {
+            "frame": frames,
+            "cell": [CELL, CELL + 1, CELL],
+            "sector": [0, 0, 0],
+            "mu": [0.3, None, 0.4],
+        }
+    )
     maps = [axes for axes in drawn("replay", table).axes if axes.get_xlabel() == "east [m]"]
-    assert [axes.get_title() for axes in maps] == ["2026-01-27T12:00:00 UTC", "2026-01-27T12:00:10 UTC"]
+    assert [axes.get_title() for axes in maps] == [
+        "2026-01-27T12:00:00 UTC",
+        "2026-01-27T12:00:10 UTC",
+    ]
     assert [shapes(axes) for axes in maps] == [2, 1]
-    hatched = [one for one in maps[0].collections if isinstance(one, PolyCollection) and one.get_hatch()]
+    hatched = [
+        one for one in maps[0].collections if isinstance(one, PolyCollection) and one.get_hatch()
+    ]
     assert [len(one.get_paths()) for one in hatched] == [1]
 
 
@@ -77,6 +100,10 @@ def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
 def test_a_spell_that_lasts_is_told_from_one_that_ended(lasts: bool) -> None:
     table = pa.table({"onset": [NOON_US * 1e-6], "duration_s": [600.0], "lasts": [lasts]})
     (axes,) = drawn("spells", table).axes
-    arrows = [line for line in axes.lines if line.get_marker() == ">" and len(np.asarray(line.get_xdata()))]
+    arrows = [
+        line
+        for line in axes.lines
+        if line.get_marker() == ">" and len(np.asarray(line.get_xdata()))
+    ]
     assert len(arrows) == lasts
     assert named(axes) == ["ended", "lasts at the end of the data"]

@@ -28,7 +28,9 @@ Ask = Callable[..., pa.Table]
 PLACE = ["cell", "sector"]
 
 
-def test_grip_gives_the_percentiles_of_values_per_cell_and_day(asked: Ask, rows: pd.DataFrame) -> None:
+def test_grip_gives_the_percentiles_of_values_per_cell_and_day(
+    asked: Ask, rows: pd.DataFrame
+) -> None:
     table = asked("grip")
     found = table.to_pandas().set_index(["day", *PLACE]).sort_index()
     rows = rows.assign(day=rows["leave_time"].dt.date)
@@ -53,7 +55,12 @@ def test_worst_finds_the_planted_ice_and_only_it(asked: Ask) -> None:
     step = 360 / 2**21
     height = step * np.cos(np.radians(synthetic.LATITUDE))
     for row in found.itertuples():
-        assert 22 < (row.west - synthetic.LONGITUDE) / step < (row.east - synthetic.LONGITUDE) / step < 39
+        assert (
+            22
+            < (row.west - synthetic.LONGITUDE) / step
+            < (row.east - synthetic.LONGITUDE) / step
+            < 39
+        )
         assert min(abs((row.south - synthetic.LATITUDE) / height - line) for line in (130, 650)) < 3
         metres = np.hypot((row.east - row.west) * 59_400, (row.north - row.south) * 111_195)
         assert row.length_m == pytest.approx(metres, rel=0.01)
@@ -70,7 +77,12 @@ def test_touching_cells_of_one_sector_are_one_stretch() -> None:
     found = stretches(table)
     assert sorted(found["cells"].to_numpy().tolist()) == [1, 1, 3]
     row = found.to_pylist()[found["cells"].to_pylist().index(3)]
-    assert (row["exposure"], row["values"], row["share_slippery"], row["mu"]) == (15, 12, pytest.approx(10 / 12), 0.25)
+    assert (row["exposure"], row["values"], row["share_slippery"], row["mu"]) == (
+        15,
+        12,
+        pytest.approx(10 / 12),
+        0.25,
+    )
     assert stretches(table.slice(0, 0)).num_rows == 0
 
 
@@ -103,12 +115,16 @@ def test_spells_are_the_runs_of_slippery_values(asked: Ask, rows: pd.DataFrame) 
     assert sorted(found, key=str) == sorted(expected, key=str)
 
 
-def test_planted_change_lies_in_the_before_after_interval(asked: Ask, rows: pd.DataFrame, tmp_path: Path) -> None:
+def test_planted_change_lies_in_the_before_after_interval(
+    asked: Ask, rows: pd.DataFrame, tmp_path: Path
+) -> None:
     at = START_NS + 24 * HOUR_NS
     found = asked("before-after", at=at).to_pylist()[1]
     told = rows[rows["value"]].assign(after=lambda r: r["time"] >= at // 10**9)
     means = told.groupby([*PLACE, "after"])["mu"].agg(["mean", "size"]).unstack().dropna()
-    weight = means["size"][True] * means["size"][False] / (means["size"][True] + means["size"][False])
+    weight = (
+        means["size"][True] * means["size"][False] / (means["size"][True] + means["size"][False])
+    )
     expected = (weight * (means["mean"][True] - means["mean"][False])).sum() / weight.sum()
     assert found["difference"] == pytest.approx(expected, abs=1e-9)
     assert found["cells"] == len(means)
@@ -130,7 +146,12 @@ def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
         after = np.repeat(
             rng.random(vehicles) < 0.5, each
         )  # a vehicle drives before or after: its bias does not cancel
-        mu = 0.6 + 0.1 * after + rng.normal(0, 0.05, vehicles)[vehicle] + rng.normal(0, 0.05, len(vehicle))
+        mu = (
+            0.6
+            + 0.1 * after
+            + rng.normal(0, 0.05, vehicles)[vehicle]
+            + rng.normal(0, 0.05, len(vehicle))
+        )
         table = pa.table({
             "cell": rng.integers(0, 4, len(vehicle)), "sector": np.zeros(len(vehicle), np.int8),
             "vehicle": vehicle.astype(str).tolist(), "time": np.where(after, 200, 100), "mu": mu, "mu_utilised": mu,
@@ -152,7 +173,9 @@ def test_vehicles_shows_the_planted_bias_of_each(asked: Ask, rows: pd.DataFrame)
     told = rows[rows["value"]].assign(hour=lambda r: r["time"] // 3600)
     one, differences = names[3], []
     there = [*PLACE, "hour"]
-    for _, group in told.merge(told[told["vehicle"] == one][there].drop_duplicates(), on=there).groupby(there):
+    for _, group in told.merge(
+        told[told["vehicle"] == one][there].drop_duplicates(), on=there
+    ).groupby(there):
         mine, others = group[group["vehicle"] == one]["mu"], group[group["vehicle"] != one]["mu"]
         if len(mine) and len(others):
             differences.append(mine.mean() - others.mean())
@@ -181,7 +204,9 @@ def test_calibration_counts_later_values_inside_published_intervals(
         for row in later.itertuples():
             held = row.mu_lower_map <= row.mu <= row.mu_upper_map
             inside.setdefault((row.basis, (row.time - since) // 3600), []).append(held)
-    assert {(row.basis, row.age_h): row.values for row in found.itertuples()} == {k: len(v) for k, v in inside.items()}
+    assert {(row.basis, row.age_h): row.values for row in found.itertuples()} == {
+        k: len(v) for k, v in inside.items()
+    }
     for row in found.itertuples():
         assert row.held == pytest.approx(np.mean(inside[row.basis, row.age_h]), abs=1e-9)
         assert row.compatible >= row.held
@@ -192,12 +217,16 @@ def test_weather_takes_the_nearest_station_s_reading_of_the_hour(
 ) -> None:
     found = asked("weather", stations=stations).to_pandas().set_index("temperature").sort_index()
     told = rows[rows["value"]]
-    temperature = 5.0 - 8.0 * synthetic.night(((told["time"] - START_NS // 10**9) // 3600 * 3600).to_numpy(float))
+    temperature = 5.0 - 8.0 * synthetic.night(
+        ((told["time"] - START_NS // 10**9) // 3600 * 3600).to_numpy(float)
+    )
     groups = told.groupby(np.floor(temperature / 2) * 2)["mu"]
     assert found["values"].to_dict() == groups.size().to_dict()
     np.testing.assert_allclose(found["mu_p10"], groups.quantile(0.1), atol=1e-9)
     np.testing.assert_allclose(found["mu_mean"], groups.mean(), atol=1e-9)
-    assert found["share_slippery"].iloc[0] > 3 * found["share_slippery"].iloc[-1]  # colder is more slippery
+    assert (
+        found["share_slippery"].iloc[0] > 3 * found["share_slippery"].iloc[-1]
+    )  # colder is more slippery
     assert found.index.min() < -2
 
 
@@ -238,7 +267,9 @@ def test_a_day_of_replay_has_a_frame_per_step_within_the_box(asked: Ask) -> None
         ("weather", {"stations": Path("nowhere.csv")}, "stations: cannot read"),
     ],
 )
-def test_what_a_question_lacks_is_said(asked: Ask, name: str, options: dict[str, object], problem: str) -> None:
+def test_what_a_question_lacks_is_said(
+    asked: Ask, name: str, options: dict[str, object], problem: str
+) -> None:
     with pytest.raises(InputError, match=f"^{problem}"):
         asked(name, **options)
 

@@ -9,7 +9,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics.past_map import map_at
-from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuild_zone, require_empty, zones_of
+from fleet_service.analytics.rebuilding import (
+    Rebuild,
+    rebuild,
+    rebuild_zone,
+    require_empty,
+    zones_of,
+)
 from fleet_service.analytics.synthetic import SyntheticFleet
 from fleet_service.archive.export.extract import Extract
 from fleet_service.archive.format import layout
@@ -19,7 +25,14 @@ from fleet_service.cli import main
 from schemas import grid
 from schemas.errors import InputError
 from schemas.wire import Kind
-from tests.fleet_service.analytics.border import BORDER, UNTIL, contents, difference, fill, rebuilt_map
+from tests.fleet_service.analytics.border import (
+    BORDER,
+    UNTIL,
+    contents,
+    difference,
+    fill,
+    rebuilt_map,
+)
 
 WORLD = SyntheticFleet(rows=8_000, days=1, vehicles=40, roads=6, length=60, icy=4, seed=7)
 
@@ -50,10 +63,14 @@ def test_zone_by_zone_the_map_is_that_of_a_whole_replay(archive: Path, tmp_path:
 def test_the_roll_ups_are_those_of_the_archive_byte_for_byte(archive: Path, tmp_path: Path) -> None:
     out = made(archive, tmp_path / "out")
     assert contents(out / rollup.TABLE) == contents(archive / rollup.TABLE)
-    assert len(contents(out / rollup.TABLE)) == len(list(layout.compacted_files(archive, Kind.OBSERVATION)))
+    assert len(contents(out / rollup.TABLE)) == len(
+        list(layout.compacted_files(archive, Kind.OBSERVATION))
+    )
 
 
-def test_a_zone_done_again_leaves_the_same_files_and_no_draft(archive: Path, tmp_path: Path) -> None:
+def test_a_zone_done_again_leaves_the_same_files_and_no_draft(
+    archive: Path, tmp_path: Path
+) -> None:
     out = made(archive, tmp_path / "out")
     before = contents(out)
     rebuild_zone(Rebuild(archive, out, UNTIL), zones_of(archive)[0])
@@ -63,7 +80,10 @@ def test_a_zone_done_again_leaves_the_same_files_and_no_draft(archive: Path, tmp
 
 def test_only_files_of_zones_near_a_box_are_read(archive: Path) -> None:
     files = list(layout.compacted_files(archive, Kind.OBSERVATION))
-    zones = {layout.partition_of(path).zone for path in files_near(files, (BORDER - 0.1, 57.0, BORDER + 0.1, 58.0))}
+    zones = {
+        layout.partition_of(path).zone
+        for path in files_near(files, (BORDER - 0.1, 57.0, BORDER + 0.1, 58.0))
+    }
     assert len(zones) == 2
     assert files_near(files, None) == files
     assert not files_near(files, (0.0, 0.0, 1.0, 1.0))
@@ -72,7 +92,15 @@ def test_only_files_of_zones_near_a_box_are_read(archive: Path) -> None:
 def test_rebuild_reports_its_result_and_refuses_a_non_empty_folder(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["rebuild", "--archive", str(archive), "--out", str(tmp_path / "out"), "--to", "2026-01-28"]
+    words = [
+        "rebuild",
+        "--archive",
+        str(archive),
+        "--out",
+        str(tmp_path / "out"),
+        "--to",
+        "2026-01-28",
+    ]
     assert main(words) == 0
     assert capsys.readouterr().out.startswith(f"3 zones in {tmp_path / 'out'}: ")
     assert len(pq.read_schema(next((tmp_path / "out" / "map").glob("*/*/*.parquet"))).names) > 20

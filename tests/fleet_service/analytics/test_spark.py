@@ -22,8 +22,12 @@ def test_spark_reads_the_archive(archive: Path) -> None:
     assert by_spark(archive) == pytest.approx(seen)
 
 
-@pytest.mark.parametrize("name", [name for name in QUESTIONS if name != "replay"])  # which asks no engine
-def test_engines_agree(asked: Callable[..., pa.Table], stations: Path, links: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", [name for name in QUESTIONS if name != "replay"]
+)  # which asks no engine
+def test_engines_agree(
+    asked: Callable[..., pa.Table], stations: Path, links: Path, name: str
+) -> None:
     from fleet_service.analytics.synthetic import START_NS
 
     options: dict[str, dict[str, object]] = {
@@ -32,6 +36,10 @@ def test_engines_agree(asked: Callable[..., pa.Table], stations: Path, links: Pa
         "contract": {"roads": links, "level": 0.35, "within_s": 3600.0},
     }
     assert (
-        differs(asked(name, **options.get(name, {})), asked(name, "spark", **options.get(name, {})), QUESTIONS[name])
+        differs(
+            asked(name, **options.get(name, {})),
+            asked(name, "spark", **options.get(name, {})),
+            QUESTIONS[name],
+        )
         is None
     )

@@ -9,7 +9,13 @@ from typing import Any
 
 import pytest
 
-from fleet_service.analytics.rebuilding import Rebuild, RebuildResult, rebuild, rebuild_zone, zones_of
+from fleet_service.analytics.rebuilding import (
+    Rebuild,
+    RebuildResult,
+    rebuild,
+    rebuild_zone,
+    zones_of,
+)
 from fleet_service.analytics.synthetic import SyntheticFleet
 from schemas.errors import InputError
 from schemas.runtime import spark
@@ -52,10 +58,14 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
 ) -> None:
     out, tries = tmp_path / "out", tmp_path / "tries"
     out.mkdir()
-    dying = spark_sessions.killed_at_first(partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries)
+    dying = spark_sessions.killed_at_first(
+        partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries
+    )
     zones = zones_of(archive)
     told = spark.spread(session, zones, dying)
-    assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, "none was killed"
+    assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, (
+        "none was killed"
+    )
     (tmp_path / "local").mkdir()
     assert told == list(rebuild(Rebuild(archive, tmp_path / "local", UNTIL)))
     assert contents(out) == contents(tmp_path / "local")

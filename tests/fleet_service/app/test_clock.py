@@ -49,7 +49,9 @@ def test_unconfirmed_clock_jumps_are_not_followed() -> None:
     assert (clock.now(), clock.moment().doubt, clock.lag()) == (start + 3 * SECOND, YEAR, -YEAR)
     for _ in range(20):
         system.passes(SECOND)
-        clock.record_reports({"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall})
+        clock.record_reports(
+            {"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall}
+        )
     assert clock.now() == start + 23 * SECOND
     system.passes(SECOND, jump=-YEAR)
     assert clock.moment() == TimeNow(start + 24 * SECOND, 0, 0, start + 24 * SECOND)
@@ -65,7 +67,13 @@ def test_a_corrected_clock_is_followed_when_most_reports_agree(wrong: int) -> No
     system.passes(SECOND, jump=-wrong * DAY)
     for second in range(1, 12):
         system.passes(SECOND)
-        clock.record_reports({"car-a": true + second * SECOND, "car-b": true + second * SECOND, "parked": true - HOUR})
+        clock.record_reports(
+            {
+                "car-a": true + second * SECOND,
+                "car-b": true + second * SECOND,
+                "parked": true - HOUR,
+            }
+        )
     assert clock.moment() == TimeNow(system.wall, 0, 0, system.wall)
 
 
@@ -101,11 +109,15 @@ def test_restart_with_a_clock_a_year_ahead_refuses_and_ends_nothing() -> None:
 
 def message(seq: int, at: int) -> Message:
     sent = batch("sim-001", seq, at, [0.8])
-    return Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION])
+    return Message(
+        Kind.OBSERVATION, key("sim-001"), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION]
+    )
 
 
 @pytest.mark.parametrize("jump", [-YEAR, -HOUR, DAY, YEAR, 0])
-def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_path: Path, jump: int) -> None:
+def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(
+    tmp_path: Path, jump: int
+) -> None:
     true = time.time_ns()
     system = System(true)
     for start in range(2):
@@ -125,7 +137,11 @@ def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: 
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([message(1, now + DAY)], now)
         engine.intake.ingest([message(2, now)], now)
-        assert (engine.counts["refused.time"], engine.counts[Kind.OBSERVATION], engine.counts["late"]) == (1, 1, 0)
+        assert (
+            engine.counts["refused.time"],
+            engine.counts[Kind.OBSERVATION],
+            engine.counts["late"],
+        ) == (1, 1, 0)
         (_, ack), *_ = engine.settlement.flush()
         (stream,) = wire.decode_ack(ack)[1]
         assert stream.durable == ((2, 2),)

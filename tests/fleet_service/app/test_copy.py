@@ -43,12 +43,17 @@ def settings(bucket: BucketServer) -> ServiceConfig:
 
 def reports(mu: float, first: int, last: int) -> list[Batch]:
     now = time.time_ns() - 2 * SECOND
-    return [batch(f"sim-{v:03}", seq, now, [mu] * 3) for seq in range(first, last + 1) for v in range(VEHICLES)]
+    return [
+        batch(f"sim-{v:03}", seq, now, [mu] * 3)
+        for seq in range(first, last + 1)
+        for v in range(VEHICLES)
+    ]
 
 
 def take(engine: Engine, sent: list[Batch]) -> None:
     engine.intake.ingest(
-        [Message(s.kind, key(s.vehicle), wire.encode(s), wire.ENCODING[s.kind]) for s in sent], time.time_ns()
+        [Message(s.kind, key(s.vehicle), wire.encode(s), wire.ENCODING[s.kind]) for s in sent],
+        time.time_ns(),
     )
 
 
@@ -79,7 +84,9 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         expected = known(engine)
     with closing(Engine(config, new)) as engine:
         assert held(new).keys() == held(root).keys()
-        missing = rows - sum(table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"]))
+        missing = rows - sum(
+            table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"])
+        )
         assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
         assert engine.alerts.count > 0
         found = known(engine)
@@ -87,18 +94,27 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         take(engine, first + second)
         assert engine.counts["duplicates"] == len(first + second)
-        assert len(engine.settlement.flush()) == VEHICLES  # they are acknowledged again, and nothing is written
-        assert len(segments.paths(new, Kind.OBSERVATION)) == len(segments.paths(root, Kind.OBSERVATION))
+        assert (
+            len(engine.settlement.flush()) == VEHICLES
+        )  # they are acknowledged again, and nothing is written
+        assert len(segments.paths(new, Kind.OBSERVATION)) == len(
+            segments.paths(root, Kind.OBSERVATION)
+        )
 
 
-def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(bucket: BucketServer, tmp_path: Path) -> None:
+def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     root, config, sent = tmp_path / "archive", settings(bucket), reports(0.15, 1, 4)
     with closing(Engine(config, root)) as engine:
         take(engine, sent)
         engine.settlement.flush()
     file = tmp_path / "service.json"
     file.write_text(json.dumps({"archive": {"path": str(root), **bucket.settings}}))
-    assert main(["forget", "--archive", str(root), "--period", MONTH, "--yes", "--config", str(file)]) == 0
+    assert (
+        main(["forget", "--archive", str(root), "--period", MONTH, "--yes", "--config", str(file)])
+        == 0
+    )
     with closing(Engine(config, tmp_path / "new")) as engine:
         take(engine, sent)
         assert engine.counts["refused.erased"] == len(sent)
@@ -107,13 +123,19 @@ def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(bucket:
         )
 
 
-def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(bucket: BucketServer, tmp_path: Path) -> None:
+def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     sent = reports(0.7, 1, 2)
     with closing(Engine(settings(bucket), tmp_path / "archive")) as engine:
         bucket.stop()
         take(engine, sent)
         assert engine.settlement.flush() == []
-        assert (engine.settlement.failing, engine.counts["copy_failures"], engine.counts["segment_failures"]) == (
+        assert (
+            engine.settlement.failing,
+            engine.counts["copy_failures"],
+            engine.counts["segment_failures"],
+        ) == (
             True,
             1,
             0,
@@ -141,14 +163,21 @@ def service(
     """A service process with a copy that is ready, and its health's address; it is gone after the block."""
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
-    told = {"zenoh": {"connect": router.connect}, "segment_s": 0.05, "archive": archive, "metrics_port": 0}
+    told = {
+        "zenoh": {"connect": router.connect},
+        "segment_s": 0.05,
+        "archive": archive,
+        "metrics_port": 0,
+    }
     config.write_text(json.dumps(told))
     words = [sys.executable, "-m", "fleet_service.cli", "run", "--config", str(config)]
     said = folder / "said"
     with said.open("w") as out:
         process = subprocess.Popen(words, stdout=out)
     try:
-        until(lambda: said.read_text().startswith("ready: ") and "\n" in said.read_text(), PATIENCE_S)
+        until(
+            lambda: said.read_text().startswith("ready: ") and "\n" in said.read_text(), PATIENCE_S
+        )
         yield process, said.read_text().splitlines()[0].split()[-1]
     finally:
         process.kill()
@@ -181,7 +210,10 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
         until(lambda: drive(fleet, before), PATIENCE_S)
         assert "does not take segments" not in health(address)
         bucket.away(kind)
-        until(lambda: not drive(fleet, during) and "does not take segments" in health(address), PATIENCE_S)
+        until(
+            lambda: not drive(fleet, during) and "does not take segments" in health(address),
+            PATIENCE_S,
+        )
         assert SECRET not in health(address)
         assert len(fleet.unsettled(during)) == len(during)  # nothing of it is acknowledged
         bucket.back(kind)
@@ -222,7 +254,11 @@ def test_service_killed_between_disk_and_bucket_loses_nothing(
 @pytest.mark.parametrize("beside", [True, False])
 @pytest.mark.campaign
 def test_an_erased_vehicle_leaves_the_bucket_too(
-    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, beside: bool
+    router: ZenohSettings,
+    session: zenoh.Session,
+    bucket: BucketServer,
+    tmp_path: Path,
+    beside: bool,
 ) -> None:
     root, fleet, sent = tmp_path / "archive", Fleet(session), reports(0.8, 1, BATCHES)
     words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", "sim-001", "--yes"]
@@ -241,9 +277,19 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
         others = pseudonyms_of(new)
         assert len(others) == 3 * BATCHES * (VEHICLES - 1)
         assert gone not in others
-        assert list((new / "keys").glob(f"{MONTH}.{gone}.*.erased")), "and it does not come in again"
-    kept = {name: content for name, content in bucket.objects().items() if not name.startswith("observations/")}
-    assert not any(bytes.fromhex(gone) in content for name, content in kept.items() if name.endswith(".witnesses"))
+        assert list((new / "keys").glob(f"{MONTH}.{gone}.*.erased")), (
+            "and it does not come in again"
+        )
+    kept = {
+        name: content
+        for name, content in bucket.objects().items()
+        if not name.startswith("observations/")
+    }
+    assert not any(
+        bytes.fromhex(gone) in content
+        for name, content in kept.items()
+        if name.endswith(".witnesses")
+    )
 
 
 def _same_in_the_bucket(bucket: BucketServer, root: Path) -> None:

@@ -61,7 +61,11 @@ def shown(session: zenoh.Session) -> dict[int, int]:
     for reply in session.get(keys.map_key(TILE)):
         if reply.ok is not None:
             table = pa.ipc.open_stream(BytesIO(reply.ok.payload.to_bytes())).read_all()
-            found |= zip(table["cell"].to_numpy().tolist(), table["observations"].to_numpy().tolist(), strict=True)
+            found |= zip(
+                table["cell"].to_numpy().tolist(),
+                table["observations"].to_numpy().tolist(),
+                strict=True,
+            )
     return found
 
 
@@ -83,7 +87,9 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         until(lambda: alone in shown(session), PATIENCE_S)
         words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", GONE, "--json"]
         command = [sys.executable, "-m", "fleet_service.cli", *words]
-        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as eraser:
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        ) as eraser:
             seq = 20
             while eraser.poll() is None:
                 seq += 1
@@ -102,24 +108,33 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         assert process.wait(PATIENCE_S) == 0
     names = Pseudonyms(root / "keys")
     gone = names.of(GONE, time.time_ns()).encode()
-    theirs = sorted(names.of(vehicle, time.time_ns()) for vehicle in OTHERS for _ in range(2 * (seq + 1)))
+    theirs = sorted(
+        names.of(vehicle, time.time_ns()) for vehicle in OTHERS for _ in range(2 * (seq + 1))
+    )
     assert pseudonyms_of(root) == theirs, "each acknowledged row of the others once, and no other"
     files = [path for path in root.rglob("*") if path.is_file()]
     number = int.from_bytes(bytes.fromhex(gone.decode()), signed=True)
-    told = (gone, GONE.encode(), number.to_bytes(8, "little", signed=True), number.to_bytes(8, "big", signed=True))
+    told = (
+        gone,
+        GONE.encode(),
+        number.to_bytes(8, "little", signed=True),
+        number.to_bytes(8, "big", signed=True),
+    )
     assert [path for path in files if any(one in path.read_bytes() for one in told)] == []
     assert checkpoints.newest(root), "what the service began from anew"
     drop_checkpoints(root)
     with closing(Engine(ServiceConfig(), root)) as engine:
-        assert engine.state.fusion.live.visits[: engine.state.fusion.size].tolist() == list(at_last.values()), (
-            "as the log tells it"
-        )
+        assert engine.state.fusion.live.visits[: engine.state.fusion.size].tolist() == list(
+            at_last.values()
+        ), "as the log tells it"
         assert sum(at_last.values()) > 2 * 3
 
 
 def filled(root: Path, *names: str) -> Engine:
     engine = Engine(ServiceConfig(), root)
-    messages = [Message(Kind.OBSERVATION, key(one), wire.encode(sent_by(one, 1)), "") for one in names]
+    messages = [
+        Message(Kind.OBSERVATION, key(one), wire.encode(sent_by(one, 1)), "") for one in names
+    ]
     engine.intake.ingest(messages, time.time_ns())
     engine.settlement.flush()
     return engine
@@ -127,7 +142,9 @@ def filled(root: Path, *names: str) -> Engine:
 
 def answered(engine: Engine, root: Path) -> None:
     """Do what is asked for, with a worker."""
-    thread = threading.Thread(target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event()))
+    thread = threading.Thread(
+        target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())
+    )
     thread.start()
     while thread.is_alive():
         engine.settlement.flush()
@@ -137,7 +154,9 @@ def answered(engine: Engine, root: Path) -> None:
 def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
     with closing(filled(tmp_path, *OTHERS[1:])) as engine:
         sent = sent_by("sim-001", 1)
-        engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
+        engine.intake.ingest(
+            [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns()
+        )
         engine.settlement.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
         question = erasure_requests.write_request(tmp_path, Erasure(MONTH))
@@ -176,6 +195,8 @@ def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Pa
         told = erasure_requests.answer_to(question)
         assert told is not None
         assert told["rows"] == 2
-        slots = again.state.fusion.slots_of(np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0]))
+        slots = again.state.fusion.slots_of(
+            np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0])
+        )
         assert slots.tolist() == [-1]
     assert main(["forget", "--archive", str(tmp_path), "--vehicle", GONE, "--period", MONTH]) == 0

@@ -44,7 +44,11 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
             fleet.settle(*(batch(f"sim-{k:03}", seq, moment, [0.8]) for k in range(3)))
         until(lambda: not list((tmp_path / "inbox").glob("*.parquet")))
         until(lambda: any(line.startswith("compacted: ") for line in run.lines))
-    assert len(set(identities(tmp_path, Kind.OBSERVATION))) == len(identities(tmp_path, Kind.OBSERVATION)) == 30
+    assert (
+        len(set(identities(tmp_path, Kind.OBSERVATION)))
+        == len(identities(tmp_path, Kind.OBSERVATION))
+        == 30
+    )
     with running(router, tmp_path) as again:
         assert again.service.engine.state.fusion.live.visits[0] == 30
         assert main(["compact", "--archive", str(tmp_path)]) == 0  # beside it
@@ -102,7 +106,10 @@ def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tasks, "MOST_S", 0.05)
-    with closing(Engine(ServiceConfig(), tmp_path)) as engine, pytest.raises(OSError, match="no segment"):
+    with (
+        closing(Engine(ServiceConfig(), tmp_path)) as engine,
+        pytest.raises(OSError, match="no segment"),
+    ):
         engine.checkpoint(threading.Event())  # the worker, which nobody is here, flushes nothing
 
 
@@ -128,7 +135,9 @@ def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
     assert not lines
 
 
-def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_when_another_compacts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "inbox").mkdir()
     with hold_compaction_lock(tmp_path):
         assert main(["compact", "--archive", str(tmp_path)]) == 2
@@ -145,7 +154,15 @@ def test_failing_compaction_is_reported_and_a_running_one_is_stopped(tmp_path: P
     engine = Engine(ServiceConfig(), tmp_path)
     with closing(engine):
         engine.intake.ingest(
-            [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
+            [
+                Message(
+                    Kind.OBSERVATION,
+                    key("sim-001"),
+                    wire.encode(batch("sim-001", 1, now(), [0.8])),
+                    "",
+                )
+            ],
+            now(),
         )
         engine.settlement.flush()
         compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path, SteadyClock().moment)
@@ -155,5 +172,7 @@ def test_failing_compaction_is_reported_and_a_running_one_is_stopped(tmp_path: P
         stopped.set()
         assert compaction.work(stopped) is None
         assert list((tmp_path / "inbox").glob("*.parquet"))
-        assert (compaction.work(threading.Event()) or "").startswith("compacted: 1 rows of 1 segments")
+        assert (compaction.work(threading.Event()) or "").startswith(
+            "compacted: 1 rows of 1 segments"
+        )
         assert compaction.work(threading.Event()) is None

@@ -32,7 +32,9 @@ def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[st
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "segment_s": 0.05}))
     words = ["run", "--config", str(config), "--archive", str(folder / "archive")]
-    process = subprocess.Popen([sys.executable, "-m", "fleet_service.cli", *words], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fleet_service.cli", *words], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: ")
@@ -77,11 +79,20 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
     """Boot as it is archived, seq and row of everything acknowledged."""
     pseudonyms, now = Pseudonyms(folder / "archive" / "keys"), time.time_ns()
-    boots = {name: pseudonyms.boot(name, batch(name, 1, 0, [0.8]).boot, now) for name in fleet.durable}
-    return [(boots[v], seq, row) for v, seqs in list(fleet.durable.items()) for seq in list(seqs) for row in range(3)]
+    boots = {
+        name: pseudonyms.boot(name, batch(name, 1, 0, [0.8]).boot, now) for name in fleet.durable
+    }
+    return [
+        (boots[v], seq, row)
+        for v, seqs in list(fleet.durable.items())
+        for seq in list(seqs)
+        for row in range(3)
+    ]
 
 
 def archived(folder: Path) -> list[tuple[int, int, int]]:
     """Boot, seq and row of everything in the segments."""
-    table = pa.concat_tables(reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"]))
+    table = pa.concat_tables(
+        reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
+    )
     return list(zip(*(table[name].to_pylist() for name in ("boot", "seq", "row")), strict=True))

@@ -40,12 +40,18 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
         def shown() -> dict[str, float]:
             families = text_string_to_metric_families(fetch(f"{address}/metrics")[2])
             return {
-                sample.name.removeprefix("gripmap_") + "".join(f".{v}" for v in sample.labels.values()): sample.value
+                sample.name.removeprefix("gripmap_")
+                + "".join(f".{v}" for v in sample.labels.values()): sample.value
                 for family in families
                 for sample in family.samples
             }
 
-        until(lambda: shown().get("rows_total.observation") and shown().get("refused_messages_total.speed"))
+        until(
+            lambda: (
+                shown().get("rows_total.observation")
+                and shown().get("refused_messages_total.speed")
+            )
+        )
         until(lambda: shown()["segments.observation"] == 1 and not shown()["unsettled_batches"])
         found = shown()
         assert found["refused_messages_total.speed"] == 1
@@ -61,7 +67,10 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
     engine = Engine(config, tmp_path)
 
     def damaged() -> object:
-        found = {metric.name: metric.values for metric in metrics.metrics(engine, pulse, config, tmp_path)}
+        found = {
+            metric.name: metric.values
+            for metric in metrics.metrics(engine, pulse, config, tmp_path)
+        }
         return found["damaged_files"][""]
 
     (tmp_path / "weather").mkdir(exist_ok=True)
@@ -69,7 +78,9 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
         (tmp_path / name).touch()
     assert damaged() == 0, "a scrape walks through no archive"
     (inventory,) = (
-        job for job in archive_jobs(engine, config, tmp_path, SteadyClock().moment) if job.name == "inventory"
+        job
+        for job in archive_jobs(engine, config, tmp_path, SteadyClock().moment)
+        if job.name == "inventory"
     )
     inventory.work(threading.Event())
     assert damaged() == 2

@@ -39,7 +39,9 @@ def root(tmp_path: Path) -> Path:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in range(1, 5):
             sent = [batch(f"car-{k:03}", seq, now, [0.8] * 20) for k in range(5)]
-            engine.intake.ingest([Message(Kind.OBSERVATION, key(b.vehicle), wire.encode(b), "") for b in sent], now)
+            engine.intake.ingest(
+                [Message(Kind.OBSERVATION, key(b.vehicle), wire.encode(b), "") for b in sent], now
+            )
             engine.settlement.flush()
     compact(tmp_path)
     return tmp_path
@@ -66,10 +68,14 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
     root: Path, asker: past.HistoricalMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(past, "MOST_ROWS", 399)
-    with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
+    with pytest.raises(
+        InputError, match="at: would have to read too much of the archive; narrow bbox"
+    ):
         list(asker.ask(question(), lambda _: True))
     assert list(asker.ask(question(bbox="0,0,1,1"), lambda _: True)) == []
-    with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
+    with pytest.raises(
+        InputError, match="at: would have to read too much of the archive; narrow bbox"
+    ):
         list(past.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
     monkeypatch.setattr(past, "LOOKED_ROWS", 399)
     with pytest.raises(InputError, match="at: would have to read too much"):
@@ -86,7 +92,10 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     monkeypatch.setattr(files, "ROW_GROUP", group)
     files.write_table(table, path, files.COMPACTED)
     assert pq.read_metadata(path).num_row_groups == -(-400 // group)
-    schema, begin = segments.SCHEMAS[Kind.OBSERVATION], table["leave_time"].cast(pa.int64()).to_numpy()
+    schema, begin = (
+        segments.SCHEMAS[Kind.OBSERVATION],
+        table["leave_time"].cast(pa.int64()).to_numpy(),
+    )
     wanted: list[tuple[ValueRange, NDArray[Any]]] = [
         (ValueRange("seq", 2, 3), np.isin(table["seq"], [2, 3])),
         (ValueRange("leave_time", most=int(np.median(begin))), begin <= np.median(begin)),
@@ -101,15 +110,21 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
             found = load(path, schema, columns, [where])
             assert found is not None
             names = columns or schema.names
-            assert repr(found.to_pylist()) == repr(table.filter(pa.array(right)).select(names).to_pylist()), where
+            assert repr(found.to_pylist()) == repr(
+                table.filter(pa.array(right)).select(names).to_pylist()
+            ), where
             taken: list[pa.Table] = []
             assert load_groups(path, schema, names, [where], taken.append)
             assert all(part.num_rows for part in taken), "a row group that holds none is not read"
-            assert repr(pa.concat_tables([found.slice(0, 0), *taken]).to_pylist()) == repr(found.to_pylist())
+            assert repr(pa.concat_tables([found.slice(0, 0), *taken]).to_pylist()) == repr(
+                found.to_pylist()
+            )
     assert 0 < wanted[0][1].sum() < 400
 
 
-def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path, asker: past.HistoricalMaps) -> None:
+def test_the_answer_of_the_other_process_is_that_of_this_one(
+    root: Path, asker: past.HistoricalMaps
+) -> None:
     asked = question(bbox=NEAR)
     (mine,) = past.replies_to(root, asked)
     (theirs,) = asker.ask(asked, lambda _: True)
@@ -136,7 +151,9 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 def test_a_process_answers_one_question_after_the_other(
     asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
-    answers = [list(asker.ask(question(bbox=box), lambda _: True)) for box in (NEAR, "0,0,1,1", NEAR)]
+    answers = [
+        list(asker.ask(question(bbox=box), lambda _: True)) for box in (NEAR, "0,0,1,1", NEAR)
+    ]
     assert [len(answer) for answer in answers] == [1, 0, 1]
     assert len(begun) == 1
     asker.close()

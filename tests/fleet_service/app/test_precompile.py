@@ -57,7 +57,9 @@ print(sorted(kernels() - warm))
 
 
 def test_a_ready_service_compiles_nothing() -> None:
-    heard = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    heard = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
+    )
     assert heard.stdout.strip() == "[]", heard.stdout + heard.stderr
 
 

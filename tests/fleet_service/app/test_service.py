@@ -21,7 +21,17 @@ from schemas import grid, keys, tables, wire
 from schemas.config import ZenohSettings
 from schemas.wire import Batch, Kind
 from tests.fleet_service.conftest import Running, running
-from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, TILE, batch, key, send
+from tests.fleet_service.examples import (
+    CELL,
+    LATITUDE,
+    LONGITUDE,
+    REGION,
+    SECOND,
+    TILE,
+    batch,
+    key,
+    send,
+)
 from tests.waiting import matched, until
 
 VEHICLES = ("sim-001", "sim-002", "sim-003")
@@ -46,7 +56,10 @@ class Fleet:
     def meet(self, *regions: int) -> Fleet:
         """Wait until services for the regions hear what is published and asked."""
         for region in regions or (REGION,):
-            for name in (keys.observation_key(region, "sim-000"), keys.state_key(region, "sim-000")):
+            for name in (
+                keys.observation_key(region, "sim-000"),
+                keys.state_key(region, "sim-000"),
+            ):
                 publisher = self.session.declare_publisher(name)
                 matched(publisher)
                 publisher.undeclare()
@@ -73,7 +86,9 @@ class Fleet:
             self.alerts.put(alert)
 
     def _tile(self, sample: zenoh.Sample) -> None:
-        self.tiles.put((str(sample.key_expr), pa.ipc.open_stream(sample.payload.to_bytes()).read_all()))
+        self.tiles.put(
+            (str(sample.key_expr), pa.ipc.open_stream(sample.payload.to_bytes()).read_all())
+        )
 
     def publish(self, sent: Batch) -> None:
         send(self.session, sent)
@@ -94,25 +109,41 @@ def fleet(service: Running, session: zenoh.Session) -> Fleet:
     return Fleet(session).meet()
 
 
-def ask(session: zenoh.Session, parameters: str = "", where: str = "**") -> list[tuple[str, str, bytes]]:
+def ask(
+    session: zenoh.Session, parameters: str = "", where: str = "**"
+) -> list[tuple[str, str, bytes]]:
     """Key, encoding and payload of every reply; an error reply fails."""
-    replies = list(session.get(f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else "")))
-    assert all(reply.ok for reply in replies), [reply.err.payload.to_string() for reply in replies if reply.err]
-    return [(str(r.ok.key_expr), str(r.ok.encoding), r.ok.payload.to_bytes()) for r in replies if r.ok]
+    replies = list(
+        session.get(f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else ""))
+    )
+    assert all(reply.ok for reply in replies), [
+        reply.err.payload.to_string() for reply in replies if reply.err
+    ]
+    return [
+        (str(r.ok.key_expr), str(r.ok.encoding), r.ok.payload.to_bytes()) for r in replies if r.ok
+    ]
 
 
 def alive(session: zenoh.Session) -> list[str]:
     """Tokens of the services."""
-    return [str(reply.ok.key_expr) for reply in session.liveliness().get(f"{keys.ROOT}/shard/*") if reply.ok]
+    return [
+        str(reply.ok.key_expr)
+        for reply in session.liveliness().get(f"{keys.ROOT}/shard/*")
+        if reply.ok
+    ]
 
 
 def now() -> int:
     return time.time_ns() - SECOND
 
 
-def test_what_is_acknowledged_lies_in_a_segment_and_on_the_map(fleet: Fleet, service: Running, tmp_path: Path) -> None:
+def test_what_is_acknowledged_lies_in_a_segment_and_on_the_map(
+    fleet: Fleet, service: Running, tmp_path: Path
+) -> None:
     fleet.settle(*(batch(vehicle, 1, now(), [0.8, 0.82]) for vehicle in VEHICLES))
-    table = pa.concat_tables([pq.read_table(path) for path in (tmp_path / "archive/inbox").glob("*.parquet")])
+    table = pa.concat_tables(
+        [pq.read_table(path) for path in (tmp_path / "archive/inbox").glob("*.parquet")]
+    )
     assert table.schema.equals(tables.OBSERVATION_ARCHIVE)
     assert table.num_rows == 6
     assert not set(table["vehicle"].to_pylist()) & set(VEHICLES)
@@ -121,7 +152,12 @@ def test_what_is_acknowledged_lies_in_a_segment_and_on_the_map(fleet: Fleet, ser
     cells = pa.ipc.open_stream(payload).read_all()
     assert cells.schema.equals(tables.MAP_SCHEMA)
     (row,) = cells.to_pylist()
-    assert (row["cell"], row["basis"], row["vehicles"], row["observations"]) == (CELL, "measured", 3, 6)
+    assert (row["cell"], row["basis"], row["vehicles"], row["observations"]) == (
+        CELL,
+        "measured",
+        3,
+        6,
+    )
     assert row["mu_lower"] < 0.8 < row["mu_upper"] < 1.0
     assert row["west"] < LONGITUDE < row["east"]
     assert row["south"] < LATITUDE < row["north"]
@@ -134,7 +170,9 @@ def test_a_changed_tile_is_put_on_its_own_key(fleet: Fleet) -> None:
     assert table["cell"].to_pylist() == [CELL]
 
 
-def test_repeated_batch_is_acknowledged_again_and_not_counted_again(fleet: Fleet, service: Running) -> None:
+def test_repeated_batch_is_acknowledged_again_and_not_counted_again(
+    fleet: Fleet, service: Running
+) -> None:
     sent = batch("sim-001", 1, now(), [0.8])
     fleet.settle(sent)
     before = fleet.acks
@@ -144,10 +182,14 @@ def test_repeated_batch_is_acknowledged_again_and_not_counted_again(fleet: Fleet
     assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
-def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(fleet: Fleet, service: Running) -> None:
+def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(
+    fleet: Fleet, service: Running
+) -> None:
     fleet.publish(batch("sim-001", 1, now(), [0.8, 0.8, 0.8], speed=[10.0, 400.0, 10.0]))
     until(lambda: fleet.rejected)
-    assert fleet.rejected == [("sim-001", 1, 1, "speed: lies outside [0, 100]; correct it at the source")]
+    assert fleet.rejected == [
+        ("sim-001", 1, 1, "speed: lies outside [0, 100]; correct it at the source")
+    ]
     assert service.service.engine.counts["refused.speed"] == 1
     assert service.service.engine.state.fusion.size == 0
 
@@ -159,8 +201,18 @@ def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(fleet: Fleet, 
         (key("sim-001"), b"{broken", wire.JSON, "payload"),
         (key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "image/png", "encoding"),
         (key("sim-002"), wire.encode(batch("sim-001", 1, now(), [0.8])), "", "vehicle"),
-        (f"{keys.ROOT}/obs/*/*/*/sim-001", wire.encode(batch("sim-001", 1, now(), [0.8])), "", "key"),
-        (keys.observation_key(REGION + 1, "sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "", "region"),
+        (
+            f"{keys.ROOT}/obs/*/*/*/sim-001",
+            wire.encode(batch("sim-001", 1, now(), [0.8])),
+            "",
+            "key",
+        ),
+        (
+            keys.observation_key(REGION + 1, "sim-001"),
+            wire.encode(batch("sim-001", 1, now(), [0.8])),
+            "",
+            "region",
+        ),
     ],
 )
 def test_what_is_not_ours_is_counted_and_the_service_goes_on(
@@ -191,7 +243,11 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
     for k in range(10):
         fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
     cleared = fleet.alerts.get(timeout=10.0)
-    assert (cleared.cell, cleared.raised, cleared.reason) == (CELL, False, "later visits found grip")
+    assert (cleared.cell, cleared.raised, cleared.reason) == (
+        CELL,
+        False,
+        "later visits found grip",
+    )
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
@@ -227,7 +283,10 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
 ) -> None:
     rng = np.random.default_rng(6)
     sent = [
-        batch(f"sim-{k % 7:03}", 1 + k // 7, now(), list(0.7 + 0.1 * rng.random(3)), told=k % 2 == 0) for k in range(40)
+        batch(
+            f"sim-{k % 7:03}", 1 + k // 7, now(), list(0.7 + 0.1 * rng.random(3)), told=k % 2 == 0
+        )
+        for k in range(40)
     ]
     with running(router, tmp_path) as first:
         fleet = Fleet(session).meet()
@@ -255,7 +314,9 @@ def test_states_are_archived_and_acknowledged(fleet: Fleet, tmp_path: Path) -> N
         "vx": np.array([15.0], np.float32),
     }  # fmt: skip
     state = Batch(Kind.STATE, "sim-001", 5, REGION, 1, 1, columns, "ckf")
-    fleet.session.put(keys.state_key(REGION, "sim-001"), wire.encode(state), encoding=wire.ENCODING[Kind.STATE])
+    fleet.session.put(
+        keys.state_key(REGION, "sim-001"), wire.encode(state), encoding=wire.ENCODING[Kind.STATE]
+    )
     until(lambda: 1 in fleet.durable["sim-001"])
     (path,) = (tmp_path / "archive/inbox/states").glob("*.parquet")
     assert pq.read_table(path).schema.equals(tables.STATE_ARCHIVE)
@@ -311,7 +372,9 @@ def test_neighbours_speak_for_a_cell_only_when_asked(fleet: Fleet) -> None:
     others = [row for row in rows if row["cell"] != CELL]
     assert len(others) == 8
     assert {row["basis"] for row in others} == {"borrowed"}
-    assert all(row["mu_upper"] - row["mu_lower"] > own["mu_upper"] - own["mu_lower"] for row in others)
+    assert all(
+        row["mu_upper"] - row["mu_lower"] > own["mu_upper"] - own["mu_lower"] for row in others
+    )
     assert own["basis"] == "measured"
 
 
@@ -321,7 +384,9 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
     fleet.settle(*(batch(vehicle, 2, now(), [0.2]) for vehicle in VEHICLES))
     at = np.datetime_as_string(np.datetime64(between, "ns"), "us", "UTC")
     (_, _, past), (_, _, present) = ask(fleet.session, f"at={at}")[0], ask(fleet.session)[0]
-    then, here = (pa.ipc.open_stream(payload).read_all().to_pylist()[0] for payload in (past, present))
+    then, here = (
+        pa.ipc.open_stream(payload).read_all().to_pylist()[0] for payload in (past, present)
+    )
     assert (then["observations"], here["observations"]) == (3, 6)
     assert then["mu"] > 0.7
 
@@ -339,7 +404,9 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
         ("colour=red", "colour: is no parameter"),
     ],
 )
-def test_a_bad_query_gets_an_error_that_names_the_field(fleet: Fleet, parameters: str, start: str) -> None:
+def test_a_bad_query_gets_an_error_that_names_the_field(
+    fleet: Fleet, parameters: str, start: str
+) -> None:
     (reply,) = fleet.session.get(f"{keys.ROOT}/map/**?{parameters}")
     assert reply.err is not None
     assert reply.err.payload.to_string().startswith(start)
@@ -357,7 +424,11 @@ def test_the_service_shows_that_it_lives_and_takes_it_back(
 def test_two_services_share_the_world_and_a_query_gets_both(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
-    far: dict[str, Any] = {"latitude": [-33.9], "longitude": [18.4], "cell": [int(grid.cell_of(-33.9, 18.4))]}
+    far: dict[str, Any] = {
+        "latitude": [-33.9],
+        "longitude": [18.4],
+        "cell": [int(grid.cell_of(-33.9, 18.4))],
+    }
     region = int(grid.region_of(far["cell"][0]))
     here, there = (f"{keys.chunks(place, 10).split('/')[0]}/*/*" for place in (REGION, region))
     with (
@@ -367,7 +438,11 @@ def test_two_services_share_the_world_and_a_query_gets_both(
         fleet = Fleet(session).meet(REGION, region)
         fleet.settle(batch("sim-001", 1, now(), [0.8]))
         sent = dataclasses.replace(batch("sim-002", 1, now(), [0.8], **far), region=region)
-        session.put(keys.observation_key(region, "sim-002"), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
+        session.put(
+            keys.observation_key(region, "sim-002"),
+            wire.encode(sent),
+            encoding=wire.ENCODING[sent.kind],
+        )
         until(lambda: 1 in fleet.durable["sim-002"])
         assert a.service.engine.state.fusion.size == b.service.engine.state.fusion.size == 1
         assert {name for name, _, _ in ask(session)} == {

@@ -43,7 +43,17 @@ PLACES: Final = ((57.7, 11.97), (48.1, 11.6))  # in two zones
 VEHICLES: Final = 8
 ROUNDS: Final = 12  # half of them before the midnight and the checkpoint
 ROUND_NS: Final = 40 * SECOND
-COLUMNS: Final = ("cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "observations")
+COLUMNS: Final = (
+    "cell",
+    "sector",
+    "mu",
+    "mu_lower",
+    "mu_upper",
+    "p_slippery",
+    "basis",
+    "vehicles",
+    "observations",
+)
 
 
 def now_of(turn: int) -> int:
@@ -63,7 +73,13 @@ def observed(turn: int, vehicle: int) -> Batch:
     where = {"latitude": [latitude] * 2, "longitude": [longitude] * 2, "cell": [cell] * 2}
     told = vehicle % 3 > 0
     one = batch(
-        f"sim-{vehicle:03}", turn + 1, now_of(turn) - SECOND - late, mu, told=told, used=None if told else 0.15, **where
+        f"sim-{vehicle:03}",
+        turn + 1,
+        now_of(turn) - SECOND - late,
+        mu,
+        told=told,
+        used=None if told else 0.15,
+        **where,
     )
     return replace(one, region=int(grid.region_of(cell)))
 
@@ -71,7 +87,13 @@ def observed(turn: int, vehicle: int) -> Batch:
 def moved(turn: int, vehicle: int) -> Batch:
     """The state that a vehicle sends in a round."""
     latitude, longitude = PLACES[vehicle % 2]
-    values = {"time": now_of(turn) - SECOND, "latitude": latitude, "longitude": longitude, "yaw": 0.1, "vx": 15.0}
+    values = {
+        "time": now_of(turn) - SECOND,
+        "latitude": latitude,
+        "longitude": longitude,
+        "yaw": 0.1,
+        "vx": 15.0,
+    }
     types = wire.column_types(Kind.STATE)
     columns = {name: np.array([value]).astype(types[name]) for name, value in values.items()}
     region = int(grid.region_of(grid.cell_of(latitude, longitude)))
@@ -81,8 +103,13 @@ def moved(turn: int, vehicle: int) -> Batch:
 def messages(turn: int) -> Iterator[Message]:
     """All that a round brings."""
     for vehicle in range(VEHICLES):
-        for one, key in ((observed(turn, vehicle), keys.observation_key), (moved(turn, vehicle), keys.state_key)):
-            yield Message(one.kind, key(one.region, one.vehicle), wire.encode(one), wire.ENCODING[one.kind])
+        for one, key in (
+            (observed(turn, vehicle), keys.observation_key),
+            (moved(turn, vehicle), keys.state_key),
+        ):
+            yield Message(
+                one.kind, key(one.region, one.vehicle), wire.encode(one), wire.ENCODING[one.kind]
+            )
 
 
 def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
@@ -109,7 +136,11 @@ def map_of(engine: Engine, at: int) -> dict[str, Any]:
     fusion = engine.state.fusion
     slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
     lines = cell_table(fusion, slots, at).select(COLUMNS).to_pylist()
-    return {"at": at, "cells": lines, "beliefs": np.asarray(fusion.beliefs(slots, at), np.float64).tolist()}
+    return {
+        "at": at,
+        "cells": lines,
+        "beliefs": np.asarray(fusion.beliefs(slots, at), np.float64).tolist(),
+    }
 
 
 def make(root: Path) -> dict[str, Any]:
@@ -117,9 +148,13 @@ def make(root: Path) -> dict[str, Any]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if turn == 2:
-                report = weather.encode(weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0))
+                report = weather.encode(
+                    weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0)
+                )
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))
-                engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
+                engine.intake.weather.enqueue(
+                    WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING)
+                )
                 engine.intake.update_weather(now_of(2))
             engine.intake.ingest(list(messages(turn)), now_of(turn))
             if turn % 2:

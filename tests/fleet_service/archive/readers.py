@@ -36,7 +36,12 @@ def by_pandas(root: Path) -> Seen:
     import pandas as pd
 
     frame = pd.read_parquet(root / "observations")
-    return Seen(len(frame), frame["mu"].mean(), frame["log_likelihood"].notna().sum(), frame["zone"].nunique())
+    return Seen(
+        len(frame),
+        frame["mu"].mean(),
+        frame["log_likelihood"].notna().sum(),
+        frame["zone"].nunique(),
+    )
 
 
 def by_polars(root: Path) -> Seen:
@@ -50,7 +55,9 @@ def by_polars(root: Path) -> Seen:
 def by_duckdb(root: Path) -> Seen:
     import duckdb
 
-    query = "select count(*), avg(mu), count(log_likelihood), count(distinct zone) from read_parquet(?)"
+    query = (
+        "select count(*), avg(mu), count(log_likelihood), count(distinct zone) from read_parquet(?)"
+    )
     with duckdb.connect() as db:
         row = db.execute(query, [str(root / "observations/*/*/*.parquet")]).fetchone()
     assert row is not None
@@ -60,7 +67,9 @@ def by_duckdb(root: Path) -> Seen:
 def by_ibis(root: Path) -> Seen:
     import ibis
 
-    t = ibis.duckdb.connect().read_parquet(str(root / "observations/*/*/*.parquet"), hive_partitioning=True)
+    t = ibis.duckdb.connect().read_parquet(
+        str(root / "observations/*/*/*.parquet"), hive_partitioning=True
+    )
     found = t.aggregate(
         rows=t.count(), mu=t.mu.mean(), told=t.log_likelihood.count(), zones=t.zone.nunique()
     ).to_pyarrow()
@@ -74,7 +83,9 @@ def by_spark(root: Path) -> Seen:
     builder = SparkSession.builder.master("local[1]").config("spark.ui.enabled", "false")
     spark = builder.config("spark.sql.session.timeZone", "UTC").getOrCreate()
     frame = spark.read.parquet(str(root / "observations"))
-    row = frame.agg(f.count("*"), f.avg("mu"), f.count("log_likelihood"), f.count_distinct("zone")).collect()[0]
+    row = frame.agg(
+        f.count("*"), f.avg("mu"), f.count("log_likelihood"), f.count_distinct("zone")
+    ).collect()[0]
     return Seen(*row)
 
 

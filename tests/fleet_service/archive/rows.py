@@ -26,7 +26,8 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
         if field.type == tables.LIKELIHOOD:
             rows["with_likelihood"] = rng.random(count) < 0.8
             rows[field.name] = (
-                rng.integers(0, 256, (count, mugrid.BINS)).astype(np.uint8) * rows["with_likelihood"][:, None]
+                rng.integers(0, 256, (count, mugrid.BINS)).astype(np.uint8)
+                * rows["with_likelihood"][:, None]
             )
         elif field.type == tables.US:
             rows[field.name] = START + rng.integers(0, 1200 * 10**9, count)
@@ -62,5 +63,7 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
     """(boot, seq) of all rows that a reader sees, sorted."""
     return sorted(
-        (row["boot"], row["seq"]) for table in reading.read(root, kind, ["boot", "seq"]) for row in table.to_pylist()
+        (row["boot"], row["seq"])
+        for table in reading.read(root, kind, ["boot", "seq"])
+        for row in table.to_pylist()
     )

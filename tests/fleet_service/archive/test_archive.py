@@ -31,11 +31,15 @@ MONTH = 31 * 86_400 * SECOND
 
 def sent(vehicle: str, seq: int, told: bool = True) -> Message:
     one = batch(vehicle, seq, time.time_ns() - SECOND, [0.8, 0.7], told=told)
-    return Message(Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+    return Message(
+        Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
+    )
 
 
 def settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int]]]:
-    return {vehicle: [r for s in wire.decode_ack(ack)[1] for r in s.durable] for vehicle, ack in acks}
+    return {
+        vehicle: [r for s in wire.decode_ack(ack)[1] for r in s.durable] for vehicle, ack in acks
+    }
 
 
 @pytest.fixture
@@ -66,12 +70,16 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         order.clear()
         acks = engine.settlement.flush()
         order.append("ack")
-        who = ["file", "folder"] if seq == 1 else []  # which vehicle of the map this is, when it is new
+        who = (
+            ["file", "folder"] if seq == 1 else []
+        )  # which vehicle of the map this is, when it is new
         assert order == [*who, "file", "rename", "folder", "ack"]
         assert settled(acks) == {"sim-001": [(seq, seq)]}
 
 
-def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(engine: Engine, tmp_path: Path) -> None:
+def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(
+    engine: Engine, tmp_path: Path
+) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")
     engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
     assert engine.settlement.flush() == []
@@ -80,7 +88,10 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(engine: Engi
     assert engine.counts["segment_failures"] == 2
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
     assert settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
-    assert sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION)) == 4
+    assert (
+        sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION))
+        == 4
+    )
 
 
 def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_path: Path) -> None:
@@ -90,7 +101,9 @@ def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_pat
     lock_archive(tmp_path).close()
 
 
-def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:
+def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
+    engine: Engine, tmp_path: Path
+) -> None:
     for seq in (1, 2, 3):
         engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
         engine.settlement.flush()
@@ -118,7 +131,9 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
     before = next(reading.read(tmp_path, Kind.OBSERVATION)).to_pylist()
     segment.write_bytes(content)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        held = [row for table in reading.read(tmp_path, Kind.OBSERVATION) for row in table.to_pylist()]
+        held = [
+            row for table in reading.read(tmp_path, Kind.OBSERVATION) for row in table.to_pylist()
+        ]
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
         assert ("is damaged and set aside" in caplog.text) == (not held)
@@ -222,4 +237,6 @@ def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_
     ]  # fmt: skip
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        np.testing.assert_array_equal(again.state.fusion.live.visits[: again.state.fusion.size], [3])
+        np.testing.assert_array_equal(
+            again.state.fusion.live.visits[: again.state.fusion.size], [3]
+        )

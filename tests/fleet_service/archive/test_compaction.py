@@ -46,7 +46,10 @@ def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
 
 def test_compacted_rows_are_the_rows_of_the_inbox(tmp_path: Path) -> None:
     fill(tmp_path, SEGMENTS, ROWS)
-    by: list[tuple[str, Literal["ascending", "descending"]]] = [("boot", "ascending"), ("seq", "ascending")]
+    by: list[tuple[str, Literal["ascending", "descending"]]] = [
+        ("boot", "ascending"),
+        ("seq", "ascending"),
+    ]
     before = {kind: pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by) for kind in Kind}
     done = compact(tmp_path)
     assert done == (2 * SEGMENTS * ROWS, 2 * SEGMENTS, 2 * 2 * 2)
@@ -65,7 +68,11 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
         f"q{grid.quadkey(int(grid.zone_of(cell)), 7)}"
         for cell in grid.cell_of(*np.array([[57.7, 48.1], [11.97, 11.6]]))
     ]
-    assert folders == {f"observations/date={layout.date_of(20_000 + k)}/zone={zone}" for k in (0, 1) for zone in zones}
+    assert folders == {
+        f"observations/date={layout.date_of(20_000 + k)}/zone={zone}"
+        for k in (0, 1)
+        for zone in zones
+    }
     for path in found:
         file = pq.ParquetFile(path)
         assert file.schema_arrow.equals(tables.OBSERVATION_ARCHIVE)
@@ -74,10 +81,17 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
         order = list(zip(table["cell"].to_pylist(), table["leave_time"].to_pylist(), strict=True))
         assert order == sorted(order)
         time = segments.nanoseconds(table["leave_time"])
-        day, zone = (np.unique(values).tolist() for values in layout.partitions_of(time, table["cell"].to_numpy()))
+        day, zone = (
+            np.unique(values).tolist()
+            for values in layout.partitions_of(time, table["cell"].to_numpy())
+        )
         assert ([layout.partition_of(path).day], [layout.partition_of(path).zone]) == (day, zone)
         column = file.metadata.row_group(0).column(table.schema.names.index("cell"))
-        assert (column.compression, column.has_column_index, column.is_stats_set) == ("ZSTD", True, True)
+        assert (column.compression, column.has_column_index, column.is_stats_set) == (
+            "ZSTD",
+            True,
+            True,
+        )
 
 
 def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
@@ -95,14 +109,18 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
 
     for name in ("rename", "unlink", "mkdir"):
         monkeypatch.setattr(Path, name, counted(name, getattr(Path, name)))
-    monkeypatch.setattr(os, "fsync", counted("fsync", lambda _: None))  # a dead process needs no disk that syncs
+    monkeypatch.setattr(
+        os, "fsync", counted("fsync", lambda _: None)
+    )  # a dead process needs no disk that syncs
     monkeypatch.setattr(files, "write_table", counted("write", files.write_table))
     monkeypatch.setattr(compaction, "write_table", counted("write", files.write_table))
     return seen
 
 
 @pytest.mark.campaign
-def test_it_may_die_before_any_change_of_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_may_die_before_any_change_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fill(tmp_path / "0", 2, 16)
     whole = {kind: identities(tmp_path / "0", kind) for kind in Kind}
     later = {kind: [(7, k) for k in range(1, 17)] for kind in Kind}
@@ -135,7 +153,9 @@ def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
         with pytest.raises(DiedError):
             compact(tmp_path)
     assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 2
-    assert compact(tmp_path).rows == 2 * ROWS  # of states; the observations are only removed from the inbox
+    assert (
+        compact(tmp_path).rows == 2 * ROWS
+    )  # of states; the observations are only removed from the inbox
     assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
 
 
@@ -164,7 +184,9 @@ def test_readers_see_every_row_once_while_it_runs(tmp_path: Path) -> None:
     assert public(tmp_path, Kind.OBSERVATION) == whole
 
 
-def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_is_overtaken_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fill(tmp_path, 3, ROWS)
     whole = identities(tmp_path, Kind.OBSERVATION)
     load, loaded = loading.load, []
@@ -182,7 +204,10 @@ def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: py
 
 def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
-    with hold_compaction_lock(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
+    with (
+        hold_compaction_lock(tmp_path),
+        pytest.raises(InputError, match="^archive: .* is being compacted; "),
+    ):
         compact(tmp_path)
     with pytest.raises(InputError, match="^archive: .* is no folder; "):
         compact(tmp_path / "nowhere")
@@ -222,7 +247,9 @@ def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: P
     for _ in range(2):
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             np.testing.assert_allclose(
-                again.state.fusion.beliefs(np.arange(again.state.fusion.size), at), before, atol=1e-6
+                again.state.fusion.beliefs(np.arange(again.state.fusion.size), at),
+                before,
+                atol=1e-6,
             )
             again.intake.ingest(messages, time_ns())
             assert again.counts["duplicates"] == 20

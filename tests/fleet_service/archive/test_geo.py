@@ -27,7 +27,12 @@ def a_map(cells: int = 300) -> pa.Table:
     cell = CELL + rng.permutation(cells)
     fusion = Fusion(120.0)
     fusion.update(
-        observations(np.arange(cells), np.arange(cells) % 7, value(rng.uniform(0.2, 0.9, cells)), cell.tolist())
+        observations(
+            np.arange(cells),
+            np.arange(cells) % 7,
+            value(rng.uniform(0.2, 0.9, cells)),
+            cell.tolist(),
+        )
     )
     return cell_table(fusion, np.arange(fusion.size), START + 10**12)
 
@@ -71,12 +76,16 @@ def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: P
 def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> None:
     table = geo.with_cells(pa.table({"cell": [CELL] * 4, "sector": pa.array(range(4), pa.int8())}))
     extract.write(table, tmp_path / "a.geojson")
-    quarters = geopandas.read_file(tmp_path / "a.geojson").geometry.set_crs(None, allow_override=True)
+    quarters = geopandas.read_file(tmp_path / "a.geojson").geometry.set_crs(
+        None, allow_override=True
+    )
     west, south, east, north = (float(side) for side in grid.bounds(CELL))
     whole = box(west, south, east, north)
     assert quarters.union_all().symmetric_difference(whole).area < 1e-9 * whole.area
     assert quarters.area.sum() == pytest.approx(whole.area)
-    for sector, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):  # east, north, west, south of the middle
+    for sector, (x, y) in enumerate(
+        ((1, 0), (0, 1), (-1, 0), (0, -1))
+    ):  # east, north, west, south of the middle
         off = quarters.iloc[sector].centroid
         assert (off.x - whole.centroid.x) * x + (off.y - whole.centroid.y) * y > 0.0
     (square,) = geo.shapes(geo.with_cells(pa.table({"cell": [CELL]})))
@@ -86,7 +95,9 @@ def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> N
 @pytest.mark.parametrize("rows", [0, 1, 5])
 def test_points_are_geoparquet_too_and_so_is_nothing(tmp_path: Path, rows: int) -> None:
     x, y = np.linspace(11.0, 12.0, rows), np.linspace(57.0, 58.0, rows)
-    write_table(geo.with_points(pa.table({"n": np.arange(rows)}), x, y), tmp_path / "points.parquet", MAP)
+    write_table(
+        geo.with_points(pa.table({"n": np.arange(rows)}), x, y), tmp_path / "points.parquet", MAP
+    )
     report = geoparquet_validator.check(str(tmp_path / "points.parquet"))
     assert geoparquet_validator.failed(report, "core") == []
     frame = geopandas.read_parquet(tmp_path / "points.parquet")
@@ -97,10 +108,14 @@ def test_points_are_geoparquet_too_and_so_is_nothing(tmp_path: Path, rows: int) 
 def test_the_validator_refuses_a_file_whose_geometry_is_broken(tmp_path: Path) -> None:
     table = geo.with_cells(a_map(3))
     broken = table.set_column(
-        table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01\x03"] * 3, pa.binary())
+        table.schema.get_field_index("geometry"),
+        "geometry",
+        pa.array([b"\x01\x03"] * 3, pa.binary()),
     )
     write_table(broken, tmp_path / "broken.parquet", MAP)
-    assert geoparquet_validator.failed(geoparquet_validator.check(str(tmp_path / "broken.parquet")), "core")
+    assert geoparquet_validator.failed(
+        geoparquet_validator.check(str(tmp_path / "broken.parquet")), "core"
+    )
 
 
 def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
@@ -110,7 +125,9 @@ def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
     frame = geopandas.read_file(tmp_path / "map.geojson")
     assert frame["cell"].tolist() == table["cell"].to_pylist()
     np.testing.assert_allclose(frame["mu"], table["mu"].to_numpy(), atol=1e-6)
-    np.testing.assert_allclose(frame.geometry.bounds["maxx"], grid.bounds(table["cell"].to_numpy())[2])
+    np.testing.assert_allclose(
+        frame.geometry.bounds["maxx"], grid.bounds(table["cell"].to_numpy())[2]
+    )
     header, *lines = (tmp_path / "map.csv").read_text().splitlines()
     assert header.startswith('"cell","sector","mu"')
     assert len(lines) == 3

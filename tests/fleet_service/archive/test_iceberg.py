@@ -47,7 +47,11 @@ def test_compacted_files_are_registered_once_and_the_log_never(
     writer = fill(root, 2, 100)
     compact(root)
     writer.write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 30, 9))  # waits in the inbox
-    assert exported(root, capsys) == {"added": 8, "dropped": 0, "rows": 400}  # two days, two zones, two kinds
+    assert exported(root, capsys) == {
+        "added": 8,
+        "dropped": 0,
+        "rows": 400,
+    }  # two days, two zones, two kinds
     assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 400}
     assert rows_different(root, uri(root)) == 0
     compact(root)
@@ -56,10 +60,15 @@ def test_compacted_files_are_registered_once_and_the_log_never(
     assert rows_different(root, uri(root)) == 0
     table = table_of(uri(root), Kind.OBSERVATION)
     connection = table.scan(selected_fields=("cell", "boot", "mu")).to_duckdb("seen")
-    assert connection.execute("select count(*), count(distinct boot) from seen").fetchone() == (230, 3)
+    assert connection.execute("select count(*), count(distinct boot) from seen").fetchone() == (
+        230,
+        3,
+    )
 
 
-def test_what_retention_removes_leaves_the_tables_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_retention_removes_leaves_the_tables_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = tmp_path / "archive"
     fill(root, 2, 100)
     compact(root)
@@ -71,7 +80,9 @@ def test_what_retention_removes_leaves_the_tables_first(tmp_path: Path, capsys: 
     assert 0 < told["rows"] < 400
 
 
-def test_a_catalogue_that_is_away_holds_retention_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_catalogue_that_is_away_holds_retention_up(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = tmp_path / "archive"
     fill(root, 1, 50)
     compact(root)
@@ -101,8 +112,13 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         writer.write(kind, rows)
     compact(root)
     assert exported(root, capsys)["rows"] == 200
-    assert main(["forget", "--archive", str(root), "--vehicle", "sim-003", "--period", MONTH, "--yes"]) == 0
-    seen = table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()  # rewritten files are out, and it can be read
+    assert (
+        main(["forget", "--archive", str(root), "--vehicle", "sim-003", "--period", MONTH, "--yes"])
+        == 0
+    )
+    seen = (
+        table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()
+    )  # rewritten files are out, and it can be read
     assert names[3] not in seen["vehicle"].to_pylist()
     assert exported(root, capsys)["rows"] == 160
     assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 160}
@@ -111,7 +127,9 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         assert names[3].encode() not in path.read_bytes()
 
 
-def test_readers_elsewhere_are_told_of_the_mirror(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readers_elsewhere_are_told_of_the_mirror(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root, there = tmp_path / "archive", tmp_path / "there"
     fill(root, 1, 50)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
@@ -123,13 +141,17 @@ def test_readers_elsewhere_are_told_of_the_mirror(tmp_path: Path, capsys: pytest
         iceberg.register(root, iceberg.Place(uri(root), "other", root.as_uri()))
 
 
-def test_the_namespace_is_the_one_that_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_namespace_is_the_one_that_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = tmp_path / "archive"
     fill(root, 1, 50)
     compact(root)
     exported(root, capsys, "--namespace", "north")
     with closing(sqlite3.connect(tmp_path / "tables.db")) as catalogue:
-        found = {name for (name,) in catalogue.execute("select table_namespace from iceberg_tables")}
+        found = {
+            name for (name,) in catalogue.execute("select table_namespace from iceberg_tables")
+        }
     assert found == {"north"}
 
 
@@ -153,7 +175,10 @@ def test_two_archives_share_tables(tmp_path: Path, capsys: pytest.CaptureFixture
             ["--archive", "{root}", "--catalog", "sqlite:///x.db", "--out", "x.csv"],
             "error: out: says nothing to export",
         ),
-        (["--archive", "{root}", "--catalog", "nobody-knows-it"], "error: catalog: nobody-knows-it: "),
+        (
+            ["--archive", "{root}", "--catalog", "nobody-knows-it"],
+            "error: catalog: nobody-knows-it: ",
+        ),
     ],
 )
 def test_a_wrong_export_is_one_line(

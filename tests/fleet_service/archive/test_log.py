@@ -29,7 +29,9 @@ def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATIO
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 
-def test_what_is_added_while_a_segment_is_written_waits_for_the_next(log: SegmentLog[str], tmp_path: Path) -> None:
+def test_what_is_added_while_a_segment_is_written_waits_for_the_next(
+    log: SegmentLog[str], tmp_path: Path
+) -> None:
     add(log, "first", 1)
     log.begin()
     add(log, "second", 2)
@@ -53,7 +55,9 @@ def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]
     assert log.flush() == []
 
 
-def test_failed_writes_are_not_settled_and_come_once_with_the_next(log: SegmentLog[str], tmp_path: Path) -> None:
+def test_failed_writes_are_not_settled_and_come_once_with_the_next(
+    log: SegmentLog[str], tmp_path: Path
+) -> None:
     inbox, away = (segments.folder(tmp_path, Kind.STATE), tmp_path / "away")
     add(log, "seen", 1)
     add(log, "state", 2, Kind.STATE)
@@ -61,7 +65,10 @@ def test_failed_writes_are_not_settled_and_come_once_with_the_next(log: SegmentL
     log.begin()
     with pytest.raises(OSError, match="states"):
         log.end()
-    assert (log.rows, log.unsettled) == (3, 2)  # the observations are written, but settled with the rest
+    assert (log.rows, log.unsettled) == (
+        3,
+        2,
+    )  # the observations are written, but settled with the rest
     add(log, "later", 3)
     with pytest.raises(OSError, match="states"):
         log.flush()
@@ -72,7 +79,9 @@ def test_failed_writes_are_not_settled_and_come_once_with_the_next(log: SegmentL
 
 
 def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
-    newer, older = (layout.segment_name("shard-0-0000000007", number) for number in (100_000_000, 99_999_999))
+    newer, older = (
+        layout.segment_name("shard-0-0000000007", number) for number in (100_000_000, 99_999_999)
+    )
     assert sorted([newer, older], key=layout.age) == [older, newer]
 
 

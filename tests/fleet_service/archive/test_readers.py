@@ -37,7 +37,9 @@ def test_a_tool_reads_the_observations(archive: tuple[Path, Seen], name: str) ->
     assert seen == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_page_in_an_archive_names_every_column_with_its_unit(archive: tuple[Path, Seen]) -> None:
+def test_the_page_in_an_archive_names_every_column_with_its_unit(
+    archive: tuple[Path, Seen],
+) -> None:
     page = (archive[0] / "README.md").read_text()
     assert page == readme.text()
     assert "| `speed` | float | m/s | mean speed over the visit; multiples of 0.015625 |" in page

@@ -37,21 +37,29 @@ MONTH = f"{DATE:%Y-%m}"
 
 
 def vehicles_in(root: Path, kind: Kind) -> list[str]:
-    return sorted(row["vehicle"] for table in reading.read(root, kind, ["vehicle"]) for row in table.to_pylist())
+    return sorted(
+        row["vehicle"]
+        for table in reading.read(root, kind, ["vehicle"])
+        for row in table.to_pylist()
+    )
 
 
 def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     fill(tmp_path, 2, 100)
     compact(tmp_path)
     assert retention.retire_rows(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
-    days = {kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind}
+    days = {
+        kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind
+    }
     assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
     whole = len(identities(tmp_path, Kind.OBSERVATION))
     done = retention.retire_rows(tmp_path, 31, DATE + timedelta(days=32))
     assert done == (2, 4)  # a day of observations and one of states, two zones each
     left = len(identities(tmp_path, Kind.OBSERVATION))
     assert 0 < left < whole
-    rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
+    rolled = [
+        pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")
+    ]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == whole - left
     assert rollup.complete(tmp_path) == 2  # those of the day that stayed
 
@@ -73,10 +81,14 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
             writer.write(kind, rows)
             if seed == 1:
                 compact(tmp_path)
-    assert main(["forget", "--archive", str(tmp_path), "--vehicle", "sim-003", "--period", MONTH]) == 0
+    assert (
+        main(["forget", "--archive", str(tmp_path), "--vehicle", "sim-003", "--period", MONTH]) == 0
+    )
     for kind in Kind:
         assert vehicles_in(tmp_path, kind) == sorted(names[[0, 1, 2, 4]].tolist() * 36)
-    rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
+    rolled = [
+        pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")
+    ]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == 144
     assert compact(tmp_path) == (0, 0, 0)
     assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, (), None)
@@ -89,14 +101,36 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(8):  # six in one cell; and one, and another, alone
             latitude = LATITUDE if k < 6 else LATITUDE - 0.001 * k
-            one = batch(f"car-{k:03}", 1, now, [0.8], latitude=[latitude], cell=[grid.cell_of(latitude, LONGITUDE)])
-            engine.intake.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+            one = batch(
+                f"car-{k:03}",
+                1,
+                now,
+                [0.8],
+                latitude=[latitude],
+                cell=[grid.cell_of(latitude, LONGITUDE)],
+            )
+            engine.intake.ingest(
+                [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now
+            )
         engine.settlement.flush()
         snapshot = snapshots.write(root, engine.queries.whole_map(now), now)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
     (root / "inbox" / f"shard-0-0000000001-00000001.parquet{BAD}").write_bytes(b"who knows")
-    words = ["forget", "--archive", str(root), "--period", month, "--put-to", there.as_uri(), "--yes", "--vehicle"]
-    for vehicle, cells in (("car-001", 3), ("car-007", 2)):  # a line of five others stays, that of nobody else goes
+    words = [
+        "forget",
+        "--archive",
+        str(root),
+        "--period",
+        month,
+        "--put-to",
+        there.as_uri(),
+        "--yes",
+        "--vehicle",
+    ]
+    for vehicle, cells in (
+        ("car-001", 3),
+        ("car-007", 2),
+    ):  # a line of five others stays, that of nobody else goes
         assert main([*words, vehicle]) == 0
         for folder in (root, there):
             table = pq.read_table(folder / snapshot.relative_to(root), partitioning=None)
@@ -120,9 +154,14 @@ ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 def told(engine: Engine, sent: Batch, now: int) -> list[str]:
     """Return the acknowledgement of a batch, once a segment is written."""
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
-    streams = [stream for _, data in engine.settlement.flush() for stream in wire.decode_ack(data)[1]]
+    streams = [
+        stream for _, data in engine.settlement.flush() for stream in wire.decode_ack(data)[1]
+    ]
     assert all(stream.durable in ((), ((sent.seq, sent.seq),)) for stream in streams)
-    return [*("durable" for one in streams if one.durable), *(why for one in streams for *_, why in one.rejected)]
+    return [
+        *("durable" for one in streams if one.durable),
+        *(why for one in streams for *_, why in one.rejected),
+    ]
 
 
 def rows_kept(root: Path) -> int:
@@ -131,7 +170,11 @@ def rows_kept(root: Path) -> int:
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
-    old, away, after = batch("car-001", 1, NOON, [0.8]), batch("car-002", 1, NOON - DAY, [0.8]), NOON + 3 * DAY
+    old, away, after = (
+        batch("car-001", 1, NOON, [0.8]),
+        batch("car-002", 1, NOON - DAY, [0.8]),
+        NOON + 3 * DAY,
+    )
     later = batch("car-001", 2, after, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert told(engine, old, after + SECOND) == ["durable"]
@@ -139,7 +182,9 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
     assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
     for _ in range(2):  # replayed from the log, then from a checkpoint
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-            assert told(engine, old, after + SECOND) == [ERASED], "settled, or its car would send it for ever"
+            assert told(engine, old, after + SECOND) == [ERASED], (
+                "settled, or its car would send it for ever"
+            )
             assert told(engine, away, after + SECOND) == [ERASED], "of that month, and never there"
             assert told(engine, later, after + SECOND) == ["durable"]
             assert (engine.counts["refused.erased"], engine.counts["duplicates"]) == (2, 1)
@@ -167,7 +212,9 @@ def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: 
     (mark,) = (tmp_path / "keys").glob("*.erased")
     assert Pseudonyms(tmp_path / "keys").of("car-001", NOON) in mark.name
     retention.forget_period(tmp_path, "2026-01")
-    assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], "it goes with the key"
+    assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], (
+        "it goes with the key"
+    )
 
 
 def test_forgetting_a_month_does_not_readmit_an_already_forgotten_vehicle(
@@ -175,7 +222,10 @@ def test_forgetting_a_month_does_not_readmit_an_already_forgotten_vehicle(
 ) -> None:
     other, last = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2))
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [["durable"], ["durable"]]
+        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [
+            ["durable"],
+            ["durable"],
+        ]
     retention.forget_vehicle(tmp_path, "car-002", "2026-01")
     retention.forget_period(tmp_path, "2026-01")
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
@@ -202,14 +252,19 @@ def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> 
     assert rows_kept(tmp_path) == 2
 
 
-@pytest.mark.parametrize(("period", "problem"), [("2026-13", "is no month"), ("1999-01", "has no key of 1999-01")])
+@pytest.mark.parametrize(
+    ("period", "problem"), [("2026-13", "is no month"), ("1999-01", "has no key of 1999-01")]
+)
 def test_a_period_that_is_none_is_said(tmp_path: Path, period: str, problem: str) -> None:
     with pytest.raises(InputError, match=f"^period: .*{problem}"):
         retention.forget_vehicle(tmp_path, "sim-003", period)
 
 
 def test_nothing_is_forgotten_beside_a_running_service(tmp_path: Path) -> None:
-    with closing(Engine(ServiceConfig(), tmp_path)), pytest.raises(InputError, match="belongs to a running service"):
+    with (
+        closing(Engine(ServiceConfig(), tmp_path)),
+        pytest.raises(InputError, match="belongs to a running service"),
+    ):
         retention.forget_period(tmp_path, MONTH)
 
 
@@ -230,15 +285,26 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
 
 @pytest.mark.parametrize("ending", [".parquet", ".geojson", ".csv"])
 @pytest.mark.parametrize("what", ["observations", "rollup"])
-def test_parts_are_exported(tmp_path: Path, what: str, ending: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parts_are_exported(
+    tmp_path: Path, what: str, ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     root, out = tmp_path / "archive", tmp_path / f"out{ending}"
     fill(root, 2, 50)
     assert main(["compact", "--archive", str(root)]) == 0
     capsys.readouterr()
-    words = ["--bbox", "11.9,57,12.1,58", "--from", str(DATE), "--to", str(DATE + timedelta(days=1))]
+    words = [
+        "--bbox",
+        "11.9,57,12.1,58",
+        "--from",
+        str(DATE),
+        "--to",
+        str(DATE + timedelta(days=1)),
+    ]
     assert main(["export", what, "--archive", str(root), *words, "--out", str(out)]) == 0
     rows = pa.concat_tables(reading.read(root, Kind.OBSERVATION))
-    inside = (segments.nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (rows["latitude"].to_numpy() > 57)
+    inside = (segments.nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (
+        rows["latitude"].to_numpy() > 57
+    )
     said = int(capsys.readouterr().out.split()[0])
     assert 0 < said <= inside.sum()
     assert what == "rollup" or said == inside.sum()
@@ -251,7 +317,10 @@ def test_parts_are_exported(tmp_path: Path, what: str, ending: str, capsys: pyte
     [
         (["map", "--snapshot", "--out", "map.parquet"], "error: to: there is no snapshot"),
         (["observations", "--out", "x.xls"], "error: out: x.xls has no known ending"),
-        (["observations", "--from", "yesterday", "--out", "x.csv"], "error: from: 'yesterday' is no time"),
+        (
+            ["observations", "--from", "yesterday", "--out", "x.csv"],
+            "error: from: 'yesterday' is no time",
+        ),
         (["observations", "--out", "/nowhere/at/all.csv"], "error: out: cannot write"),
     ],
 )

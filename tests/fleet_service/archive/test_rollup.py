@@ -20,7 +20,12 @@ from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill
 
 # other columns are added up
-JOIN: dict[str, Callable[..., Any]] = {"mu_min": min, "mu_max": max, "utilised_max": max, "vehicle_bits": np.bitwise_or}
+JOIN: dict[str, Callable[..., Any]] = {
+    "mu_min": min,
+    "mu_max": max,
+    "utilised_max": max,
+    "vehicle_bits": np.bitwise_or,
+}
 
 
 def merged(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
@@ -58,12 +63,17 @@ def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
     assert max(map(len, direct.values())) > 3
     for key, group in direct.items():
         mu = np.array([row["mu"] for row in group])
-        sums = np.sum([np.frombuffer(row["log_likelihood"] or bytes(mugrid.BINS), np.uint8) for row in group], axis=0)
+        sums = np.sum(
+            [np.frombuffer(row["log_likelihood"] or bytes(mugrid.BINS), np.uint8) for row in group],
+            axis=0,
+        )
         assert found[key]["observations"] == found[key]["mu_count"] == len(group)
         assert found[key]["mu_min"] == mu.min()
         assert found[key]["utilised_max"] == max(row["mu_utilised"] for row in group)
         np.testing.assert_allclose(
-            [found[key]["mu_sum"], found[key]["mu_sum_squares"]], [mu.sum(), (mu**2).sum()], rtol=1e-12
+            [found[key]["mu_sum"], found[key]["mu_sum_squares"]],
+            [mu.sum(), (mu**2).sum()],
+            rtol=1e-12,
         )
         np.testing.assert_array_equal(found[key]["mu_histogram"], np.histogram(mu, mugrid.EDGES)[0])
         np.testing.assert_array_equal(found[key]["log_likelihood_sum"], sums)

@@ -19,7 +19,14 @@ from fleet_service import cli
 from fleet_service.app.engine import Engine
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import layout, reading, segments, version
-from fleet_service.archive.format.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_table
+from fleet_service.archive.format.files import (
+    COMPACTED,
+    MAP,
+    ROLLUP,
+    SEGMENT,
+    Encoding,
+    write_table,
+)
 from fleet_service.archive.format.load import content
 from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
@@ -50,7 +57,9 @@ def same(found: dict[str, Any], made: dict[str, Any]) -> None:
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
     for now, line in zip(found["cells"], made["cells"], strict=True):
-        then = line | ({"mu": None} if line["basis"] == "bound" else {})  # since 1.2 a bound has no mu
+        then = line | (
+            {"mu": None} if line["basis"] == "bound" else {}
+        )  # since 1.2 a bound has no mu
         assert now == {name: pytest.approx(then[name], abs=1e-5) for name in COLUMNS}
 
 
@@ -64,7 +73,10 @@ def test_kept_archive_is_of_version_one_and_has_every_kind_of_file(old: Path) ->
     digests = set()
     for path in files(old):
         with pq.ParquetFile(path) as file:
-            assert version.judge(path, file.schema_arrow, version.entries_of(file.metadata.metadata)) == version.OLDEST
+            assert (
+                version.judge(path, file.schema_arrow, version.entries_of(file.metadata.metadata))
+                == version.OLDEST
+            )
             digests.add(version.digest(file.schema_arrow, {}))
     assert digests == version.FIRST
     assert len(checkpoints.newest(old)) == 1
@@ -75,7 +87,9 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
-        assert engine.counts["checkpoints_refused"] == (begin == "checkpoint"), "it has no digests: the log is replayed"
+        assert engine.counts["checkpoints_refused"] == (begin == "checkpoint"), (
+            "it has no digests: the log is replayed"
+        )
         same(map_of(engine, MADE["at"]), MADE)
         assert engine.alerts.count == MADE["alerts"] > 0
         engine.intake.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
@@ -108,7 +122,9 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
 def test_export_reads_the_kept_files(old: Path) -> None:
     assert extract.observations(old, EVERYTHING).num_rows == MADE["rows"]["obs"]
     assert extract.map_then(old, EVERYTHING).num_rows == len(MADE["cells"])
-    assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 8 * 2 * ROUNDS // 2
+    assert (
+        extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 8 * 2 * ROUNDS // 2
+    )
 
 
 def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
@@ -116,7 +132,9 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
     return sorted(zip(*(found[name].to_pylist() for name in found.column_names), strict=True))
 
 
-def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT) -> None:
+def rewritten(
+    path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
+) -> None:
     """Let a file be one of another version."""
     found = content(path)
     assert found is not None
@@ -124,11 +142,15 @@ def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], said: str, enc
 
 
 def without_columns(table: pa.Table) -> pa.Table:
-    return table.drop_columns(["tyre_season", "abs_active", "air_temperature", "estimator", "speed"])
+    return table.drop_columns(
+        ["tyre_season", "abs_active", "air_temperature", "estimator", "speed"]
+    )
 
 
 def with_columns(table: pa.Table) -> pa.Table:
-    return table.append_column("road_wetness", pa.array(np.arange(table.num_rows) / 64.0, pa.float32()))
+    return table.append_column(
+        "road_wetness", pa.array(np.arange(table.num_rows) / 64.0, pa.float32())
+    )
 
 
 def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Path) -> None:
@@ -181,14 +203,19 @@ def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -
     table = pa.concat_tables(parts)
     assert table.schema.names == [*tables.OBSERVATION_ARCHIVE.names, "road_wetness"]
     assert (table["road_wetness"].null_count, table["tyre_season"].null_count) == (40, 20)
-    assert np.sort(table["road_wetness"].drop_null().to_numpy()).tolist() == [k / 64.0 for k in range(20)]
+    assert np.sort(table["road_wetness"].drop_null().to_numpy()).tolist() == [
+        k / 64.0 for k in range(20)
+    ]
 
 
 def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> None:
     compact(old)
     for path in layout.compacted_files(old, Kind.OBSERVATION):
         rewritten(path, with_columns, "1.7", COMPACTED)
-    assert cli.main(["forget", "--archive", str(old), "--period", "2024-10", "--vehicle", "sim-003"]) == 0
+    assert (
+        cli.main(["forget", "--archive", str(old), "--period", "2024-10", "--vehicle", "sim-003"])
+        == 0
+    )
     for path in layout.compacted_files(old, Kind.OBSERVATION):
         found = content(path)
         assert found is not None
@@ -202,9 +229,15 @@ def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) ->
         fill(tmp_path, 1, 20, seed)
         rewritten(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
         compact(tmp_path)
-    engine = pytest.importorskip("fleet_service.analytics.engines").QueryEngine("duckdb", tmp_path, EVERYTHING)
+    engine = pytest.importorskip("fleet_service.analytics.engines").QueryEngine(
+        "duckdb", tmp_path, EVERYTHING
+    )
     seen = engine.answer(engine.observations().select("seq", "tyre_season", "road_wetness"))
-    assert (seen.num_rows, seen["tyre_season"].null_count, seen["road_wetness"].null_count) == (60, 20, 40)
+    assert (seen.num_rows, seen["tyre_season"].null_count, seen["road_wetness"].null_count) == (
+        60,
+        20,
+        40,
+    )
 
 
 AHEAD = {
@@ -216,13 +249,17 @@ AHEAD = {
 def test_archive_of_a_newer_major_version_is_refused_untouched(old: Path, folder: str) -> None:
     path = next((old / folder).glob("*.parquet"), None) or next((old / folder).rglob("*.parquet"))
     rewritten(path, lambda table: table, "2.0", AHEAD[folder])
-    with pytest.raises(InputError, match=r"^archive: .* is of version 2\.0, .* reads 1\.x; use a newer GripMap$"):
+    with pytest.raises(
+        InputError, match=r"^archive: .* is of version 2\.0, .* reads 1\.x; use a newer GripMap$"
+    ):
         Engine(ServiceConfig(), old)
     assert path.exists()
     assert not list(old.rglob("*.bad"))
 
 
-def test_the_commands_refuse_a_newer_major_version_in_one_line(old: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_refuse_a_newer_major_version_in_one_line(
+    old: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     archive = ["--archive", str(old), "--out", str(old / "out.csv")]
     for what, encoding in (("observations", COMPACTED), ("rollup", ROLLUP), ("map", MAP)):
         rewritten(next((old / what).rglob("*.parquet")), lambda table: table, "2.0", encoding)
@@ -253,7 +290,10 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
 
     rewritten(path, wider, "1.2")
     compact(tmp_path)
-    assert pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type == pa.int32()
+    assert (
+        pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type
+        == pa.int32()
+    )
     rewritten(next(layout.compacted_files(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
         t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)), "1.2")  # fmt: skip
     with pytest.raises(InputError, match="^archive: column health is string and not int32; "):
@@ -261,9 +301,12 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["mu_utilised", "gripmap.version", "gripmap.digest", "gripmap.sources", "log_likelihood"]
+    "name",
+    ["mu_utilised", "gripmap.version", "gripmap.digest", "gripmap.sources", "log_likelihood"],
 )
-def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(tmp_path: Path, name: str) -> None:
+def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(
+    tmp_path: Path, name: str
+) -> None:
     fill(tmp_path, 1, 5)
     compact(tmp_path)
     path = next(layout.compacted_files(tmp_path, Kind.OBSERVATION))
@@ -314,7 +357,9 @@ def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> N
 
 
 def test_rows_with_null_are_written_again_as_they_are_read(tmp_path: Path) -> None:
-    table = segments.table_of(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5)).drop_columns(["speed"])
+    table = segments.table_of(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5)).drop_columns(
+        ["speed"]
+    )
     write_table(table, tmp_path / "one.parquet", SEGMENT)
     found = content(tmp_path / "one.parquet")
     assert found is not None

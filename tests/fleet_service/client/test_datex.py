@@ -91,7 +91,10 @@ def test_value_spread_count_and_probability_travel() -> None:
 def test_the_line_runs_along_the_cells_the_way_that_vehicles_head() -> None:
     (east,) = records(publication(OURS, stretches(*(alert(x, sector=0) for x in range(9))), NOW))
     (west,) = records(publication(OURS, stretches(*(alert(x, sector=2) for x in range(9))), NOW))
-    one, other = (np.array(text(record, ".//loc:posList").split(), float).reshape(-1, 2) for record in (east, west))
+    one, other = (
+        np.array(text(record, ".//loc:posList").split(), float).reshape(-1, 2)
+        for record in (east, west)
+    )
     assert len(one) == 9
     assert (np.diff(one[:, 1]) > 0).all()
     assert np.array_equal(one, other[::-1])
@@ -139,7 +142,9 @@ def test_a_reader_that_begins_anew_goes_on_with_the_same_situation() -> None:
 
 def test_ice_that_comes_back_is_a_new_situation() -> None:
     over = publication(OURS, [], NOW + NS, publication(OURS, stretches(*ICE), NOW))
-    later = publication(OURS, stretches(*(alert(x, at=100) for x in range(20))), NOW + 200 * NS, over)
+    later = publication(
+        OURS, stretches(*(alert(x, at=100) for x in range(20))), NOW + 200 * NS, over
+    )
     assert len({record.get("id") for record in records(later)}) == 2
 
 
@@ -161,9 +166,15 @@ def test_who_answers_for_it_must_be_named(country: str, name: str) -> None:
 
 
 def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
-    router: ZenohSettings, session: zenoh.Session, start: Callable[..., AbstractContextManager[Running]], tmp_path: Path
+    router: ZenohSettings,
+    session: zenoh.Session,
+    start: Callable[..., AbstractContextManager[Running]],
+    tmp_path: Path,
 ) -> None:
-    out, words = tmp_path / "situations.xml", ["--country", "se", "--supplier", "test", "--connect", router.connect[0]]
+    out, words = (
+        tmp_path / "situations.xml",
+        ["--country", "se", "--supplier", "test", "--connect", router.connect[0]],
+    )
     words = ["export", "datex", "--out", str(out), *words]
     with start(tmp_path / "archive"):
         command = [sys.executable, "-m", "fleet_service.cli", *words, "--follow"]
@@ -171,9 +182,13 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
             assert following.stdout is not None
             assert following.stdout.readline() == f"0 slippery stretches in {out}\n"
             fleet = Fleet(session).meet()
-            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - 9 * SECOND, [0.2]) for k in range(4)))
+            fleet.settle(
+                *(batch(f"sim-{k:03}", 1, time.time_ns() - 9 * SECOND, [0.2]) for k in range(4))
+            )
             assert following.stdout.readline() == f"1 slippery stretches in {out}\n"
-            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.8]) for k in range(10, 22)))
+            fleet.settle(
+                *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.8]) for k in range(10, 22))
+            )
             assert following.stdout.readline() == f"0 slippery stretches in {out}\n"
             following.terminate()
             assert following.wait(20) == 0
@@ -186,20 +201,36 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
 
 
 def test_who_only_rolled_is_in_no_publication(
-    router: ZenohSettings, session: zenoh.Session, start: Callable[..., AbstractContextManager[Running]], tmp_path: Path
+    router: ZenohSettings,
+    session: zenoh.Session,
+    start: Callable[..., AbstractContextManager[Running]],
+    tmp_path: Path,
 ) -> None:
     out = tmp_path / "situations.xml"
     with start(tmp_path / "archive"):
         fleet = Fleet(session).meet()
         now = time.time_ns() - SECOND
-        fleet.settle(*(batch(f"sim-{k:03}", 1, now, [0.2], told=False, used=0.02) for k in range(9)))
+        fleet.settle(
+            *(batch(f"sim-{k:03}", 1, now, [0.2], told=False, used=0.02) for k in range(9))
+        )
         config = tmp_path / "reader.json"
         config.write_text(json.dumps({"zenoh": {"connect": router.connect}}))
-        words = ["--country", "no", "--supplier", "who", "--status", "real", "--config", str(config)]
+        words = [
+            "--country",
+            "no",
+            "--supplier",
+            "who",
+            "--status",
+            "real",
+            "--config",
+            str(config),
+        ]
         assert main(["export", "datex", "--out", str(out), *words]) == 0
     assert not records(out.read_bytes())
     root = ET.fromstring(out.read_bytes())
-    assert [root.findtext(f".//com:{name}", "", SPACES) for name in ("country", "nationalIdentifier")] == ["no", "who"]
+    assert [
+        root.findtext(f".//com:{name}", "", SPACES) for name in ("country", "nationalIdentifier")
+    ] == ["no", "who"]
     real = publication(Supplier("no", "who", "real"), stretches(alert(0)), NOW, out.read_bytes())
     assert b"<com:informationStatus>real</com:informationStatus>" in real
 
@@ -210,13 +241,20 @@ def test_who_only_rolled_is_in_no_publication(
         (["datex", "--out", "a.xml"], "country"),
         (["datex", "--out", "a.xml", "--country", "se"], "supplier"),
         (["datex", "--out", "a.json", "--country", "se", "--supplier", "x"], "out"),
-        (["datex", "--out", "a.xml", "--country", "se", "--supplier", "x", "--archive", "a"], "archive"),
+        (
+            ["datex", "--out", "a.xml", "--country", "se", "--supplier", "x", "--archive", "a"],
+            "archive",
+        ),
         (["map", "--out", "a.csv"], "archive"),
         (["map", "--out", "a.csv", "--archive", "a", "--country", "se"], "country"),
     ],
 )
 def test_options_of_the_other_kind_are_refused(
-    words: list[str], field: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str],
+    field: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["export", *words]) == 2

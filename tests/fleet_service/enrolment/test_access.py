@@ -21,7 +21,17 @@ from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, ground
 from tests.fleet_service.examples import key
-from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, enrolment, network, registry, settings
+from tests.secured import (
+    READER,
+    ROUTERS,
+    SERVICE,
+    VEHICLES,
+    Network,
+    enrolment,
+    network,
+    registry,
+    settings,
+)
 from tests.waiting import matched, until
 
 # What does not depend on the routers: clients and service look for themselves.
@@ -54,31 +64,55 @@ def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
 
 @pytest.mark.parametrize("protocol", ["quic", "tls"])
 def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
-    with network(tmp_path, guarded=False, protocol=protocol) as open_to_all, ground(open_to_all) as found:
+    with (
+        network(tmp_path, guarded=False, protocol=protocol) as open_to_all,
+        ground(open_to_all) as found,
+    ):
         assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
 
 
 def test_a_vehicle_may_exactly_what_the_design_says() -> None:
     listed = access_control(enrolment())
     rules = {rule["id"]: rule for rule in listed["rules"]}
-    granted = [rules[name] for policy in listed["policies"] if HONEST in policy["subjects"] for name in policy["rules"]]
+    granted = [
+        rules[name]
+        for policy in listed["policies"]
+        if HONEST in policy["subjects"]
+        for name in policy["rules"]
+    ]
 
     def allowed(flow: str) -> set[tuple[str, str]]:
         ours = [rule for rule in granted if flow in rule["flows"]]
-        return {(message, place) for rule in ours for message in rule["messages"] for place in rule["key_exprs"]}
+        return {
+            (message, place)
+            for rule in ours
+            for message in rule["messages"]
+            for place in rule["key_exprs"]
+        }
 
     public = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
     assert allowed("ingress") == {
         *(("put", f"{keys.ROOT}/{kind}/*/*/*/{HONEST}") for kind in ("obs", "state")),
-        *((message, place) for message in ("put", "declare_subscriber") for place in keys.private_keys(HONEST)),
+        *(
+            (message, place)
+            for message in ("put", "declare_subscriber")
+            for place in keys.private_keys(HONEST)
+        ),
         ("liveliness_token", keys.alive_key(HONEST)),
         ("declare_subscriber", keys.ack_key(HONEST)),
         *((message, place) for message in ("declare_subscriber", "query") for place in public),
-        *((message, f"{keys.SERVES}/**") for message in ("liveliness_query", "declare_liveliness_subscriber")),
+        *(
+            (message, f"{keys.SERVES}/**")
+            for message in ("liveliness_query", "declare_liveliness_subscriber")
+        ),
     }
     assert allowed("egress") == {
         ("put", keys.ack_key(HONEST)),
-        *((message, place) for message in ("put", "declare_subscriber") for place in keys.private_keys(HONEST)),
+        *(
+            (message, place)
+            for message in ("put", "declare_subscriber")
+            for place in keys.private_keys(HONEST)
+        ),
         *((m, place) for m in ("put", "reply") for place in public),
         *(("declare_subscriber", f"{keys.ROOT}/{kind}/**") for kind in ("obs", "state")),
         ("declare_queryable", f"{keys.ROOT}/map/**"),
@@ -90,7 +124,9 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
 def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
     """Return True if a vehicle's message on its own key reaches a service."""
     received: list[bytes] = []
-    with listener.declare_subscriber(f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())):
+    with listener.declare_subscriber(
+        f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())
+    ):
         publisher = listener.declare_publisher(key(name))  # only a service is told who hears
 
         def arrived() -> bool:
@@ -134,7 +170,9 @@ def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(runnin
 
     with anywhere(SERVICE) as service, anywhere(HONEST) as honest:
         assert heard(honest, HONEST, service)
-        assert registry(running.folder).enrol(enrolment(vehicles=[HONEST, "new-001"])).made == ["new-001"]
+        assert registry(running.folder).enrol(enrolment(vehicles=[HONEST, "new-001"])).made == [
+            "new-001"
+        ]
         for router in ROUTERS:
             running.stop(router)
             assert heard(honest, HONEST, service), "the other router is there"
@@ -152,18 +190,24 @@ def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: N
             much_later.enrol(enrolment(), step)
         for router in ROUTERS:
             running.stop(router)
-        for router in ROUTERS:  # they trust only the new authority, so that the old certificates are worth nothing
+        for router in (
+            ROUTERS
+        ):  # they trust only the new authority, so that the old certificates are worth nothing
             running.start(router)
         assert heard(honest, HONEST, service)
 
 
-def test_old_and_new_authority_get_on_while_one_replaces_the_other(running: Network, tmp_path: Path) -> None:
+def test_old_and_new_authority_get_on_while_one_replaces_the_other(
+    running: Network, tmp_path: Path
+) -> None:
     registry(running.folder).enrol(enrolment(), "next")
     for router in ROUTERS[::-1]:
         running.stop(router)
         running.start(router)
     before = tmp_path / "as it was"
-    shutil.copytree(running.folder, before, ignore=shutil.ignore_patterns("authority", "archive", before.name))
+    shutil.copytree(
+        running.folder, before, ignore=shutil.ignore_patterns("authority", "archive", before.name)
+    )
     registry(running.folder).enrol(enrolment(), "switch")
     running.stop(ROUTERS[1])
     running.start(ROUTERS[1])
@@ -174,7 +218,10 @@ def test_old_and_new_authority_get_on_while_one_replaces_the_other(running: Netw
 
 
 def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^zenoh.config.transport/link/tls/root_ca_certificate: there is no file .*"):
+    with pytest.raises(
+        InputError,
+        match=r"^zenoh.config.transport/link/tls/root_ca_certificate: there is no file .*",
+    ):
         configuration(settings("tls/127.0.0.1:1", tmp_path), HONEST)
 
 
@@ -192,7 +239,9 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
 
 
 @pytest.mark.parametrize("own", [keys.ahead_key, keys.vss_key])
-def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(tmp_path: Path, own: Callable[[str], str]) -> None:
+def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
+    tmp_path: Path, own: Callable[[str], str]
+) -> None:
     other = next(name for name in VEHICLES if name != HONEST)
     fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
     listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")

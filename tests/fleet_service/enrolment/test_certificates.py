@@ -48,7 +48,9 @@ def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) 
         assert found.subject.rfc4514_string() == f"CN={name}"
         assert found.not_valid_after_utc == NOW + timedelta(days=365)
         uses = found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
-        assert (x509.oid.ExtendedKeyUsageOID.SERVER_AUTH in uses) == (name in ROUTERS), "only a router is a server"
+        assert (x509.oid.ExtendedKeyUsageOID.SERVER_AUTH in uses) == (name in ROUTERS), (
+            "only a router is a server"
+        )
         assert ca.read(folder / name) is not None, "key and certificate belong together"
 
 
@@ -75,7 +77,11 @@ def test_what_comes_to_its_end_is_issued_anew(folder: Path) -> None:
 def test_a_router_with_another_address_gets_another_certificate(folder: Path) -> None:
     moved = enrolment(routers={"router-a": {"hosts": ["10.0.0.7"]}, "router-b": {}})
     assert at(folder).enrol(moved).made == ["router-a"]
-    names = certificate(folder, "router-a").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    names = (
+        certificate(folder, "router-a")
+        .extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        .value
+    )
     assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
 
 
@@ -91,7 +97,9 @@ def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> No
     assert at(folder).enrol(fewer).revoked == [gone]
     assert not (folder / f"{gone}.key").exists()
     assert gone not in (folder / "router-a.json5").read_text()
-    with pytest.raises(InputError, match=f"^fleet: '{gone}' was revoked .* until 2027-03-01; give another name$"):
+    with pytest.raises(
+        InputError, match=f"^fleet: '{gone}' was revoked .* until 2027-03-01; give another name$"
+    ):
         at(folder, 1.0).enrol(enrolment())
     assert gone in at(folder, 366.0).enrol(enrolment()).made
 
@@ -136,7 +144,9 @@ def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
     assert enrolment(routers={"r-1": {"hosts": [host]}}).routers["r-1"].hosts == [host]
 
 
-@pytest.mark.parametrize("host", ["", "-a", "a-", "a..b", ".a", "a_b", "a" * 64, "a b", "a\n", ".".join(["ab"] * 100)])
+@pytest.mark.parametrize(
+    "host", ["", "-a", "a-", "a..b", ".a", "a_b", "a" * 64, "a b", "a\n", ".".join(["ab"] * 100)]
+)
 def test_what_is_no_host_is_refused(host: str) -> None:
     with pytest.raises(ValueError, match="is no host name and no address"):
         enrolment(routers={"r-1": {"hosts": [host]}})
@@ -152,12 +162,24 @@ def test_what_is_no_host_is_refused(host: str) -> None:
             [],
             "error: content: value error, 'shard-0' is there",
         ),
-        ({"routers": {"r-1": {"hosts": ["a b"]}}}, [], "error: routers.r-1.hosts.0: value error, 'a b' is no host"),
-        ({"routers": {"r-1": {"hosts": [LONG]}}}, [], "error: routers.r-1.hosts.0: value error, 'aaaa"),
+        (
+            {"routers": {"r-1": {"hosts": ["a b"]}}},
+            [],
+            "error: routers.r-1.hosts.0: value error, 'a b' is no host",
+        ),
+        (
+            {"routers": {"r-1": {"hosts": [LONG]}}},
+            [],
+            "error: routers.r-1.hosts.0: value error, 'aaaa",
+        ),
         ({"routers": {"r-1": {}}, "cars": []}, [], "error: cars: "),
         ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is no time; "),
         ({"routers": {"r-1": {}}}, ["--days", "nan"], "error: days: nan is no time; "),
-        ({"routers": {"r-1": {}}}, ["--days", "20"], "error: renew-days: is not less than the 20 days"),
+        (
+            {"routers": {"r-1": {}}},
+            ["--days", "20"],
+            "error: renew-days: is not less than the 20 days",
+        ),
         ({"routers": {"r-1": {}}}, ["--ca", "switch"], "error: ca: there is no next authority; "),
     ],
 )

@@ -25,8 +25,14 @@ def vote_for(p: np.ndarray, vote: np.ndarray, strength: float) -> None:
     p /= p.sum()
 
 
-_rising = st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).map(np.sort).filter(lambda p: p.sum() > 0.1)
-_steps = st.lists(st.integers(0, 255), min_size=32, max_size=32).map(lambda e: np.array(e, np.uint8))
+_rising = (
+    st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32)
+    .map(np.sort)
+    .filter(lambda p: p.sum() > 0.1)
+)
+_steps = st.lists(st.integers(0, 255), min_size=32, max_size=32).map(
+    lambda e: np.array(e, np.uint8)
+)
 
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=64, max_size=64), st.floats(0.0, 1.0))
@@ -92,7 +98,9 @@ def test_the_bias_kernel_is_a_probability_for_every_road() -> None:
     np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
     middle = kernel[20] @ mugrid.CENTRES
     spread = np.sqrt(kernel[20] @ (mugrid.CENTRES - middle) ** 2)
-    assert spread == pytest.approx(np.hypot(c.BIAS_RELATIVE * mugrid.CENTRES[20], c.BIAS_ABSOLUTE), rel=0.02)
+    assert spread == pytest.approx(
+        np.hypot(c.BIAS_RELATIVE * mugrid.CENTRES[20], c.BIAS_ABSOLUTE), rel=0.02
+    )
 
 
 def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:

@@ -28,9 +28,13 @@ def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: 
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.1, 0.9), st.integers(1, 400))
-def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(used: float, vehicles: int) -> None:
+def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(
+    used: float, vehicles: int
+) -> None:
     fusion = Fusion(120.0)
-    o = observations(np.arange(vehicles) * 2.0, np.arange(vehicles), at_least(np.full(vehicles, used)))
+    o = observations(
+        np.arange(vehicles) * 2.0, np.arange(vehicles), at_least(np.full(vehicles, used))
+    )
     fusion.update(replace(o, evidence=levelled(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
     assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
@@ -39,7 +43,9 @@ def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(u
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.1, 0.9), st.integers(1, 200))
-def test_what_was_used_counts_where_an_estimator_was_contradicted_and_says_nothing(used: float, vehicles: int) -> None:
+def test_what_was_used_counts_where_an_estimator_was_contradicted_and_says_nothing(
+    used: float, vehicles: int
+) -> None:
     flat = np.zeros((vehicles, mugrid.BINS))
     o = observations(np.arange(vehicles) * 2.0, np.arange(vehicles), flat)
     fusion = Fusion(120.0)

@@ -67,7 +67,8 @@ def test_the_next_cell_lies_in_the_sectors_direction(x: int, y: int, sector: int
 
 def test_an_untested_cell_between_snow_is_probably_slippery() -> None:
     alone, one, both = (
-        slippery(belief(road({0: UNTESTED} | {k: snow() for k in sides}))) for sides in ((), (1,), (-1, 1))
+        slippery(belief(road({0: UNTESTED} | {k: snow() for k in sides})))
+        for sides in ((), (1,), (-1, 1))
     )
     assert alone < 0.2
     assert alone + 0.3 < one < both
@@ -75,7 +76,9 @@ def test_an_untested_cell_between_snow_is_probably_slippery() -> None:
 
 
 def test_the_further_it_is_the_less_a_neighbour_tells() -> None:
-    told = [slippery(belief(road({0: UNTESTED, steps: snow()}))) for steps in range(1, NEIGHBOURS + 2)]
+    told = [
+        slippery(belief(road({0: UNTESTED, steps: snow()}))) for steps in range(1, NEIGHBOURS + 2)
+    ]
     assert np.all(np.diff(told) < 0.0)
     assert told[-1] == slippery(belief(road({0: UNTESTED})))
 
@@ -109,7 +112,11 @@ def test_grip_ends_a_stretch() -> None:
 
 
 def test_a_message_is_of_a_neighbours_own_reports() -> None:
-    far = road({0: UNTESTED} | dict.fromkeys(range(1, NEIGHBOURS + 1), UNTESTED) | {NEIGHBOURS + 1: snow(9)})
+    far = road(
+        {0: UNTESTED}
+        | dict.fromkeys(range(1, NEIGHBOURS + 1), UNTESTED)
+        | {NEIGHBOURS + 1: snow(9)}
+    )
     near = [slippery(belief(far, east(k))) for k in range(NEIGHBOURS, -1, -1)]
     assert near[0] > 0.4
     assert near[-1] == slippery(belief(road({0: UNTESTED})))

@@ -20,21 +20,31 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
     """Visits of 12 vehicles, one of them a liar, to 6 cells; in order of time."""
     rng = np.random.default_rng(seed)
     vehicle = rng.integers(0, 12, n)
-    mu = np.where(vehicle == 0, 0.25, rng.choice([0.8, 0.3], n, p=[0.9, 0.1]) + 0.04 * rng.normal(size=n))
+    mu = np.where(
+        vehicle == 0, 0.25, rng.choice([0.8, 0.3], n, p=[0.9, 0.1]) + 0.04 * rng.normal(size=n)
+    )
     likelihood = np.where(rng.random(n)[:, None] < 0.4, value(mu), at_least(0.3 * mu))
     o = observations(np.sort(rng.random(n)) * duration_s, vehicle, likelihood)
     near = rng.random(n) < 0.2
     return Observations(
-        **{**vars(o), "cell": CELL + rng.integers(0, 6, n), "second": np.where(near, 1, -1).astype(np.int8)}
+        **{
+            **vars(o),
+            "cell": CELL + rng.integers(0, 6, n),
+            "second": np.where(near, 1, -1).astype(np.int8),
+        }
     )
 
 
 def delayed(o: Observations, most_s: float, seed: int) -> IntArray:
     """An order of arrival in which each visit comes up to `most_s` late."""
-    return np.argsort(o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64))
+    return np.argsort(
+        o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
+    )
 
 
-def fold_in(o: Observations, order: IntArray, parts: int) -> tuple[Fusion, list[tuple[IntArray, Updated]]]:
+def fold_in(
+    o: Observations, order: IntArray, parts: int
+) -> tuple[Fusion, list[tuple[IntArray, Updated]]]:
     fusion = Fusion(LATENESS_S)
     told = [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
     return fusion, told
@@ -59,7 +69,9 @@ def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: in
     assert difference(straight, mixed) <= 1e-6
     order = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
     np.testing.assert_array_equal(straight.live.visits[: straight.size], mixed.live.visits[order])
-    np.testing.assert_array_equal(straight.live.vehicles[: straight.size], mixed.live.vehicles[order])
+    np.testing.assert_array_equal(
+        straight.live.vehicles[: straight.size], mixed.live.vehicles[order]
+    )
 
 
 def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
@@ -76,7 +88,9 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     again = Fusion(LATENESS_S)
     again.update(o, Before(late, late_by, weight))
     assert difference(fusion, again) <= 1e-6
-    assert [again.trust(v) for v in range(12)] == pytest.approx([fusion.trust(v) for v in range(12)], abs=1e-6)
+    assert [again.trust(v) for v in range(12)] == pytest.approx(
+        [fusion.trust(v) for v in range(12)], abs=1e-6
+    )
 
 
 def test_an_observation_long_before_the_checkpoint_is_late_and_changes_nothing() -> None:
@@ -94,7 +108,9 @@ def test_an_observation_long_before_the_checkpoint_is_late_and_changes_nothing()
 def test_a_window_frees_its_places_when_the_checkpoint_passes() -> None:
     fusion = Fusion(LATENESS_S)
     for k in range(200):
-        fusion.update(observations(k * 60.0 + np.arange(50.0), np.arange(50), value(np.full(50, 0.7))))
+        fusion.update(
+            observations(k * 60.0 + np.arange(50.0), np.arange(50), value(np.full(50, 0.7)))
+        )
     assert fusion.waiting <= 4 * 50
 
 
@@ -102,7 +118,9 @@ def test_stores_grow_without_disturbing_what_they_hold() -> None:
     n = 20_000
     rng = np.random.default_rng(5)
     cells = rng.permutation(n)
-    o = observations(np.linspace(0.0, 900.0, n), rng.integers(0, 300, n), value(np.full(n, 0.6)), cell=cells)
+    o = observations(
+        np.linspace(0.0, 900.0, n), rng.integers(0, 300, n), value(np.full(n, 0.6)), cell=cells
+    )
     grown, _ = fold_in(o, np.arange(n), 37)
     whole = Fusion(LATENESS_S)
     whole.update(o)
@@ -110,4 +128,6 @@ def test_stores_grow_without_disturbing_what_they_hold() -> None:
     assert difference(grown, whole) <= 1e-6
     np.testing.assert_array_equal(np.sort(grown.cell[:n]), np.arange(n))
     assert (grown.slots_of(np.array([n + 5]), np.array([0])) == -1).all()
-    assert mugrid.quantiles(grown.believed(np.arange(n)), 0.5) == pytest.approx(np.full(n, 0.6), abs=0.1)
+    assert mugrid.quantiles(grown.believed(np.arange(n)), 0.5) == pytest.approx(
+        np.full(n, 0.6), abs=0.1
+    )

@@ -21,11 +21,15 @@ def told(mu: float, std: float = 0.05) -> np.ndarray:
 
 
 def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
-    steps, reported = as_reported(np.vstack([told(0.85), np.minimum(told(0.3), 200) + 7, 0 * told(0.3)]))
+    steps, reported = as_reported(
+        np.vstack([told(0.85), np.minimum(told(0.3), 200) + 7, 0 * told(0.3)])
+    )
     np.testing.assert_array_equal(steps[0], told(0.85)[0])
     assert steps[1].min() == 0
     assert reported[:2, 0] == pytest.approx([0.85, 0.3], abs=0.01)
-    assert reported[0, 1] == pytest.approx(np.hypot(0.05, np.hypot(c.BIAS_RELATIVE * 0.85, c.BIAS_ABSOLUTE)), rel=0.02)
+    assert reported[0, 1] == pytest.approx(
+        np.hypot(0.05, np.hypot(c.BIAS_RELATIVE * 0.85, c.BIAS_ABSOLUTE)), rel=0.02
+    )
     assert reported[:2, 2] == pytest.approx([0.0, 0.97], abs=0.03)
     assert np.isnan(reported[2]).all()
 
@@ -39,6 +43,8 @@ def test_who_lies_is_compared_with_what_others_reported_and_not_with_what_is_use
     used = np.where(who == 0, 0.25, 0.5).astype(np.float32)
     evidence_, reported = evidence({"log_likelihood": steps, "mu_utilised": used}, np.ones(n, bool))
     o = observations(np.arange(n) * 1.0, who, value(reading))
-    o = dataclasses.replace(o, cell=CELL + np.arange(n) // 30, evidence=evidence_, reported=reported, used=used)
+    o = dataclasses.replace(
+        o, cell=CELL + np.arange(n) // 30, evidence=evidence_, reported=reported, used=used
+    )
     fusion.update(o)
     assert fusion.trust(0) < 0.2 < 0.8 < fusion.trust(1)

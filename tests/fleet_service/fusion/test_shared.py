@@ -14,12 +14,18 @@ from fleet_service.fusion import constants as c
 from schemas import mugrid
 from tests.fleet_service.examples import belief, interval, observations, value
 
-_rising = st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).map(np.sort).filter(lambda p: p.sum() > 0.1)
+_rising = (
+    st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32)
+    .map(np.sort)
+    .filter(lambda p: p.sum() > 0.1)
+)
 
 
 @pytest.mark.parametrize("used", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("stated", [0.0, 0.2])
-def test_a_kernel_is_a_probability_for_every_road_and_leaves_the_prior_where_it_is(used: float, stated: float) -> None:
+def test_a_kernel_is_a_probability_for_every_road_and_leaves_the_prior_where_it_is(
+    used: float, stated: float
+) -> None:
     kernel = shared.shared_kernel(used, 1.0, stated)
     np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
     np.testing.assert_allclose(kernel @ mugrid.PRIOR, mugrid.PRIOR, atol=1e-15)
@@ -36,7 +42,9 @@ def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
     """Of the interval, after thirty vehicles that agree."""
     fusion, n = Fusion(120.0), len(manoeuvres)
     o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))
-    o = dataclasses.replace(o, used=np.full(n, used, np.float32), manoeuvre=manoeuvres.astype(np.int8))
+    o = dataclasses.replace(
+        o, used=np.full(n, used, np.float32), manoeuvre=manoeuvres.astype(np.int8)
+    )
     fusion.update(o)
     lower, upper = interval(belief(fusion))
     return upper - lower

@@ -18,7 +18,9 @@ WIDTH_M = 10.2  # of a cell at LATITUDE
 
 
 def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, FloatArray]:
-    found = space.other_cells(np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std]))
+    found = space.other_cells(
+        np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std])
+    )
     return found[0][0], found[1][0].astype(float)
 
 
@@ -34,7 +36,9 @@ def told(fusion: Fusion) -> FloatArray:
 
 
 @given(st.floats(0.01, 100.0), st.floats(1.0, 40.0))
-def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(std: float, length: float) -> None:
+def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(
+    std: float, length: float
+) -> None:
     share = space.shares(np.array([std]), np.array([length]))[0]
     assert (share >= -1e-9).all()
     assert share.sum() <= 1.0 + 1e-9
@@ -44,9 +48,13 @@ def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(std: 
 def test_shares_are_those_of_visits_drawn_anywhere_in_a_cell_with_a_normal_error() -> None:
     rng = np.random.default_rng(1)
     for std in (3.0, 8.0):
-        at = np.floor((rng.uniform(0.0, WIDTH_M, 200_000) + std * rng.normal(size=200_000)) / WIDTH_M)
+        at = np.floor(
+            (rng.uniform(0.0, WIDTH_M, 200_000) + std * rng.normal(size=200_000)) / WIDTH_M
+        )
         drawn = [np.mean(at == k) for k in (-2, -1, 1, 2)]
-        assert space.shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(drawn, abs=0.005)
+        assert space.shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(
+            drawn, abs=0.005
+        )
 
 
 def test_a_good_fix_stays_in_its_cell_and_a_poor_one_reaches_along_the_heading() -> None:
@@ -73,7 +81,9 @@ def test_a_visit_is_not_spread_into_another_region() -> None:
 
 
 @given(st.floats(0.1, 60.0), st.floats(0.1, 1.1), st.floats(0.03, 0.3), st.floats(-3.1, 3.1))
-def test_all_cells_together_learn_no_more_than_one_would(std: float, mu: float, width: float, yaw: float) -> None:
+def test_all_cells_together_learn_no_more_than_one_would(
+    std: float, mu: float, width: float, yaw: float
+) -> None:
     sure, unsure = Fusion(120.0), Fusion(120.0)
     o = observations([0.0], [1], value([mu], width))
     cells, share = space.other_cells(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
@@ -87,7 +97,9 @@ def test_a_cell_where_the_vehicle_was_perhaps_learns_a_little_and_is_not_visited
     fusion = Fusion(120.0)
     cells, share = spread(5.0)
     o = observations([0.0], [1], value([0.2]))
-    fusion.update(dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32)))
+    fusion.update(
+        dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32))
+    )
     slots = fusion.slots_of(np.array([CELL, cells[2]]), np.zeros(2, np.int64))
     own, beside = told(fusion)[slots]
     assert information(own) > 3 * information(beside) > 0.0

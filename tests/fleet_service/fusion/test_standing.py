@@ -31,8 +31,12 @@ def acquainted(slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool 
         mu = 0.5 + 0.04 * cell
         reading = mu * (1.0 + gain[who] - slope * (1.0 - share)) + 0.04 * rng.normal(size=n)
         used = share * mu * (1.0 + gain[who] * gain_in_use)
-        o = observations(60.0 * minute + np.sort(rng.uniform(0, 60, n)), who, value(reading, 0.04), cell=cell)
-        fusion.update(dataclasses.replace(o, used=used.astype(np.float32), manoeuvre=np.zeros(n, np.int8)))
+        o = observations(
+            60.0 * minute + np.sort(rng.uniform(0, 60, n)), who, value(reading, 0.04), cell=cell
+        )
+        fusion.update(
+            dataclasses.replace(o, used=used.astype(np.float32), manoeuvre=np.zeros(n, np.int8))
+        )
     return fusion
 
 
@@ -73,7 +77,12 @@ def test_shape_widens_a_gentle_value_upwards_and_lifts_no_lower_end() -> None:
 
 def test_shape_is_the_slope_and_a_doubt() -> None:
     shapes = [shared.Shape(slope, 0.0) for slope in (0.0, 0.11, 0.42, 1.0)]
-    assert [shared.SHAPES[shared.shape_class(shape.reader)] for shape in shapes] == [0.1, 0.2, 0.5, 0.7]
+    assert [shared.SHAPES[shared.shape_class(shape.reader)] for shape in shapes] == [
+        0.1,
+        0.2,
+        0.5,
+        0.7,
+    ]
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
@@ -99,7 +108,8 @@ def test_vehicle_with_a_record_sharpens_a_cell_and_a_newcomer_does_not() -> None
 
 
 @pytest.mark.parametrize(
-    ("used", "tail", "witnesses"), [(0.05, -12.0, 1), (0.19, -12.0, 1), (0.19, -4.0, 1), (0.19, -1.0, 0)]
+    ("used", "tail", "witnesses"),
+    [(0.05, -12.0, 1), (0.19, -12.0, 1), (0.19, -4.0, 1), (0.19, -1.0, 0)],
 )
 def test_ice_far_below_any_grip_is_evidence_and_a_likely_tail_to_dry_road_is_none(
     used: float, tail: float, witnesses: int

@@ -32,7 +32,9 @@ def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() 
     for step in range(3):
         fusion.update(
             observations(
-                [10.0 * step + 0.001 * k for k in range(vehicles)], np.arange(vehicles), at_least([0.3] * vehicles)
+                [10.0 * step + 0.001 * k for k in range(vehicles)],
+                np.arange(vehicles),
+                at_least([0.3] * vehicles),
             )
         )
     state = fusion.store.state
@@ -50,14 +52,18 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_new_ones_take_their_
     fusion.update(observations([4 * HOUR], [1], value([0.8]), CELL))
     assert fusion.store.state.used[REPORTERS_USED] == 1  # the window's
     before = belief(fusion, CELL + 7)
-    fusion.update(observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7))
+    fusion.update(
+        observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7)
+    )
     assert fusion.store.state.used[REPORTERS_USED] == 2
     assert (fusion.sources(slots[7:8], GRIP, START - 1) > 0).sum() == 2
     assert (fusion.sources(slots[8:9], GRIP, START - 1) > 0).sum() == 0
     assert not np.allclose(belief(fusion, CELL + 7), before)
 
 
-def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_on_as_they_were() -> None:
+def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_on_as_they_were() -> (
+    None
+):
     """A fusion that dropped them takes what comes next as one that has them all."""
     fusion, whole = Fusion(LATENESS_S), Fusion(LATENESS_S)
     cells, week = CELL + np.arange(40), 7 * 24 * HOUR
@@ -78,11 +84,15 @@ def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_
     np.testing.assert_array_equal(place, [*range(10), *[NONE] * 30])
     assert fusion.size == 10
     assert (fusion.slots_of(cells[10:], np.zeros(30, np.int64)) == NONE).all()
-    after = observations(week + 6 * HOUR + np.arange(20.0), np.arange(20), value([0.3] * 20), cells[:20])
+    after = observations(
+        week + 6 * HOUR + np.arange(20.0), np.arange(20), value([0.3] * 20), cells[:20]
+    )
     for other in (fusion, whole):
         other.update(after)
     for cell in cells[:10].tolist():
         np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-12)
     for cell in cells[10:20].tolist():
-        np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-3)  # 16 bits a bin at rest
+        np.testing.assert_allclose(
+            belief(fusion, cell), belief(whole, cell), atol=1e-3
+        )  # 16 bits a bin at rest
     assert fusion.live.vehicles[: fusion.size].max() < 40

@@ -19,14 +19,20 @@ def driven(private: int = 0) -> Fusion:
     rng, fusion = np.random.default_rng(4), Fusion(120.0)
     for minute in range(30):
         who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
-        cells = np.concatenate([rng.integers(0, 4, 12 + len(LIARS)), 100 + rng.integers(0, 4, private * len(LIARS))])
+        cells = np.concatenate(
+            [rng.integers(0, 4, 12 + len(LIARS)), 100 + rng.integers(0, 4, private * len(LIARS))]
+        )
         mu = np.where(who < 100, 0.8 + 0.05 * rng.normal(size=len(who)), 0.25)
-        fusion.update(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))
+        fusion.update(
+            observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells)
+        )
     return fusion
 
 
 @pytest.mark.parametrize("private", [0, 5])
-def test_a_group_that_agrees_only_with_itself_loses_its_vote_wherever_it_meets(private: int) -> None:
+def test_a_group_that_agrees_only_with_itself_loses_its_vote_wherever_it_meets(
+    private: int,
+) -> None:
     fusion = driven(private)
     assert max(fusion.trust(int(v)) for v in LIARS) < 0.1
     assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
@@ -41,7 +47,9 @@ def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
     fusion = driven()
     n = 200
-    updated = fusion.update(observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1))
+    updated = fusion.update(
+        observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1)
+    )
     assert slippery(belief(fusion, cell=1)) < 0.1
     assert not Alerts(fusion).update(updated.slots)
 

@@ -41,7 +41,9 @@ def test_five_vehicles_narrow_a_cell_more_than_fifty_visits_of_one() -> None:
     for visit in range(50):
         one.update(observations([30.0 * visit], [1], value(0.8 + 0.03 * rng.normal(size=1))))
     for vehicle in range(5):
-        five.update(observations([300.0 * vehicle], [vehicle], value(0.8 + 0.05 * rng.normal(size=1))))
+        five.update(
+            observations([300.0 * vehicle], [vehicle], value(0.8 + 0.05 * rng.normal(size=1)))
+        )
     assert width(five) < 0.8 * width(one)
     assert one.live.vehicles[0] == 1
     assert five.live.vehicles[0] == 5
@@ -100,7 +102,10 @@ def test_a_vehicle_that_always_disagrees_loses_its_vote() -> None:
 def test_what_nobody_confirms_fades_to_the_prior() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.3))))
-    widths = [np.subtract(*interval(belief(fusion, now=START + int(h * 3600e9)))[::-1]) for h in (0.1, 1, 4, 24)]
+    widths = [
+        np.subtract(*interval(belief(fusion, now=START + int(h * 3600e9)))[::-1])
+        for h in (0.1, 1, 4, 24)
+    ]
     assert widths == sorted(widths)
     assert widths[-1] == pytest.approx(PRIOR_UPPER - PRIOR_LOWER, abs=0.01)
 
@@ -129,7 +134,9 @@ def test_a_sender_that_says_nothing_changes_nothing() -> None:
 
 
 @given(st.lists(st.integers(0, 255), min_size=32, max_size=32), st.floats(0.0, 1.3))
-def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(steps: list[int], used: float) -> None:
+def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(
+    steps: list[int], used: float
+) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
     found = levelled(sent, np.array([used], np.float32))
     if sent[0, -1] >= c.VALUE_DROP_STEPS:
@@ -142,7 +149,10 @@ def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(st
 def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() -> None:
     n = 60
     sloping = mugrid.encode_log_likelihood(np.tile(np.linspace(-2.0, 0.0, 32), (n, 1)))
-    columns: dict[str, NDArray[Any]] = {"log_likelihood": sloping, "mu_utilised": np.full(n, 0.2, np.float32)}
+    columns: dict[str, NDArray[Any]] = {
+        "log_likelihood": sloping,
+        "mu_utilised": np.full(n, 0.2, np.float32),
+    }
     fusion = Fusion(120.0)
     o = observations(np.arange(n) * 2.0, np.arange(n), value(np.full(n, 0.5)))
     fusion.update(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).steps))
@@ -160,7 +170,10 @@ def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused()
     fusion.update(observations([70.0], [8], value([0.5])))
     assert fusion.waiting == c.WAITING_MOST + 1
     again = Fusion(120.0)
-    told = (np.concatenate(of) for of in zip(*((f.late, f.late_by, f.weight) for f in updated), strict=True))
+    told = (
+        np.concatenate(of)
+        for of in zip(*((f.late, f.late_by, f.weight) for f in updated), strict=True)
+    )
     again.update(o, Before(*told))
     again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

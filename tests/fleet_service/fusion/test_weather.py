@@ -10,7 +10,16 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import weather as w
 from schemas import grid, mugrid
-from tests.fleet_service.examples import CELL, REGION, START, belief, interval, observations, slippery, value
+from tests.fleet_service.examples import (
+    CELL,
+    REGION,
+    START,
+    belief,
+    interval,
+    observations,
+    slippery,
+    value,
+)
 
 HOUR = 3600 * 10**9
 KEY = CELL * grid.SECTORS
@@ -21,7 +30,14 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
     """Hours after START, and air, road and precipitation."""
     air, road, water = np.array([row[1] for row in rows]).T
     time = np.array([START + int(row[0] * HOUR) for row in rows])
-    return w.Reports(np.full(len(rows), region), time, air, road, water, np.full((len(rows), mugrid.BINS), np.nan))
+    return w.Reports(
+        np.full(len(rows), region),
+        time,
+        air,
+        road,
+        water,
+        np.full((len(rows), mugrid.BINS), np.nan),
+    )
 
 
 def passed(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
@@ -31,7 +47,10 @@ def passed(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
 
 
 def test_without_a_word_about_a_region_its_roads_age_by_the_clock() -> None:
-    for weather in (w.weather_of(w.no_reports()), w.weather_of(reports((0.0, RAIN), region=REGION + 1))):
+    for weather in (
+        w.weather_of(w.no_reports()),
+        w.weather_of(reports((0.0, RAIN), region=REGION + 1)),
+    ):
         assert passed(weather, -5.0, 7.0) == pytest.approx((12.0, 12.0))
 
 
@@ -43,14 +62,21 @@ def test_road_time_is_the_sum_over_what_the_weather_was_and_ends_with_a_reports_
     assert passed(weather, 2.0, 5.0) == pytest.approx((3.0, 3.0 * w.STEADY_CHANGE))
     assert passed(weather, 5.0, 9.0) == pytest.approx((4.0, 4.0))
     whole = [passed(weather, -1.0, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
-    parts = [passed(weather, -1.0, 0.3)[1] + passed(weather, 0.3, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
+    parts = [
+        passed(weather, -1.0, 0.3)[1] + passed(weather, 0.3, t)[1] for t in (0.5, 1.5, 2.5, 9.0)
+    ]
     assert whole == pytest.approx(parts)
 
 
 def test_unknown_values_change_nothing() -> None:
     nothing = (np.nan, np.nan, np.nan)
-    assert w.rates(reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))).tolist() == [[1.0, 1.0], [1.0, 1.0]]
-    assert w.rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FROST_CHANGE  # a road is colder than the air
+    assert w.rates(reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))).tolist() == [
+        [1.0, 1.0],
+        [1.0, 1.0],
+    ]
+    assert (
+        w.rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FROST_CHANGE
+    )  # a road is colder than the air
 
 
 def after_an_hour(weather: w.Reports | None) -> np.ndarray:
@@ -64,13 +90,20 @@ def after_an_hour(weather: w.Reports | None) -> np.ndarray:
 def test_a_dry_value_fades_faster_when_water_freezes_and_slower_when_it_is_warm() -> None:
     width = {
         name: np.subtract(*interval(after_an_hour(reports((0.0, rows)) if rows else None))[::-1])
-        for name, rows in (("steady", STEADY), ("unknown", None), ("rain", RAIN), ("freezing", FREEZING))
+        for name, rows in (
+            ("steady", STEADY),
+            ("unknown", None),
+            ("rain", RAIN),
+            ("freezing", FREEZING),
+        )
     }
     assert list(width) == sorted(width, key=lambda name: width[name])
     assert slippery(after_an_hour(reports((0.0, FREEZING)))) > 2 * slippery(after_an_hour(None))
 
 
-def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_half_of_it_uniform() -> None:
+def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_half_of_it_uniform() -> (
+    None
+):
     icy = np.where(mugrid.CENTRES < 0.4, 1.0, 0.0)
     told = dataclasses.replace(reports((0.0, STEADY)), prior=(icy / icy.sum())[None])
     fusion = Fusion(120.0)
@@ -80,10 +113,16 @@ def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_
     assert belief(fusion).min() > 0.4 / mugrid.BINS
 
 
-def test_weather_that_acts_on_what_was_not_folded_yet_gives_the_map_of_weather_known_before() -> None:
+def test_weather_that_acts_on_what_was_not_folded_yet_gives_the_map_of_weather_known_before() -> (
+    None
+):
     rng = np.random.default_rng(8)
     n = 300
-    o = observations(np.sort(rng.uniform(0.0, 3 * 3600.0, n)), rng.integers(0, 9, n), value(rng.uniform(0.3, 0.9, n)))
+    o = observations(
+        np.sort(rng.uniform(0.0, 3 * 3600.0, n)),
+        rng.integers(0, 9, n),
+        value(rng.uniform(0.3, 0.9, n)),
+    )
     known, told = Fusion(120.0), Fusion(120.0)
     arriving = [reports((0.0, RAIN)), reports((0.0, FREEZING)), reports((0.0, STEADY))]
     used = []

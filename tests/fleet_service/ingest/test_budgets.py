@@ -29,7 +29,10 @@ from tests.fleet_service.examples import SECOND, batch
 
 def message(sent: Batch) -> Message:
     return Message(
-        sent.kind, keys.observation_key(sent.region, sent.vehicle), wire.encode(sent), wire.ENCODING[sent.kind]
+        sent.kind,
+        keys.observation_key(sent.region, sent.vehicle),
+        wire.encode(sent),
+        wire.ENCODING[sent.kind],
     )
 
 
@@ -41,7 +44,9 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 def months(now: int) -> tuple[int, int]:
     """The last second of a month and the first of the next, as near as they were [ns]."""
-    first = datetime.fromtimestamp(now / SECOND, UTC).replace(day=1, hour=0, minute=0, second=0, microsecond=0)
+    first = datetime.fromtimestamp(now / SECOND, UTC).replace(
+        day=1, hour=0, minute=0, second=0, microsecond=0
+    )
     at = int(first.timestamp()) * SECOND
     return at - SECOND, at + 2 * SECOND
 
@@ -70,8 +75,13 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
             assert engine.counts["duplicates"] == (2 if again else 0), "a restart knows both"
             ((vehicle, ack),) = engine.settlement.flush()
             streams = wire.decode_ack(ack)[1]
-            assert {stream.boot for stream in streams} == {sent[0].boot}, "its sender hears its own name for it"
-            assert sorted(seq for stream in streams for run in stream.durable for seq in run) == [1, 2]
+            assert {stream.boot for stream in streams} == {sent[0].boot}, (
+                "its sender hears its own name for it"
+            )
+            assert sorted(seq for stream in streams for run in stream.durable for seq in run) == [
+                1,
+                2,
+            ]
     table = pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION, ["vehicle", "boot"]))
     assert (vehicle, table.num_rows) == ("car-001", 2)
     assert len(set(table["vehicle"].to_pylist())) == len(set(table["boot"].to_pylist())) == 2
@@ -79,7 +89,9 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
     assert table["boot"].to_numpy().min() >= 0
 
 
-def test_batches_with_unhashed_starts_are_recognised_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_with_unhashed_starts_are_recognised_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = time.time_ns()
     sent = [message(batch("car-001", seq, now, [0.8])) for seq in (1, 2, 3)]
     with monkeypatch.context() as before:
@@ -98,7 +110,9 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
     for seq in range(1, 40):
         old = now - 29 * 86_400 * SECOND
         leave = [old, now - SECOND] if seq % 2 else [now - 2 * SECOND, now - SECOND]
-        one = batch("car-001", seq, now, [0.15, 0.15], leave_time=leave, enter_time=np.array(leave) - SECOND)
+        one = batch(
+            "car-001", seq, now, [0.15, 0.15], leave_time=leave, enter_time=np.array(leave) - SECOND
+        )
         engine.intake.ingest([message(one)], now)
     assert engine.alerts.count == 0
     assert engine.counts["refused.time"] == 20, "a batch spans no month"
@@ -115,7 +129,10 @@ def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> 
     data[30] ^= 1
     path.write_bytes(data)
     assert len(read(tmp_path)) == 2
-    assert VehicleIds(tmp_path).id_of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
+    assert (
+        VehicleIds(tmp_path).id_of("car-000", pseudonyms.month(now), names["car-000"])
+        == known[names["car-000"]]
+    )
     assert path.stat().st_mode & 0o077 == 0
 
 
@@ -139,7 +156,9 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
         assert engine.counts["witnesses_damaged"] == 0
 
 
-def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now, synced, fsync = time.time_ns(), [], os.fsync
 
     def noted(handle: int) -> None:
@@ -195,14 +214,32 @@ def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
 def test_new_cells_are_counted_once_and_by_vehicle() -> None:
     budgets = NewCells(3)
     vehicle, cell = np.array([2, 1, 1, 2, 1, 1, 1]), np.array([5, 1, 2, 5, 1, 3, 4])
-    assert budgets.beyond(vehicle, cell, 0.0).tolist() == [False, False, False, False, False, False, True]
-    assert budgets.beyond(np.array([1, 2, 2, 2]), np.array([9, 6, 7, 8]), 0.0).tolist() == [True, False, False, True]
+    assert budgets.beyond(vehicle, cell, 0.0).tolist() == [
+        False,
+        False,
+        False,
+        False,
+        False,
+        False,
+        True,
+    ]
+    assert budgets.beyond(np.array([1, 2, 2, 2]), np.array([9, 6, 7, 8]), 0.0).tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]
     assert not len(budgets.beyond(vehicle[:0], cell[:0], 0.0))
 
 
 def test_a_budget_fills_again() -> None:
     bucket = Bucket(10, 3600)
-    assert [bucket.take(1, 6, 0.0), bucket.take(1, 6, 0.0), bucket.take(1, 6, 3.0), bucket.take(2, 6, 3.0)] == [
+    assert [
+        bucket.take(1, 6, 0.0),
+        bucket.take(1, 6, 0.0),
+        bucket.take(1, 6, 3.0),
+        bucket.take(2, 6, 3.0),
+    ] == [
         6,
         4,
         3,

@@ -16,7 +16,9 @@ STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 
 
 @given(STEPS)
-def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tuple[int, int]]) -> None:
+def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(
+    steps: list[tuple[int, int]],
+) -> None:
     stream, accepted, floor = SequenceTracker(KEY), set(), 0
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
@@ -36,7 +38,9 @@ def test_a_stream_without_gaps_is_one_number() -> None:
     assert (stream.low, len(stream.seen)) == (5000, 0)
 
 
-def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
     stream = SequenceTracker(KEY)
     assert [stream.accept(2**62 - k) for k in range(4)] == [True, True, True, False]
@@ -46,7 +50,9 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: py
 
 
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(1, 30), st.integers(1, 30)), max_size=60))
-def test_rows_of_an_archive_restore_the_streams_that_wrote_them(rows: list[tuple[int, int, int]]) -> None:
+def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
+    rows: list[tuple[int, int, int]],
+) -> None:
     before, after = SequenceTrackers(), SequenceTrackers()
     for vehicle, seq, held in rows:
         stream = before[vehicle, 5, Kind.STATE, 7]

@@ -37,10 +37,16 @@ def test_what_waits_is_bounded_in_bytes_and_not_in_messages_only() -> None:
     for _ in range(2 * fits):
         queue.put(large)
     assert fits <= len(queue) <= fits + 1
-    assert counts["overload"] == 2 * fits - len(queue), "each that found no room is counted; its sender keeps it"
+    assert counts["overload"] == 2 * fits - len(queue), (
+        "each that found no room is counted; its sender keeps it"
+    )
     waiting = len(queue)
     taken = queue.drain(0.0)
-    assert STEP_BYTES <= sum(len(message.payload) for message in taken) < STEP_BYTES + len(large.payload)
+    assert (
+        STEP_BYTES
+        <= sum(len(message.payload) for message in taken)
+        < STEP_BYTES + len(large.payload)
+    )
     for _ in range(2 * fits):
         queue.put(large)
     assert len(queue) in (waiting, waiting - 1), "what was taken made room"
@@ -62,7 +68,9 @@ def test_start_opens_each_waiting_segment_twice_whatever_their_number(
         for seq in range(1, segments + 1):
             sent = batch("car-001", seq, NOW, [0.8])
             key = keys.observation_key(sent.region, sent.vehicle)
-            engine.intake.ingest([Message(sent.kind, key, wire.encode(sent), wire.ENCODING[sent.kind])], NOW)
+            engine.intake.ingest(
+                [Message(sent.kind, key, wire.encode(sent), wire.ENCODING[sent.kind])], NOW
+            )
             engine.settlement.flush()
     opened: Counter[str] = Counter()
     begin = pq.ParquetFile.__init__
@@ -84,7 +92,9 @@ def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) ->
 
         def known(seq: int, now: int) -> list[tuple[str, int, int, int]]:
             sent = batch("car-1", seq, now, [0.8])
-            engine.intake.ingest([Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now)
+            engine.intake.ingest(
+                [Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now
+            )
             engine.settlement.flush()
             return list(intake._known[Kind.OBSERVATION])
 

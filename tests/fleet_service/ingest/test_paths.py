@@ -15,7 +15,9 @@ METRE = 1.0 / 111_195.0  # of longitude on the equator [deg]
 CAR = 7
 
 
-def find(known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float], vehicle: int = CAR) -> list[bool]:
+def find(
+    known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float], vehicle: int = CAR
+) -> list[bool]:
     """Return which reports on the equator are implausible."""
     time = START + (np.array(list(seconds)) * SECOND).astype(np.int64)
     east = np.array(list(east_m), float) * METRE
@@ -26,7 +28,9 @@ def find(known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float],
 def test_a_vehicle_is_not_in_two_towns_at_once() -> None:
     known = VehiclePaths()
     assert find(known, [0, 10, 20, 30], [0, 400, 8e6, 1200]) == [False, False, True, False]
-    assert find(known, [-3600], [-200_000]) == [False], "a backlog: there was time to come from there"
+    assert find(known, [-3600], [-200_000]) == [False], (
+        "a backlog: there was time to come from there"
+    )
     assert find(known, [31], [5_000 + FASTEST * 31]) == [True]
 
 
@@ -50,7 +54,9 @@ def test_leap_budget_fills_again() -> None:
 
 def test_order_of_time_does_not_hide_a_second_place() -> None:
     known = VehiclePaths()
-    assert find(known, [0, -3600, 0.5], [0, -200_000, -250_000]) == [False, False, True], "back and forth in time"
+    assert find(known, [0, -3600, 0.5], [0, -200_000, -250_000]) == [False, False, True], (
+        "back and forth in time"
+    )
     assert find(known, [-1800, -1799], [-100_000, -40_000]) == [False, True]
 
 

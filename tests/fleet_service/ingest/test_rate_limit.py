@@ -78,7 +78,9 @@ def test_who_is_not_enrolled_is_not_looked_at() -> None:
     assert len(found) == 1
 
 
-def test_invented_names_share_one_bucket_and_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_names_share_one_bucket_and_fill_no_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(rate_limit, "MOST_NAMES", 100)
     clock = Clock()
     found, _ = buckets(clock)
@@ -93,7 +95,9 @@ def test_invented_names_share_one_bucket_and_fill_no_memory(monkeypatch: pytest.
 def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
-        head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
+        head = Head(
+            one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator
+        )
         acks.record_rejected("sim-001", head, 0, "x" * 120)
     stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
     stream.vehicle, stream.boot = "sim-001", sent[0].boot
@@ -110,10 +114,14 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
 ) -> None:
     file = tmp_path / "fleet.json"
     file.write_text(enrolment(vehicles=["car-1"]).model_dump_json())
-    with running(router, tmp_path / "archive", fleet=file, vehicle_kb_s=1.0, vehicle_burst_kb=64.0) as run:
+    with running(
+        router, tmp_path / "archive", fleet=file, vehicle_kb_s=1.0, vehicle_burst_kb=64.0
+    ) as run:
         counts = run.service.engine.counts
         heard: list[bytes] = []
-        session.declare_subscriber("gripmap/v1/ack/*", lambda sample: heard.append(sample.payload.to_bytes()))
+        session.declare_subscriber(
+            "gripmap/v1/ack/*", lambda sample: heard.append(sample.payload.to_bytes())
+        )
         publisher = session.declare_publisher(key("car-1"))
         matched(publisher)
         for name in ("car-2", "car-1"):
@@ -125,7 +133,10 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
         assert 60 <= counts[Kind.OBSERVATION] < 100
         until(lambda: heard)
         rejected = [
-            refusal for payload in heard for stream in wire.decode_ack(payload)[1] for refusal in stream.rejected
+            refusal
+            for payload in heard
+            for stream in wire.decode_ack(payload)[1]
+            for refusal in stream.rejected
         ]
         assert not rejected, "too much is not a fault of the batch"
 
@@ -135,7 +146,9 @@ def test_a_region_that_is_none_is_refused_in_the_configuration() -> None:
         ServiceConfig(regions=["**"])
 
 
-def test_the_list_of_a_service_is_read_when_it_is_made(router: ZenohSettings, tmp_path: Path) -> None:
+def test_the_list_of_a_service_is_read_when_it_is_made(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
     with (
         pytest.raises(InputError, match="^config: cannot read"),
         running(router, tmp_path, fleet=tmp_path / "none.json"),

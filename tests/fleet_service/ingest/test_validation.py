@@ -45,10 +45,17 @@ class Desk:
 
     def take(self, *messages: Message) -> int:
         """Number of rows admitted."""
-        return sum(len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values())
+        return sum(
+            len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values()
+        )
 
     def rejected(self) -> list[tuple[int, int, str]]:
-        return [r for _, ack in self.acks.messages() for s in wire.decode_ack(ack)[1] for r in s.rejected]
+        return [
+            r
+            for _, ack in self.acks.messages()
+            for s in wire.decode_ack(ack)[1]
+            for r in s.rejected
+        ]
 
 
 @pytest.fixture
@@ -105,7 +112,10 @@ def one(column: str, values: list[float]) -> dict[str, Any]:
 def test_a_bad_value_is_refused_with_its_row_and_a_reason(
     desk: Desk, column: str, values: list[float], rule: str
 ) -> None:
-    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values)))) == 0
+    assert (
+        desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values))))
+        == 0
+    )
     assert desk.counts == {f"refused.{rule}": 1}
     ((seq, row, reason),) = desk.rejected()
     assert (seq, row) == (1, 0)
@@ -123,15 +133,22 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
         ("yaw", [1.0, -1.0]),
     ],
 )
-def test_what_is_absent_or_just_beside_is_let_in(desk: Desk, column: str, values: list[float]) -> None:
-    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values)))) == 2
+def test_what_is_absent_or_just_beside_is_let_in(
+    desk: Desk, column: str, values: list[float]
+) -> None:
+    assert (
+        desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values))))
+        == 2
+    )
 
 
 def test_controllers_and_surroundings_are_taken_as_they_were_sent(desk: Desk) -> None:
     told: dict[str, Any] = {
         "abs_active": [1, -1], "esc_active": [0, 1], "wiper": [0.5, np.nan], "air_temperature": [-3.5, np.nan],
     }  # fmt: skip
-    accepted = desk.intake.accept([message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **told))], CLOCK)
+    accepted = desk.intake.accept(
+        [message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **told))], CLOCK
+    )
     rows = accepted[Kind.OBSERVATION].rows
     for name, values in told.items():
         np.testing.assert_array_equal(rows[name], np.array(values, rows[name].dtype))
@@ -170,13 +187,17 @@ def test_a_full_queue_drops_and_counts() -> None:
 
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_no_mutation_of_a_batch_stops_the_intake_or_lets_nonsense_in(desk: Desk, data: st.DataObject) -> None:
+def test_no_mutation_of_a_batch_stops_the_intake_or_lets_nonsense_in(
+    desk: Desk, data: st.DataObject
+) -> None:
     payload = bytearray(wire.encode(good(data.draw(st.integers(1, 10**6)))))
     for _ in range(data.draw(st.integers(1, 8))):
         place = data.draw(st.integers(0, len(payload) - 1))
         payload[place] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(payload)))
-    accepted = desk.intake.accept([message(good(), bytes(payload[cut:] if cut % 3 == 0 else payload))], CLOCK)
+    accepted = desk.intake.accept(
+        [message(good(), bytes(payload[cut:] if cut % 3 == 0 else payload))], CLOCK
+    )
     for found in accepted.values():
         rows = found.rows
         assert np.isfinite(rows["latitude"]).all()

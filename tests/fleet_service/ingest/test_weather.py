@@ -45,7 +45,9 @@ from tests.waiting import matched, until
 
 def test_a_report_survives_the_wire_and_what_is_left_out_is_unknown() -> None:
     prior = np.full(mugrid.BINS, 1.0 / mugrid.BINS)
-    got = weather.decode(weather.encode(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior)))
+    got = weather.decode(
+        weather.encode(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))
+    )
     assert (got.time, got.road_temperature, got.precipitation) == (17, -2.5, 0.25)
     assert np.isnan(got.air_temperature)
     assert got.prior == pytest.approx(prior)
@@ -93,7 +95,10 @@ def drive(engine: Engine, begin: int, seq: int) -> None:
     """Three vehicles, one visit each, at a time [ns]."""
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
-        engine.intake.ingest([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
+        engine.intake.ingest(
+            [Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")],
+            begin + 60 * SECOND,
+        )
     engine.settlement.flush()
 
 
@@ -111,7 +116,9 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
     told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
-    engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+    engine.intake.weather.enqueue(
+        WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+    )
     engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
     engine.intake.update_weather(start + 1300 * SECOND)
     drive(engine, start + 3000 * SECOND, 2)
@@ -124,7 +131,9 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     np.testing.assert_allclose(beliefs(again, now), beliefs(engine, now), atol=1e-6)
     assert np.abs(beliefs(dry, now) - beliefs(engine, now)).max() > 1e-3
     assert len(archived_reports(tmp_path / "a").time) == 2  # the file's row is known already
-    assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(tables.WEATHER_ARCHIVE)
+    assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(
+        tables.WEATHER_ARCHIVE
+    )
     again.close()
     dry.close()
 
@@ -133,8 +142,12 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     start, root = time.time_ns() - 7200 * SECOND, tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
-            told = weather.encode(Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2)))
-            engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+            told = weather.encode(
+                Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2))
+            )
+            engine.intake.weather.enqueue(
+                WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+            )
             engine.intake.update_weather(start + 600 * k * SECOND)
             drive(engine, start + 600 * k * SECOND, 1 + k)
             if k == 3:
@@ -162,10 +175,14 @@ def test_a_running_service_takes_weather_over_its_key(
     service: Running, session: zenoh.Session, start: Callable[..., Any]
 ) -> None:
     # by default a put is dropped where the link is busy for a millisecond
-    publisher = session.declare_publisher(keys.weather_key(REGION), congestion_control=zenoh.CongestionControl.BLOCK)
+    publisher = session.declare_publisher(
+        keys.weather_key(REGION), congestion_control=zenoh.CongestionControl.BLOCK
+    )
     matched(publisher)
     publisher.put(bytes(wire.MAX_BYTES + 1), encoding=wire.WEATHER_ENCODING)
-    publisher.put(weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
+    publisher.put(
+        weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING
+    )
     publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     counts = service.service.engine.counts
     until(lambda: counts["weather"] == 1 and counts["refused.weather"] == 2)

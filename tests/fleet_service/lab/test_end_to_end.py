@@ -22,7 +22,12 @@ from tests.fleet_service.examples import CELL, START, observations, value
 def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:
         world = ["--scenario", end_to_end.HILLS.scenario, "--rough", "0.5"]
-        assert main(["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3", *world]) == 0
+        assert (
+            main(
+                ["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3", *world]
+            )
+            == 0
+        )
 
     figures = end_to_end.measure(drive, tmp_path, end_to_end.HILLS)
     assert figures["fusion.whole_way.hills.observations"] > 4
@@ -55,11 +60,21 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
     })  # fmt: skip
 
 
-def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> None:
+def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> (
+    None
+):
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     slots, mu = end_to_end.joined(
-        fusion, visits((0, 10.0, 0.9), (0, 80.0, 0.2), (0, 99.0, 0.4), (1, 5.0, 0.8), (1, 6.0, 0.6), (7, 99.0, 0.1))
+        fusion,
+        visits(
+            (0, 10.0, 0.9),
+            (0, 80.0, 0.2),
+            (0, 99.0, 0.4),
+            (1, 5.0, 0.8),
+            (1, 6.0, 0.6),
+            (7, 99.0, 0.1),
+        ),
     )
     found = dict(zip(fusion.cell[slots].tolist(), mu.tolist(), strict=True))
     assert found == {CELL: pytest.approx(0.3), CELL + 1: pytest.approx(0.7)}
@@ -70,7 +85,9 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
 
     def alert(cells_east: int, seconds: float) -> Alert:
         cell = int(grid.interleave(np.array([east + cells_east]), np.array([north]))[0])
-        return Alert(cell, 0, True, START + int(seconds * NS), 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test")
+        return Alert(
+            cell, 0, True, START + int(seconds * NS), 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test"
+        )
 
     rows = visits((0, 10.0, 0.2), (0, 2.0, 0.9))
     assert end_to_end.false_ice([alert(0, 20.0)], rows) == (0, 0)
@@ -81,7 +98,9 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
 
 def test_alerts_are_those_of_a_service_that_hears_second_by_second() -> None:
     fusion = Fusion(120.0)
-    raised = end_to_end.raised_alerts(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
+    raised = end_to_end.raised_alerts(
+        fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8))
+    )
     assert [alert.cell for alert in raised] == [CELL]
 
 
@@ -90,11 +109,19 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
     counts = end_to_end.excited(fusion, rows)
-    assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [2, 1]
+    assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [
+        2,
+        1,
+    ]
 
 
 def test_a_cell_of_two_surfaces_is_told_apart() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
-    same = end_to_end.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
-    assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [False, True]
+    same = end_to_end.one_surface(
+        fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61))
+    )
+    assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [
+        False,
+        True,
+    ]

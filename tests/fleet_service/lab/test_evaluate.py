@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 
 from fleet_service.cli import main
-from fleet_service.lab import agent, attacks, bars, campaign, changes, exact, fleets, rules, third_party, town
+from fleet_service.lab import (
+    agent,
+    attacks,
+    bars,
+    campaign,
+    changes,
+    exact,
+    fleets,
+    rules,
+    third_party,
+    town,
+)
 from fleet_service.lab.drive import arrivals, novel, rows_of
 from fleet_service.lab.score import coverage, of_beliefs, safe
 from schemas import mugrid
@@ -31,16 +42,30 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.usefixtures("small")
-def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plots(tmp_path: Path) -> None:
+def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plots(
+    tmp_path: Path,
+) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--skip-whole-way"]) == 0
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
     assert header["campaign"] == "fusion --quick"
     found = {row["name"]: row for row in rows}
     assert set(bars.BARS) <= set(found)
     missing = {name for name in bars.BARS if found[name]["value"] is None}
-    assert missing >= {"fusion.whole_way.crps", "fusion.whole_way.rmse.after6", "fusion.whole_way.level.rmse"}
+    assert missing >= {
+        "fusion.whole_way.crps",
+        "fusion.whole_way.rmse.after6",
+        "fusion.whole_way.level.rmse",
+    }
     assert all(
-        name.startswith(("fusion.whole_way", "fusion.resampled", "fusion.false", "fusion.missed", "fusion.clean"))
+        name.startswith(
+            (
+                "fusion.whole_way",
+                "fusion.resampled",
+                "fusion.false",
+                "fusion.missed",
+                "fusion.clean",
+            )
+        )
         for name in missing
     )
     assert not any(found[name]["holds"] for name in missing)
@@ -57,7 +82,11 @@ def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> Non
     assert names == {name for name in bars.BARS if name.startswith(campaign.END_TO_END)}
     assert "fusion.whole_way.hills.coverage90" in names
     assert not any(figure.holds for figure in found)
-    assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [0.0, 0.5, *[0.5] * 10]
+    assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [
+        0.0,
+        0.5,
+        *[0.5] * 10,
+    ]
 
 
 def test_a_missing_figure_fails_the_campaign() -> None:
@@ -75,7 +104,9 @@ def test_a_single_visit_without_bias_is_calibrated() -> None:
     exactly = agent.Errors(np.zeros(1), np.zeros(1), np.zeros(1))
     along = np.tile(np.arange(4), n // 4)
     sure = np.ones(n, bool)
-    passes = agent.Passes(who, mu, np.zeros(n), agent.shares(rng, sure), agent.noise(rng, along), who, sure)
+    passes = agent.Passes(
+        who, mu, np.zeros(n), agent.shares(rng, sure), agent.noise(rng, along), who, sure
+    )
     reports = agent.report(rng, exactly, passes)
     belief = np.exp(reports.log_likelihood - reports.log_likelihood.max(axis=1, keepdims=True))
     belief /= belief.sum(axis=1, keepdims=True)
@@ -90,7 +121,9 @@ def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it
     n, mu = 4000, 0.6
     errors = agent.Errors(np.zeros(n), np.zeros(n), np.zeros(n))
     who, sure = np.arange(n), np.ones(n, bool)
-    passes = agent.Passes(who, np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n), 0 * who, sure)
+    passes = agent.Passes(
+        who, np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n), 0 * who, sure
+    )
     readings = agent.report(rng, errors, passes).reading
     assert readings.mean() - mu == pytest.approx(0.05 * mu, abs=0.005)
 
@@ -98,7 +131,9 @@ def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it
 def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> None:
     rng = np.random.default_rng(2)
     n, who = 500, np.arange(500)
-    passes = agent.Passes(who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n), 0 * who, who < 0)
+    passes = agent.Passes(
+        who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n), 0 * who, who < 0
+    )
     reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
     above = reports.log_likelihood[:, mugrid.CENTRES > 0.35]
     assert np.ptp(above, axis=1).max() <= agent.SLOPE_NATS
@@ -113,12 +148,16 @@ def test_what_is_delivered_twice_is_admitted_once() -> None:
     np.testing.assert_array_equal(np.sort(kept), np.arange(len(visits)))
 
 
-def test_the_federated_reset_is_the_inverse_variance_of_readings_and_the_newest_report_the_last() -> None:
+def test_the_federated_reset_is_the_inverse_variance_of_readings_and_the_newest_report_the_last() -> (
+    None
+):
     seconds, place = np.arange(3.0), np.zeros(3, np.int64)
     reading, std = np.array([0.5, 0.7, np.nan]), np.array([0.1, 0.1, np.nan])
     sent = np.array([[0.5, 0.01], [0.7, 0.01], [0.6, 0.05]])
     found = rules.fuse(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
-    federated, newest = (found[rules.RULES.index(name)] for name in ("federated reset", "newest report"))
+    federated, newest = (
+        found[rules.RULES.index(name)] for name in ("federated reset", "newest report")
+    )
     information = 1 / rules.PRIOR_VAR + 2 / 0.01
     expected = (rules.PRIOR_MEAN / rules.PRIOR_VAR + (0.5 + 0.7) / 0.01) / information
     assert federated == pytest.approx([expected, 1 / information], rel=1e-3)

@@ -8,11 +8,18 @@ from fleet_service.lab import fading
 
 
 def test_what_is_vouched_for_falls_with_time_and_falls_faster_in_rain_and_frost() -> None:
-    lower = {name: fading.lower_ends(np.random.default_rng(1), known) for name, known in fading.WEATHER.items()}
+    lower = {
+        name: fading.lower_ends(np.random.default_rng(1), known)
+        for name, known in fading.WEATHER.items()
+    }
     assert all((np.diff(of) <= 0.0).all() for of in lower.values())
     assert all(of[0] > 0.6 and of[-1] < 0.2 for of in lower.values())
     after_half_an_hour = {name: of[fading.AFTER_MIN.index(30)] for name, of in lower.items()}
-    assert after_half_an_hour["mild_dry"] > after_half_an_hour["unknown"] > after_half_an_hour["mild_rain"]
+    assert (
+        after_half_an_hour["mild_dry"]
+        > after_half_an_hour["unknown"]
+        > after_half_an_hour["mild_rain"]
+    )
     assert after_half_an_hour["mild_rain"] >= after_half_an_hour["freezing"]
 
 

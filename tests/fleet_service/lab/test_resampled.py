@@ -46,7 +46,9 @@ def test_a_town_s_vehicle_is_one_of_the_ways_and_its_reports_are_of_the_town_s_r
     assert found.reports.used == pytest.approx(0.5 * visits.mu)
     inside = (found.reports.reading > 0.2) & (found.reports.reading < 1.1)
     most = mugrid.CENTRES[found.reports.log_likelihood.argmax(axis=1)]
-    assert np.abs(most - found.reports.reading)[inside].max() < mugrid.CENTRES[1] - mugrid.CENTRES[0]
+    assert (
+        np.abs(most - found.reports.reading)[inside].max() < mugrid.CENTRES[1] - mugrid.CENTRES[0]
+    )
 
 
 def test_where_a_vehicle_never_was_on_such_a_road_another_s_visit_is_drawn() -> None:
@@ -60,7 +62,10 @@ def test_where_a_vehicle_never_was_on_such_a_road_another_s_visit_is_drawn() -> 
 
 def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
     truth = TrueVisits(
-        np.array([0, 0, 1]), np.array([0, 10, 0]) * NS, np.array([0.9, 0.2, 0.5]), np.array([0.1, 0.9, 0.7])
+        np.array([0, 0, 1]),
+        np.array([0, 10, 0]) * NS,
+        np.array([0.9, 0.2, 0.5]),
+        np.array([0.1, 0.9, 0.7]),
     )
     nan = np.full(4, np.nan, np.float32)
     found = resampled.driven({

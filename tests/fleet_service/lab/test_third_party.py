@@ -18,7 +18,9 @@ def test_gain_error_moves_value_and_use_alike() -> None:
     reports = third_party.report(rng, gain, vehicle, np.full(n, 0.5), np.ones(n, bool))
     share = reports.used / reports.reading
     for who in (0, 1):
-        assert reports.reading[vehicle == who].mean() == pytest.approx(0.5 * (1.0 + gain[who]), rel=0.01)
+        assert reports.reading[vehicle == who].mean() == pytest.approx(
+            0.5 * (1.0 + gain[who]), rel=0.01
+        )
         assert share[vehicle == who].mean() == pytest.approx(np.mean(third_party.SHARE), rel=0.02)
 
 
@@ -26,7 +28,9 @@ def test_columns_hold_no_optional_fact_and_fixes_are_right() -> None:
     drive, mu = third_party.drive_honest(np.random.default_rng(2), 0.05)
     o = third_party.observe(drive)
     assert set(o.manoeuvre.tolist()) == {-1}
-    assert np.mean(mu[drive.visits.place] != drive.visits.mu) < 0.01, "five metres are three standard deviations"
+    assert np.mean(mu[drive.visits.place] != drive.visits.mu) < 0.01, (
+        "five metres are three standard deviations"
+    )
 
 
 def test_changing_cells_are_dry_then_white_then_dry() -> None:

@@ -56,7 +56,10 @@ def bare(router: ZenohSettings) -> Iterator[str]:
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
     """A page beside a service that keeps a snapshot each second."""
     archive = tmp_path / "archive"
-    with running(router, archive, snapshot_s=1.0) as service, page_of(router, archive=archive) as address:
+    with (
+        running(router, archive, snapshot_s=1.0) as service,
+        page_of(router, archive=archive) as address,
+    ):
         yield RunningPage(address, service, archive)
 
 
@@ -75,6 +78,8 @@ def drive(session: zenoh.Session, page: RunningPage) -> Drive:
         named = parts or tuple(street.PARTS)
         seq = street.put(session, named, time.time_ns(), seq)
         wanted = before + street.known(*named) * len(street.CARS)
-        until(lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] >= wanted)
+        until(
+            lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] >= wanted
+        )
 
     return go

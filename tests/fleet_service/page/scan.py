@@ -18,7 +18,9 @@ def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
     source = file_of("axe-core", "axe.min.js")
     if source is None:
         return None
-    seen.page.emulate_media(reduced_motion="reduce")  # a colour that is just fading in is not the one that is read
+    seen.page.emulate_media(
+        reduced_motion="reduce"
+    )  # a colour that is just fading in is not the one that is read
     seen.page.evaluate(f"() => {{ {source.read_text()} }}")
     found: list[str] = []
     for tab in tabs:

@@ -14,7 +14,11 @@ from tests.fleet_service.examples import CELL, at_least, batch, send, value
 
 VISIT_NS: Final = 600_000_000  # 10 m at 17 m/s
 ROLLED: Final = 0.25  # grip used where a part is only passed
-WAYS: Final = ((-1.0, 0.0), (1.0, 0.0), (0.0, 1.0))  # braking, driving, turning: visits that do the same share an error
+WAYS: Final = (
+    (-1.0, 0.0),
+    (1.0, 0.0),
+    (0.0, 1.0),
+)  # braking, driving, turning: visits that do the same share an error
 EAST, NORTH, WEST, SOUTH = range(4)
 CARS: Final = tuple(f"car-{name}" for name in ("one", "two", "three", "four", "five", "six"))
 MIDDLE: Final = tuple(int(v) for v in grid.deinterleave(CELL))
@@ -46,7 +50,13 @@ def cells(part: Part) -> IntArray:
     return grid.interleave(MIDDLE[0] + x, MIDDLE[1] + y)
 
 
-def put(session: zenoh.Session, parts: Sequence[str], now: int, first_seq: int = 1, cars: Sequence[str] = CARS) -> int:
+def put(
+    session: zenoh.Session,
+    parts: Sequence[str],
+    now: int,
+    first_seq: int = 1,
+    cars: Sequence[str] = CARS,
+) -> int:
     """Let cars drive over parts, there and back, the last visit `now` [ns], and report; returns the next free seq."""
     place, heading, mu = _drive([PARTS[name] for name in parts])
     time = now - (len(place) - 1 - np.arange(len(place))) * VISIT_NS
@@ -60,7 +70,10 @@ def put(session: zenoh.Session, parts: Sequence[str], now: int, first_seq: int =
 
 
 def _report(
-    session: zenoh.Session, car: str, seq: int, visits: tuple[IntArray, IntArray, FloatArray, IntArray]
+    session: zenoh.Session,
+    car: str,
+    seq: int,
+    visits: tuple[IntArray, IntArray, FloatArray, IntArray],
 ) -> None:
     place, heading, mu, time = visits
     latitude, longitude = grid.centre(place)

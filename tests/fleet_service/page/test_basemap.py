@@ -30,7 +30,9 @@ def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
     """A picture of one colour."""
 
     def part(name: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        return (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
 
     rows = zlib.compress((b"\0" + bytes(colour) * side) * side)
     head = struct.pack(">2I5B", side, side, 8, 2, 0, 0, 0)
@@ -41,7 +43,9 @@ def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str 
     """MBTiles of tiles by zoom, column and row from the north."""
     with closing(sqlite3.connect(path)) as table, table:
         table.execute("create table metadata (name text, value text)")
-        table.execute("create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)")
+        table.execute(
+            "create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)"
+        )
         table.execute("insert into metadata values ('format', ?)", (form,))
         rows = [(z, x, 2**z - 1 - y, data) for (z, x, y), data in tiles.items()]
         table.executemany("insert into tiles values (?, ?, ?, ?)", rows)
@@ -59,10 +63,13 @@ def test_mbtiles_rows_count_from_the_south_and_requests_from_the_north(tmp_path:
     assert of.file is not None
     assert (of.address, of.zooms, of.file.kind) == (OWN, (2, 2), "image/png")
     assert [of.file.picture(2, 1, y) for y in range(4)] == [b"north", None, None, b"south"]
-    assert [of.file.picture(*place) for place in ((1, 1, 0), (2, 4, 0), (2, -1, 0), (-1, 0, 0), (99, 0, 0))] == [
-        None
-    ] * 5
-    assert base_map("https://t.example/{z}/{x}/{y}.png") == BaseMap("https://t.example/{z}/{x}/{y}.png", ZOOMS)
+    assert [
+        of.file.picture(*place)
+        for place in ((1, 1, 0), (2, 4, 0), (2, -1, 0), (-1, 0, 0), (99, 0, 0))
+    ] == [None] * 5
+    assert base_map("https://t.example/{z}/{x}/{y}.png") == BaseMap(
+        "https://t.example/{z}/{x}/{y}.png", ZOOMS
+    )
 
 
 def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
@@ -75,7 +82,11 @@ def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> 
     for name, problem in names.items():
         with pytest.raises(InputError, match=problem):
             base_map(str(tmp_path / name))
-    for text in ("https://t.example/{z}/{x}.png", "ftp://t.example/{z}/{x}/{y}", "https://t.example/{z}/{x}/{y};a"):
+    for text in (
+        "https://t.example/{z}/{x}.png",
+        "ftp://t.example/{z}/{x}/{y}",
+        "https://t.example/{z}/{x}/{y};a",
+    ):
         with pytest.raises(InputError, match="no address"):
             base_map(text)
 
@@ -92,7 +103,9 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
         assert ask(address, "/base/x/y/z")[0] == 404
 
 
-def test_a_person_sees_the_file_below_the_map_without_any_network(router: ZenohSettings, tmp_path: Path) -> None:
+def test_a_person_sees_the_file_below_the_map_without_any_network(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
     """Further in than the file goes its deepest tiles are drawn larger; far out none is asked for."""
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,
@@ -101,7 +114,8 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(router: ZenohS
         seen.page.wait_for_selector(READY, state="attached")
         go = "([x, y, zoom]) => gripmap.view.go(gripmap.view.x = x, gripmap.view.y = y, zoom)"
         x, y = seen.page.evaluate(
-            "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / Math.PI) / 2]", AT
+            "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / Math.PI) / 2]",
+            AT,
         )
         for zoom in (12.0, 18.0):
             seen.page.evaluate(go, [x, y, zoom])

@@ -8,7 +8,16 @@ from itertools import combinations, pairwise
 import pytest
 
 from fleet_service.page.colours import EDGES, colour_of
-from schemas.runtime.palette import DARK_FOUR, DARK_GROUND, DARK_LITTLE, DARK_TWO, FOUR, GROUND, LITTLE, TWO
+from schemas.runtime.palette import (
+    DARK_FOUR,
+    DARK_GROUND,
+    DARK_LITTLE,
+    DARK_TWO,
+    FOUR,
+    GROUND,
+    LITTLE,
+    TWO,
+)
 from tests.sight import SIGHTS, difference, lab
 
 LEAST = 10.0
@@ -24,9 +33,13 @@ def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("sight", SIGHTS)
 @pytest.mark.parametrize("palette", [ALL, DARK], ids=["light", "dark"])
-def test_any_two_classes_and_the_ground_are_told_apart(sight: str, palette: tuple[str, ...]) -> None:
+def test_any_two_classes_and_the_ground_are_told_apart(
+    sight: str, palette: tuple[str, ...]
+) -> None:
     assert len(set(palette)) == 8
-    assert min(difference(lab(a, sight), lab(b, sight)) for a, b in combinations(palette, 2)) >= LEAST
+    assert (
+        min(difference(lab(a, sight), lab(b, sight)) for a, b in combinations(palette, 2)) >= LEAST
+    )
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
@@ -52,7 +65,11 @@ def test_nothing_is_green() -> None:
 def test_the_less_is_known_the_fewer_colours() -> None:
     mus = [0.05 + 0.01 * k for k in range(100)]
     for half, classes in ((0.1, 4), (0.2, 2), (0.4, 1)):
-        found = {colour_of(mu, mu - half, mu + half) for mu in mus if half == 0.1 or mu + half >= EDGES[1]}
+        found = {
+            colour_of(mu, mu - half, mu + half)
+            for mu in mus
+            if half == 0.1 or mu + half >= EDGES[1]
+        }
         assert len(found) == classes
     assert {colour_of(mu, 0.05, 1.1) for mu in mus} == {LITTLE}
 

@@ -44,7 +44,9 @@ def made_up_service(session: zenoh.Session) -> Iterator[None]:
         with asked:
             asked.reply(keys.map_key(TILE), payload)
 
-    queryable = session.declare_queryable(keys.map_key(TILE).rpartition("/")[0] + "/*", answer, complete=True)
+    queryable = session.declare_queryable(
+        keys.map_key(TILE).rpartition("/")[0] + "/*", answer, complete=True
+    )
     try:
         yield
     finally:
@@ -54,7 +56,20 @@ def made_up_service(session: zenoh.Session) -> Iterator[None]:
 def put(session: zenoh.Session, cells: list[int], *, raised: bool, at: int = START) -> None:
     for cell in cells:
         latitude, longitude = (float(v) for v in grid.centre(cell))
-        told = Alert(cell, 0, raised, at, 0.2, 0.1, 0.3, 0.95, 3, latitude, longitude, "P(mu < 0.4) = 0.95 > 0.9")
+        told = Alert(
+            cell,
+            0,
+            raised,
+            at,
+            0.2,
+            0.1,
+            0.3,
+            0.95,
+            3,
+            latitude,
+            longitude,
+            "P(mu < 0.4) = 0.95 > 0.9",
+        )
         session.put(keys.alert_key(TILE), wire.encode_alert(told))
 
 
@@ -75,7 +90,9 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
             until(lambda: out.read_bytes() == begun)
         with page_of(router, datex=DatexFile(OURS, out, print)) as address:
             pulled = pull(address)
-            until(lambda: text(records(pulled())[0], ".//com:overallEndTime"))  # nothing stands any more
+            until(
+                lambda: text(records(pulled())[0], ".//com:overallEndTime")
+            )  # nothing stands any more
             put(session, CELLS, raised=True, at=START + NS)
             until(lambda: len(records(pulled())) == 2)
             put(session, CELLS, raised=False, at=START + 2 * NS)
@@ -119,7 +136,9 @@ def test_a_page_without_a_publication_says_how_to_have_one(bare: str) -> None:
     assert (status, b"--datex" in body) == (404, True)
 
 
-def test_before_any_service_spoke_there_is_no_publication(router: ZenohSettings, tmp_path: Path) -> None:
+def test_before_any_service_spoke_there_is_no_publication(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
     with page_of(router, datex=DatexFile(OURS, tmp_path / "situations.xml", print)) as address:
         assert ask(address, ROUTE)[0] == 503
     assert PageSettings(router).datex is None

@@ -79,23 +79,27 @@ def test_readers_of_others_open_it_and_see_bounds_without_a_value(
     assert measured.total_bounds[3] == pytest.approx(north.max())
 
 
-def test_mu_is_a_number_also_to_who_sees_only_bounds_first(page: RunningPage, drive: Drive, tmp_path: Path) -> None:
+def test_mu_is_a_number_also_to_who_sees_only_bounds_first(
+    page: RunningPage, drive: Drive, tmp_path: Path
+) -> None:
     drawn(page, drive, "passed")
     found = opened_by("GDAL", page.address, tmp_path)
     assert found["mu"].dtype == np.float64
     assert found["vehicles"].dtype.kind == "i"
 
 
-def test_pages_follow_each_other_and_nothing_is_there_twice(page: RunningPage, drive: Drive) -> None:
+def test_pages_follow_each_other_and_nothing_is_there_twice(
+    page: RunningPage, drive: Drive
+) -> None:
     drawn(page, drive, "ice", "wet")
     found, path, pages = [], f"{ITEMS}?limit=7", 0
     while path:
         answer = told(page, path)
         assert answer["numberReturned"] == len(answer["features"]) <= 7
         found += [one["id"] for one in answer["features"]]
-        path = next((link["href"] for link in answer["links"] if link["rel"] == "next"), "").removeprefix(
-            page.address[:-1]
-        )
+        path = next(
+            (link["href"] for link in answer["links"] if link["rel"] == "next"), ""
+        ).removeprefix(page.address[:-1])
         pages += 1
     assert pages == -(-street.known("ice", "wet") // 7)
     assert len(set(found)) == len(found) == street.known("ice", "wet")
@@ -106,13 +110,19 @@ def test_pages_follow_each_other_and_nothing_is_there_twice(page: RunningPage, d
 
 def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
     drawn(page, drive, "ice", "avenue")
-    west, south, east, north = (float(v) for v in grid.bounds(int(street.cells(street.PARTS["ice"])[2])))
+    west, south, east, north = (
+        float(v) for v in grid.bounds(int(street.cells(street.PARTS["ice"])[2]))
+    )
     inside = told(page, f"{ITEMS}?bbox={west + 1e-7},{south + 1e-7},{east - 1e-7},{north - 1e-7}")
-    assert {one["properties"]["cell"] for one in inside["features"]} == {int(street.cells(street.PARTS["ice"])[2])}
+    assert {one["properties"]["cell"] for one in inside["features"]} == {
+        int(street.cells(street.PARTS["ice"])[2])
+    }
     assert told(page, f"{ITEMS}?bbox={west + 9},{south},{east + 9},{north}")["features"] == []
 
 
-def test_a_time_is_the_map_of_then_and_an_interval_what_was_observed_in_it(page: RunningPage, drive: Drive) -> None:
+def test_a_time_is_the_map_of_then_and_an_interval_what_was_observed_in_it(
+    page: RunningPage, drive: Drive
+) -> None:
     drawn(page, drive, "ice")
     time.time_ns()
     now = _text(time.time())
@@ -137,14 +147,23 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
     assert b"<html" in ask(page.address, "/", Accept="text/html,application/json;q=.9")[2]
     assert b"<html" in ask(page.address, "/")[2]
     found = json.loads(ask(page.address, "/", Accept="application/json")[2])
-    assert {"service-desc", "conformance", "data", "self"} <= {link["rel"] for link in found["links"]}
+    assert {"service-desc", "conformance", "data", "self"} <= {
+        link["rel"] for link in found["links"]
+    }
     for link in found["links"]:
         assert ask(page.address, link["href"].removeprefix(page.address[:-1]))[0] == 200
     assert told(page, "/conformance")["conformsTo"] == list(CONFORMANCE)
     (one,) = told(page, "/collections")["collections"]
     assert one["id"] == told(page, "/collections/grip")["id"] == "grip"
     paths = told(page, "/api")["paths"]
-    assert set(paths) >= {"/", "/conformance", "/collections", "/collections/grip", ITEMS, f"{ITEMS}/{{featureId}}"}
+    assert set(paths) >= {
+        "/",
+        "/conformance",
+        "/collections",
+        "/collections/grip",
+        ITEMS,
+        f"{ITEMS}/{{featureId}}",
+    }
 
 
 @pytest.mark.parametrize(
@@ -160,7 +179,9 @@ def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str)
 
 
 def test_no_service_is_no_empty_map(bare: str) -> None:
-    until(lambda: ask(bare, ITEMS)[0] == 503)  # the page is the module's: it may still hear another test's service
+    until(
+        lambda: ask(bare, ITEMS)[0] == 503
+    )  # the page is the module's: it may still hear another test's service
     assert ask(bare, ITEMS)[2].startswith(b"no service")
 
 

@@ -33,12 +33,16 @@ def look(seen: Opened, name: str) -> None:
 
 
 @contextmanager
-def shown(page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False) -> Iterator[Opened]:
+def shown(
+    page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False
+) -> Iterator[Opened]:
     """The page, when it is ready; no foreign request and nothing on the console when it is left."""
     with opened(page.address + state, phone=phone) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         yield seen
-        foreign = [url for url in seen.requests if not url.startswith((page.address, "blob:", "data:"))]
+        foreign = [
+            url for url in seen.requests if not url.startswith((page.address, "blob:", "data:"))
+        ]
         assert foreign == []
         assert errors or seen.errors == []
 
@@ -61,7 +65,9 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
 
 def waits(seen: Opened, script: str) -> None:
     """Return as soon as a script says true."""
-    until(lambda: seen.page.evaluate(script))  # the page's own policy forbids Playwright to poll inside it
+    until(
+        lambda: seen.page.evaluate(script)
+    )  # the page's own policy forbids Playwright to poll inside it
 
 
 def cell_of(part: str, index: int = 1) -> int:
@@ -78,7 +84,9 @@ def read(seen: Opened, sector: int) -> dict[str, str]:
     return found
 
 
-def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningPage, drive: Drive) -> None:
+def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("dry", "snow", "ice", "wet", "passed", "avenue")
     with shown(page) as seen:
         near(seen, cell_of("ice"), 17.2)
@@ -95,7 +103,9 @@ def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningP
         assert painted > 100
         near(seen, cell_of("passed", 3), 21)
         only = f"(all => all[{HOLLOW}] > 0 && all.slice(0, {HOLLOW}).every(n => n === '0'))"
-        waits(seen, f"{only}(document.body.dataset.kinds.split(','))")  # the last picture was of all of them
+        waits(
+            seen, f"{only}(document.body.dataset.kinds.split(','))"
+        )  # the last picture was of all of them
         assert seen.page.evaluate(_COLOURED) == 0, "a bound has no colour"
         look(seen, "bounds")
 
@@ -141,14 +151,21 @@ def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive)
     with shown(page) as seen:
         for zoom, level in ((12.0, 18), (6.0, 14)):
             near(seen, cell_of("ice"), zoom)
-            waits(seen, f"document.body.dataset.level === '{level}' && document.body.dataset.kinds.split(',')[0] > 0")
-            waits(seen, f"[...gripmap.now.tiles.values()].every(tile => tile.block.level === {level})")
+            waits(
+                seen,
+                f"document.body.dataset.level === '{level}' && document.body.dataset.kinds.split(',')[0] > 0",
+            )
+            waits(
+                seen, f"[...gripmap.now.tiles.values()].every(tile => tile.block.level === {level})"
+            )
         look(seen, "far")
 
 
 def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> None:
     steps = range(10, 230, 9)
-    triples = [(mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)]
+    triples = [
+        (mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)
+    ]
     with shown(page) as seen:
         there: list[int] = seen.page.evaluate(
             "async triples => { const { kindOf, setColours } = await import('/static/colours.js'); "
@@ -159,12 +176,16 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
             "async () => { const { kindOf } = await import('/static/colours.js'); return kindOf(0, 160, 150, 170) }"
         )
     names = [*palette.FOUR, *palette.TWO, palette.LITTLE]
-    assert [names[k] for k in there] == [colours.colour_of(*(v / 200 for v in one)) for one in triples]
+    assert [names[k] for k in there] == [
+        colours.colour_of(*(v / 200 for v in one)) for one in triples
+    ]
     assert hollow == HOLLOW
     assert len(set(there)) == 7
 
 
-def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(page: RunningPage, drive: Drive) -> None:
+def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("ice", "passed")
     with shown(page) as seen:
         near(seen, cell_of("ice"))
@@ -177,20 +198,27 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(page: RunningPa
         assert "km/h with 50 m of sight" in told["speed"]
         alert = re.match(r"(\d+) vehicles found it slippery, (over )?\d+ % sure", told["alert"])
         assert alert is not None, told["alert"]
-        assert 2 <= int(alert[1]) <= len(street.CARS), "as many as had been heard when it was raised"
+        assert 2 <= int(alert[1]) <= len(street.CARS), (
+            "as many as had been heard when it was raised"
+        )
         assert seen.page.locator(".chart .density").count() == 2
         look(seen, "place")
         near(seen, cell_of("passed"))
         waits(seen, f"gripmap.cells.at_place(...Object.values({_place('passed')})).length")
         seen.page.locator("#map").click()
-        waits(seen, "document.querySelector('[data-value=basis]')?.textContent.startsWith('only passed')")
+        waits(
+            seen,
+            "document.querySelector('[data-value=basis]')?.textContent.startsWith('only passed')",
+        )
         told = read(seen, street.EAST)
         assert told["speed"] == "unknown: nobody measured here"
         assert told["grip"].startswith("at least 0.")
         assert "slippery" not in told
         assert seen.page.locator(".chart .density").count() == 0
         seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
-        assert seen.page.locator("#panel .nobody").inner_text() == "Nobody was here: nothing is known."
+        assert (
+            seen.page.locator("#panel .nobody").inner_text() == "Nobody was here: nothing is known."
+        )
 
 
 def _place(part: str) -> str:
@@ -198,7 +226,9 @@ def _place(part: str) -> str:
     return json.dumps([cell >> 14, cell & 0x3FFF])
 
 
-def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(page: RunningPage, drive: Drive) -> None:
+def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
+    page: RunningPage, drive: Drive
+) -> None:
     with shown(page) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "gripmap.live.state")
@@ -218,7 +248,9 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(page: Runni
         look(seen, "alerts")
 
 
-def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(page: RunningPage, drive: Drive) -> None:
+def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("ice")
     with shown(page) as seen:
         near(seen, cell_of("ice"))
@@ -241,7 +273,9 @@ def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage)
 
 
 @pytest.mark.campaign
-def test_slider_shows_a_past_cell_and_two_moments_side_by_side(page: RunningPage, drive: Drive) -> None:
+def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("snow")
     until(lambda: kept(page.archive))
     before = kept(page.archive)[-1]
@@ -251,7 +285,9 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(page: RunningPage
         near(seen, cell_of("ice"))
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         seen.page.evaluate("gripmap.timeline.load()")
-        seen.page.evaluate("at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before)
+        seen.page.evaluate(
+            "at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before
+        )
         waits(seen, f"document.body.dataset.at === '{before}'")
         assert kinds(seen)[ICE] == 0
         assert sum(kinds(seen)) == street.known("snow")
@@ -268,17 +304,25 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(page: RunningPage
 
 def kept(archive: Path) -> list[int]:
     """The moments of the snapshots."""
-    return sorted(snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet"))
+    return sorted(
+        snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")
+    )
 
 
 def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
     page: RunningPage, drive: Drive, tmp_path: Path
 ) -> None:
     drive("ice", "wet")
-    west, east = (grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3)))
-    points = "".join(f'<trkpt lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east))
+    west, east = (
+        grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3))
+    )
+    points = "".join(
+        f'<trkpt lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east)
+    )
     gpx = tmp_path / "way.gpx"
-    gpx.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>')
+    gpx.write_text(
+        f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
+    )
     with shown(page) as seen:
         seen.page.locator("#tab-route").click()
         seen.page.locator("#gpx").set_input_files(gpx)
@@ -297,7 +341,9 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
         assert "nobody knows" in seen.page.locator("#route-worst").inner_text()
 
 
-def test_all_of_a_map_fills_the_window_until_somebody_looks_elsewhere(page: RunningPage, drive: Drive) -> None:
+def test_all_of_a_map_fills_the_window_until_somebody_looks_elsewhere(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("ice", "wet")
     with shown(page) as seen:
         waits(seen, _FITTED)
@@ -309,7 +355,10 @@ def test_all_of_a_map_fills_the_window_until_somebody_looks_elsewhere(page: Runn
         zoom = seen.page.evaluate("gripmap.view.zoom")
         seen.page.locator("#controls button").first.click()
         drive("avenue", "passed")
-        waits(seen, f"gripmap.now.extent.south - gripmap.now.extent.north > 1e-5 && gripmap.view.zoom === {zoom} + 1")
+        waits(
+            seen,
+            f"gripmap.now.extent.south - gripmap.now.extent.north > 1e-5 && gripmap.view.zoom === {zoom} + 1",
+        )
         seen.page.locator("#controls button").last.click()
         waits(seen, _FITTED)
 
@@ -356,11 +405,16 @@ def test_a_file_that_leaves_has_no_mu_for_a_bound(page: RunningPage, drive: Driv
     drive("passed")
     with shown(page) as seen:
         near(seen, cell_of("passed", 3), 17)
-        waits(seen, f"document.body.dataset.kinds?.split(',')[{HOLLOW}] == {street.known('passed')}")
+        waits(
+            seen, f"document.body.dataset.kinds?.split(',')[{HOLLOW}] == {street.known('passed')}"
+        )
         seen.page.locator("#tab-share").click()
         with seen.page.expect_download() as waiting:
             seen.page.locator("#geojson").click()
-        rows = [one["properties"] for one in json.loads(Path(waiting.value.path()).read_text())["features"]]
+        rows = [
+            one["properties"]
+            for one in json.loads(Path(waiting.value.path()).read_text())["features"]
+        ]
         assert len(rows) == street.known("passed")
         assert all(row["mu"] is None and row["basis"] == "bound" for row in rows)
 
@@ -384,12 +438,16 @@ def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
         assert seen.page.evaluate("gripmap.tab") == "alerts"
 
 
-def test_a_phone_shows_map_and_words_without_scrolling_sideways(page: RunningPage, drive: Drive) -> None:
+def test_a_phone_shows_map_and_words_without_scrolling_sideways(
+    page: RunningPage, drive: Drive
+) -> None:
     drive()
     with shown(page, phone=True) as seen:
         near(seen, cell_of("ice"), 17)
         waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
-        size = seen.page.evaluate("[document.documentElement.scrollWidth, innerWidth, gripmap.view.height]")
+        size = seen.page.evaluate(
+            "[document.documentElement.scrollWidth, innerWidth, gripmap.view.height]"
+        )
         assert size[0] <= size[1]
         assert size[2] > 200
         seen.page.locator("#map").tap()

@@ -50,18 +50,24 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.locator("#play").click()
         assert seen.page.locator("#play").inner_text() != "play"
-        until(lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0)  # a moment each .7 s
+        until(
+            lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0
+        )  # a moment each .7 s
         played: list[list[str]] = seen.page.evaluate("played")
         moments = [int(at) for at, _ in played[:-1]]
         assert moments == sorted(moments)
         assert len(set(moments)) >= 2
-        assert abs(moments[0] - first) <= 10, "a moment from memory may come before the first snapshot"
+        assert abs(moments[0] - first) <= 10, (
+            "a moment from memory may come before the first snapshot"
+        )
         ice = [int(drawn.split(",")[ICE]) for _, drawn in played]
         assert (ice[0], ice[-1]) == (0, street.known("ice"))
         waits(seen, "gripmap.timeline.timer === null")
 
 
-def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(page: RunningPage, drive: Drive) -> None:
+def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
+    page: RunningPage, drive: Drive
+) -> None:
     with shown(page) as seen:
         silent = seen.page.context.new_page()
         silent.goto(page.address)
@@ -80,21 +86,27 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(page: Runni
         assert silent.evaluate("beeps") == 0
 
 
-def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPage, drive: Drive) -> None:
+def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("ice", "dry")
     with shown(page) as seen:
         near(seen, cell_of("ice"), 17)
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         seen.page.emulate_media(media="print")
         seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
-        assert re.fullmatch(r"as of \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC.*", seen.page.locator("#moment").inner_text())
+        assert re.fullmatch(
+            r"as of \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC.*", seen.page.locator("#moment").inner_text()
+        )
         assert "as of 20" in seen.page.locator("#paper h2").inner_text()
         assert seen.page.locator("#paper .ladder li").count() == 8
         for selector in ("#tabs", "#controls", "#play", "#slider", "#panel button", "#searching"):
             assert not any(one.is_visible() for one in seen.page.locator(selector).all()), selector
         for selector in ("#map", "#panel", "#scale", "#moment", "#paper"):
             assert seen.page.locator(selector).is_visible(), selector
-        panel = seen.page.evaluate("(p => [p.scrollHeight, p.clientHeight])(document.getElementById('panel'))")
+        panel = seen.page.evaluate(
+            "(p => [p.scrollHeight, p.clientHeight])(document.getElementById('panel'))"
+        )
         assert panel[0] <= panel[1] + 1, "no word is cut off"
         assert seen.page.pdf()[:5] == b"%PDF-"
         look(seen, "print")
@@ -104,8 +116,12 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPa
 
 def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:
     drive("ice", "wet")
-    west, east = (grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3)))
-    points = "".join(f'<rtept lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east))
+    west, east = (
+        grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3))
+    )
+    points = "".join(
+        f'<rtept lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east)
+    )
     with shown(page) as seen:
         gpx = f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><rte>{points}</rte></gpx>'
         assert seen.page.evaluate(_DROP, gpx), "the browser does not open it instead"
@@ -114,7 +130,9 @@ def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:
         assert "km/h with 50 m of sight" in seen.page.locator("#route-worst").inner_text()
 
 
-def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(page: RunningPage, drive: Drive) -> None:
+def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(
+    page: RunningPage, drive: Drive
+) -> None:
     drive()
     with shown(page) as seen:
         seen.page.set_viewport_size(WALL)  # type: ignore[arg-type]
@@ -135,7 +153,9 @@ def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(page: Runnin
 
 
 @pytest.mark.parametrize("phone", [False, True], ids=["desk", "phone"])
-def test_axe_finds_nothing_serious_in_any_panel(page: RunningPage, drive: Drive, phone: bool) -> None:
+def test_axe_finds_nothing_serious_in_any_panel(
+    page: RunningPage, drive: Drive, phone: bool
+) -> None:
     drive("ice", "passed", "dry")
     with shown(page, phone=phone) as seen:
         near(seen, cell_of("ice"))
@@ -149,7 +169,9 @@ def test_axe_finds_nothing_serious_in_any_panel(page: RunningPage, drive: Drive,
 
 def test_axe_would_see_a_button_without_a_name(page: RunningPage) -> None:
     with shown(page) as seen:
-        seen.page.evaluate("document.getElementById('controls').append(document.createElement('button'))")
+        seen.page.evaluate(
+            "document.getElementById('controls').append(document.createElement('button'))"
+        )
         found = scan.findings(seen, ("legend",))
         if found is None:
             pytest.skip(scan.MISSING)
@@ -157,4 +179,6 @@ def test_axe_would_see_a_button_without_a_name(page: RunningPage) -> None:
 
 
 def _choose(seen: Opened, cell: int) -> None:
-    seen.page.evaluate("([tile, local]) => gripmap.choose(tile, local)", [cell >> 14, cell & 0x3FFF])
+    seen.page.evaluate(
+        "([tile, local]) => gripmap.choose(tile, local)", [cell >> 14, cell & 0x3FFF]
+    )

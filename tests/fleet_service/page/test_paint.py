@@ -12,7 +12,17 @@ from schemas.runtime import palette
 from tests.browser import opened
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
-from tests.fleet_service.page.test_page import _COLOURED, _POINTS, ICE, READY, cell_of, look, near, shown, waits
+from tests.fleet_service.page.test_page import (
+    _COLOURED,
+    _POINTS,
+    ICE,
+    READY,
+    cell_of,
+    look,
+    near,
+    shown,
+    waits,
+)
 
 PLACES: Final = 12
 # Squares of known ground in a row, of two tiles; says how many points of each colour there are in the row's middle.
@@ -61,14 +71,18 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
                 assert seen.page.evaluate(_ROW, [side, first, 0])[2] == 0, (side, first)
 
 
-def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: RunningPage, drive: Drive) -> None:
+def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
+    page: RunningPage, drive: Drive
+) -> None:
     """Paint a tile that has changed since it was first received."""
     drive("dry")
     with shown(page) as seen:
         near(seen, cell_of("ice"))
         drive("ice")
         waits(seen, f"document.body.dataset.kinds?.split(',')[{ICE}] >= {street.known('ice')}")
-        assert seen.page.evaluate("[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)")
+        assert seen.page.evaluate(
+            "[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)"
+        )
         seen.page.evaluate(
             "() => { globalThis.dashed = []; const real = CanvasRenderingContext2D.prototype.stroke;"
             " CanvasRenderingContext2D.prototype.stroke = function () {"
@@ -84,7 +98,10 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: Runn
 def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     ice = ",".join(str(int(palette.FOUR[0][k : k + 2], 16)) for k in (1, 3, 5))
-    ends = [[float(v) for v in reversed(grid.centre(street.cells(street.PARTS["ice"])[k]))] for k in (0, 4)]
+    ends = [
+        [float(v) for v in reversed(grid.centre(street.cells(street.PARTS["ice"])[k]))]
+        for k in (0, 4)
+    ]
     with shown(page) as seen:
         for zoom in (16.0, 18.0):
             near(seen, cell_of("ice", 2), zoom)
@@ -94,7 +111,8 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
             )
             before = seen.page.evaluate(_POINTS, ice)
             seen.page.evaluate(
-                "async ends => { await gripmap.setRoute(ends); gripmap.alerts = []; gripmap.drawNow() }", ends
+                "async ends => { await gripmap.setRoute(ends); gripmap.alerts = []; gripmap.drawNow() }",
+                ends,
             )
             dots = 2 * 100  # at its ends
             assert seen.page.evaluate(_POINTS, ice) >= before - dots, zoom
@@ -128,7 +146,9 @@ def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, dr
 
 
 @pytest.mark.parametrize("width", [390, 1280, 3840])
-def test_words_stand_beside_what_they_name_on_every_screen(router: ZenohSettings, width: int) -> None:
+def test_words_stand_beside_what_they_name_on_every_screen(
+    router: ZenohSettings, width: int
+) -> None:
     size: Any = {"width": width, "height": 900}
     with page_of(router) as address, opened(address) as seen:
         seen.page.set_viewport_size(size)

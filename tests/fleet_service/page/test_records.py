@@ -31,7 +31,11 @@ def table() -> pa.Table:
     n = 1000
     fusion = Fusion(120.0)
     cells = (TILE << 14) + rng.choice(1 << 14, n, replace=False)
-    found = np.where(rng.random(n)[:, None] < 0.6, value(rng.uniform(0.1, 1.0, n)), at_least(rng.uniform(0.1, 0.4, n)))
+    found = np.where(
+        rng.random(n)[:, None] < 0.6,
+        value(rng.uniform(0.1, 1.0, n)),
+        at_least(rng.uniform(0.1, 0.4, n)),
+    )
     fusion.update(observations(np.arange(n) * 0.05, np.arange(n), found, cells))
     return cell_table(fusion, np.arange(fusion.size), START + 60 * 10**9)
 
@@ -41,26 +45,35 @@ def test_a_record_is_accurate_and_never_narrower_or_drier(table: pa.Table) -> No
     place = (table["cell"].to_numpy() & 0x3FFF) * 4 + table["sector"].to_numpy()
     row = {key: k for k, key in enumerate(place.tolist())}
     order = [row[key] for key in found["place"].tolist()]
-    told = {name: table[name].to_numpy()[order] for name in ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles")}
+    told = {
+        name: table[name].to_numpy()[order]
+        for name in ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles")
+    }
     known = found["basis"] == MEASURED
     assert 0.2 < known.mean() < 0.9
     assert np.abs(found["mu"][known] / 200 - told["mu"][known]).max() <= 0.0025 + 1e-6
     assert (found["lower"] / 200 <= told["mu_lower"] + 1e-6).all()
     assert (found["upper"] / 200 >= told["mu_upper"] - 1e-6).all()
     assert (found["slippery"] / 254 >= told["p_slippery"] - 1e-6).all()
-    assert np.array_equal(found["last"], table["last_time"].cast(pa.int64()).to_numpy()[order] // 10**9)
+    assert np.array_equal(
+        found["last"], table["last_time"].cast(pa.int64()).to_numpy()[order] // 10**9
+    )
     assert np.array_equal(found["vehicles"], told["vehicles"])
 
 
 def test_a_bound_has_no_number_to_colour_by_whoever_sent_it(table: pa.Table) -> None:
     place = table.schema.get_field_index("mu")
-    lying = table.set_column(place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.8, np.float32)))
+    lying = table.set_column(
+        place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.8, np.float32))
+    )
     found = records.of_table(lying)
     assert (found["mu"][found["basis"] == BOUND] == NO_NUMBER).all()
 
 
 @pytest.mark.parametrize("level", range(LEAST_LEVEL, CELL_LEVEL + 1))
-def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(table: pa.Table, level: int) -> None:
+def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(
+    table: pa.Table, level: int
+) -> None:
     cells = records.of_table(table)
     found = records.aggregate_worst(cells, level)
     shift = 2 * (CELL_LEVEL - level)
@@ -74,7 +87,11 @@ def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(table: pa.
             assert all(one[name] == known[name].min() for name in ("mu", "lower", "upper"))
             assert one["slippery"] == known["slippery"].max()
         else:
-            assert (one["basis"], one["mu"], one["lower"]) == (BOUND, NO_NUMBER, below["lower"].min())
+            assert (one["basis"], one["mu"], one["lower"]) == (
+                BOUND,
+                NO_NUMBER,
+                below["lower"].min(),
+            )
 
 
 def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
@@ -104,5 +121,7 @@ def test_a_cell_takes_thirteen_bytes(table: pa.Table) -> None:
     block = TileBlock(TILE, CELL_LEVEL, 3, 2, 1.5, cells).encoded()
     assert len(block) <= 16 * len(cells)
     assert HEAD.unpack_from(block) == (TILE, 3, 2, len(cells), CELL_LEVEL, 1.5)
-    assert np.array_equal(np.frombuffer(block, "<u2", len(cells), HEAD.size + 4 * len(cells)), cells["place"])
+    assert np.array_equal(
+        np.frombuffer(block, "<u2", len(cells), HEAD.size + 4 * len(cells)), cells["place"]
+    )
     assert int(grid.tile_of(CELL)) == TILE

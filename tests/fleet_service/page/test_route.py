@@ -51,7 +51,11 @@ def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
     assert all(a["to_m"] == b["from_m"] for a, b in pairwise(stretches))
     assert {one["basis"] for one in stretches} == {"unknown", "measured", "bound"}
     for one in stretches:
-        assert (one.get("mu") is not None) == (one.get("safe_speed") is not None) == (one["basis"] == "measured")
+        assert (
+            (one.get("mu") is not None)
+            == (one.get("safe_speed") is not None)
+            == (one["basis"] == "measured")
+        )
     assert found["share"]["measured"] == pytest.approx(5 / 50, abs=0.02)
     assert found["share"]["unknown"] > 0.5
     assert sum(found["share"].values()) == pytest.approx(1.0, abs=1e-3)

@@ -46,7 +46,11 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     try:
-        return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+        return (
+            answer.status,
+            {name.lower(): value for name, value in answer.getheaders()},
+            answer.read(),
+        )
     finally:
         answer.close()
         connection.close()
@@ -122,8 +126,17 @@ def test_another_language_is_one_file(tmp_path: Path) -> None:
     for name in ("texts.en.json", "texts.de.json", "texts.pt-br.json", "main.js"):
         (tmp_path / name).write_text("{}")
     files = Files(tmp_path)
-    asked = {"de-CH, en;q=.5": "de", "fr, de;q=.5": "de", "pt-BR": "pt-br", "pt": "en", "en, de": "en", "": "en"}
-    assert {one: files.texts(one) for one in asked} == {one: f"texts.{tag}.json" for one, tag in asked.items()}
+    asked = {
+        "de-CH, en;q=.5": "de",
+        "fr, de;q=.5": "de",
+        "pt-BR": "pt-br",
+        "pt": "en",
+        "en, de": "en",
+        "": "en",
+    }
+    assert {one: files.texts(one) for one in asked} == {
+        one: f"texts.{tag}.json" for one, tag in asked.items()
+    }
 
 
 def test_the_words_are_given_in_a_language_that_there_is(bare: str) -> None:
@@ -132,7 +145,9 @@ def test_the_words_are_given_in_a_language_that_there_is(bare: str) -> None:
     assert "Accept-Language" in headers["vary"]
 
 
-def test_who_connects_is_told_what_stands_and_then_what_changes(page: RunningPage, drive: Drive) -> None:
+def test_who_connects_is_told_what_stands_and_then_what_changes(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("ice")
     until(lambda: json.loads(ask(page.address, "/tiles")[2]))
     with listening(page.address) as events:
@@ -181,7 +196,9 @@ def ask_briefly(address: str) -> int:
     return answer.status
 
 
-def test_a_region_whose_service_went_is_told_and_its_cells_stay(page: RunningPage, drive: Drive) -> None:
+def test_a_region_whose_service_went_is_told_and_its_cells_stay(
+    page: RunningPage, drive: Drive
+) -> None:
     drive("dry")
     until(lambda: json.loads(ask(page.address, "/tiles")[2]))
     until(lambda: json.loads(ask(page.address, "/health")[2])["regions"])
@@ -189,7 +206,11 @@ def test_a_region_whose_service_went_is_told_and_its_cells_stay(page: RunningPag
     page.service.end()
     until(lambda: not json.loads(ask(page.address, "/health")[2])["regions"][0]["served"])
     with listening(page.address) as events:
-        beat = next(value for name, value in events if name == "beat" and value["away"] and not value["served"])
+        beat = next(
+            value
+            for name, value in events
+            if name == "beat" and value["away"] and not value["served"]
+        )
     assert beat["away"][0]["since"] <= time.time()
     assert json.loads(ask(page.address, "/tiles")[2]), "what was known is not emptiness"
 
@@ -246,20 +267,34 @@ async def _all(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 def test_metrics_are_read_by_name_and_label() -> None:
-    text = '# HELP x\ngripmap_rows_total{kind="observation"} 12.0\ngripmap_cells 5.0\nother 1\n# EOF\n'
+    text = (
+        '# HELP x\ngripmap_rows_total{kind="observation"} 12.0\ngripmap_cells 5.0\nother 1\n# EOF\n'
+    )
     assert values(text) == {"rows": {"observation": 12.0}, "cells": {"": 5.0}}
 
 
-def test_a_stranger_on_the_map_ends_nothing(page: RunningPage, session: zenoh.Session, drive: Drive) -> None:
-    for key in ("gripmap/v1/map/1202/310/201/2222", "gripmap/v1/alert/1202/310/201/2222", "gripmap/v1/map/x"):
+def test_a_stranger_on_the_map_ends_nothing(
+    page: RunningPage, session: zenoh.Session, drive: Drive
+) -> None:
+    for key in (
+        "gripmap/v1/map/1202/310/201/2222",
+        "gripmap/v1/alert/1202/310/201/2222",
+        "gripmap/v1/map/x",
+    ):
         session.put(key, b"\x00rubbish")
     drive("dry")
     until(lambda: json.loads(ask(page.address, "/tiles")[2]))
 
 
 @pytest.mark.parametrize("way", ["connect", "config"])
-def test_every_option_of_the_command_does_what_it_says(router: ZenohSettings, tmp_path: Path, way: str) -> None:
-    archive, overlay, config = tmp_path / "archive", tmp_path / "truth.parquet", tmp_path / "reader.json"
+def test_every_option_of_the_command_does_what_it_says(
+    router: ZenohSettings, tmp_path: Path, way: str
+) -> None:
+    archive, overlay, config = (
+        tmp_path / "archive",
+        tmp_path / "truth.parquet",
+        tmp_path / "reader.json",
+    )
     with running(router, archive):
         pass
     fusion = Fusion(120.0)
@@ -299,7 +334,11 @@ def test_every_option_of_the_command_does_what_it_says(router: ZenohSettings, tm
         assert address.startswith("http://127.0.0.1:")
         until(lambda: json.loads(ask(address, "/health")[2])["router"])
         assert json.loads(ask(address, "/moments")[2]) == [START // 10**9]
-        assert json.loads(ask(address, "/overlay")[2]) == {"cell": ["7"], "sector": [1], "mu": [0.3]}
+        assert json.loads(ask(address, "/overlay")[2]) == {
+            "cell": ["7"],
+            "sector": [1],
+            "mu": [0.3],
+        }
         assert json.loads(ask(address, "/health")[2])["services"] == [
             {"address": "http://127.0.0.1:1", "answers": False}
         ]

@@ -57,7 +57,13 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
 
 
 @pytest.mark.parametrize(
-    "text", ['import main from "./main.js";\n', 'import "./main.js";\n', "export default 1;\n", "export { a };\n"]
+    "text",
+    [
+        'import main from "./main.js";\n',
+        'import "./main.js";\n',
+        "export default 1;\n",
+        "export { a };\n",
+    ],
 )
 def test_what_cannot_be_joined_is_said(text: str) -> None:
     with pytest.raises(ValueError, match="cannot be joined"):
@@ -76,7 +82,9 @@ def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
     ]
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name
+)
 def test_page_modules_are_short_and_take_nothing_from_elsewhere(path: Path) -> None:
     text = path.read_text()
     assert text.count("\n") <= 400

@@ -20,14 +20,21 @@ from schemas.errors import InputError
 
 pmtiles_tile = pytest.importorskip("pmtiles.tile")
 pmtiles_writer = pytest.importorskip("pmtiles.writer")
-TILES = {(z, x, y): f"{z}/{x}/{y}".encode() for z in range(7) for x in range(2**z) for y in range(0, 2**z, 2)}
+TILES = {
+    (z, x, y): f"{z}/{x}/{y}".encode()
+    for z in range(7)
+    for x in range(2**z)
+    for y in range(0, 2**z, 2)
+}
 
 
 def write(path: Path, kind: int = 1) -> Path:
     """A PMTiles file with leaf directories, by the library of the format."""
     with path.open("wb") as file:
         writer = pmtiles_writer.Writer(file)
-        for (z, x, y), data in sorted(TILES.items(), key=lambda one: pmtiles_tile.zxy_to_tileid(*one[0])):
+        for (z, x, y), data in sorted(
+            TILES.items(), key=lambda one: pmtiles_tile.zxy_to_tileid(*one[0])
+        ):
             writer.write_tile(pmtiles_tile.zxy_to_tileid(z, x, y), gzip.compress(data, mtime=0))
         head = {
             "tile_type": pmtiles_tile.TileType(kind),

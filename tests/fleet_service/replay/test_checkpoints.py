@@ -35,7 +35,9 @@ DAY_S = 86_400.0
 
 def icy(vehicle: int, seq: int, mu: float) -> Message:
     one = batch(f"sim-{vehicle:03}", seq, time.time_ns() - SECOND, [mu])
-    return Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+    return Message(
+        Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
+    )
 
 
 def message(one: Batch) -> Message:
@@ -84,7 +86,9 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return rows
 
 
-def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, replayed: list[int]) -> None:
+def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
+    tmp_path: Path, replayed: list[int]
+) -> None:
     sent = [icy(k % 6, 1 + k // 6, 0.2 if k % 5 else 0.8) for k in range(60)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 40, 4):
@@ -116,20 +120,28 @@ def known(engine: Engine) -> dict[str, NDArray[Any]]:
     """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
     fusion, rows = engine.state.fusion, engine.state.fusion.store.state.live
     order = np.lexsort((fusion.sector, fusion.cell))
-    columns = {name: rows.cells[name][order] for name in CELL.names or () if name not in ("window", "reporters")}
+    columns = {
+        name: rows.cells[name][order]
+        for name in CELL.names or ()
+        if name not in ("window", "reporters")
+    }
     times = {"epoch": np.array([fusion.epoch]), "newest": np.array([engine.state.streams.newest])}
     return {"belief": rows.belief[order], **columns, **times}
 
 
 @pytest.mark.parametrize("oldest_s", [30 * DAY_S, DAY_S])
-def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(tmp_path: Path, oldest_s: float) -> None:
+def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
+    tmp_path: Path, oldest_s: float
+) -> None:
     """Restart after a compaction that joined old and new rows in one file."""
     config, now = ServiceConfig(oldest_s=oldest_s), time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
     with closing(Engine(config, tmp_path)) as engine:
         for vehicle, at in (("sim-001", old), ("sim-002", now)):
             one = batch(vehicle, 1, at, [0.8])
-            sent = Message(Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+            sent = Message(
+                Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
+            )
             engine.intake.ingest([sent], at + SECOND)
             engine.settlement.flush()
         keep(engine, tmp_path)
@@ -156,7 +168,9 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
     sent.sort(key=lambda pair: pair[0])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 120, 8):
-            engine.intake.ingest([message(one) for _, one in sent[k : k + 8]], now + (k + 9) * SECOND)
+            engine.intake.ingest(
+                [message(one) for _, one in sent[k : k + 8]], now + (k + 9) * SECOND
+            )
             engine.settlement.flush()
             if k == 56:
                 compact(tmp_path)
@@ -168,7 +182,10 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
         assert len(checkpoints.newest(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             found = known(again)
-            assert (again.seen, again.counts["checkpoints_refused"]) == (again.state.streams.newest, 0)
+            assert (again.seen, again.counts["checkpoints_refused"]) == (
+                again.state.streams.newest,
+                0,
+            )
         assert [name for name in live if not np.array_equal(found[name], live[name])] == []
         if kept:
             shutil.rmtree(checkpoints.newest(tmp_path)[0])
@@ -178,7 +195,9 @@ def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
-        engine.intake.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
+        engine.intake.ingest(
+            [icy(k, 2, 0.5) for k in range(4)], time.time_ns()
+        )  # dies before its segment
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 4
         again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
@@ -186,7 +205,9 @@ def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", ["truncate", "remove", "flip"])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(tmp_path: Path, harm: str) -> None:
+def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
+    tmp_path: Path, harm: str
+) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in (1, 2, 3):
             engine.intake.ingest([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
@@ -234,7 +255,10 @@ def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Pat
             engine.intake.ingest([icy(k, seq, 0.15) for k in range(6)], time.time_ns())
             engine.settlement.flush()
         keep_alerts, at = engine.alerts.count, time.time_ns()
-        running, visits = beliefs(engine, at), engine.state.fusion.live.visits[: engine.state.fusion.size].sum()
+        running, visits = (
+            beliefs(engine, at),
+            engine.state.fusion.live.visits[: engine.state.fusion.size].sum(),
+        )
         compact(tmp_path)
     assert keep_alerts > 0
     with closing(Engine(ServiceConfig(), tmp_path)) as again:

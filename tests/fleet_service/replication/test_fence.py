@@ -17,7 +17,9 @@ from tests.fleet_service.replication.test_lease import Machine
 from tests.standbys import restored
 
 
-def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: BucketServer, tmp_path: Path) -> None:
+def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     month, known = "2026-11", dict[int, int]()
 
     def meets(one: Machine, pseudonym: int) -> None:
@@ -50,7 +52,10 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: Bucke
     meets(one, 5)  # the frozen one wakes
     join_daily_files(one.root)
     one.copy.upload_segments([])
-    one.copy._may, one.copy._alone = lambda: True, None  # as if it had been frozen right behind its looks
+    one.copy._may, one.copy._alone = (
+        lambda: True,
+        None,
+    )  # as if it had been frozen right behind its looks
     one.copy.sync()
     found = restored(tmp_path / "new", bucket)
     held = vehicle_ids.read(found / "keys")

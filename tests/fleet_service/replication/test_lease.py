@@ -73,7 +73,10 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         if how == "frozen":
             one.part.send(signal.SIGCONT)
         one.to_router.mend()
-        if how not in {"killed", "stopped"}:  # cut from the bucket, it hears of its successor by the token
+        if how not in {
+            "killed",
+            "stopped",
+        }:  # cut from the bucket, it hears of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
             assert one.said("lease lost to another service")
         one.to_bucket.mend()
@@ -114,7 +117,11 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path
 ) -> None:
     fleet, sent = Fleet(session), reports(0.8, 1, BATCHES)
-    with hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (one, two, three):
+    with hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (
+        one,
+        two,
+        three,
+    ):
         one.part.start()
         one.part.line_with("ready: ")
         for host in (two, three):
@@ -136,13 +143,22 @@ class Machine:
     """A folder whose service is no process, so that it can be stopped between any two steps."""
 
     def __init__(
-        self, root: Path, bucket: BucketServer, say: Callable[[str], None] = print, *, standby: bool = True
+        self,
+        root: Path,
+        bucket: BucketServer,
+        say: Callable[[str], None] = print,
+        *,
+        standby: bool = True,
     ) -> None:
         root.mkdir(exist_ok=True)
         self.root = root
         told = {"standby": standby, "lease_s": LEASE_S, "archive": bucket.settings}
         self.config = ServiceConfig.model_validate(told)
-        there = (lambda: True, lambda _: False, lambda: None)  # it reaches a router, and no token stands
+        there = (
+            lambda: True,
+            lambda _: False,
+            lambda: None,
+        )  # it reaches a router, and no token stands
         signs = there if standby else None
         held = acquire(self.config, root, threading.Event(), say, signs)
         assert held is not None
@@ -174,7 +190,9 @@ def acknowledges(one: Machine) -> bool:
 
 
 @pytest.mark.campaign
-def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketServer, tmp_path: Path) -> None:
+def test_what_a_frozen_service_had_under_way_counts_for_nothing(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     one = Machine(tmp_path / "one", bucket)
     for seed in range(3):
         one.write(seed)
@@ -211,7 +229,9 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketSe
     back.close()
 
 
-def test_folder_served_without_its_bucket_is_not_synchronised(bucket: BucketServer, tmp_path: Path) -> None:
+def test_folder_served_without_its_bucket_is_not_synchronised(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
     one.close()
@@ -253,7 +273,9 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     two.close()
     lines: list[str] = []
     back: list[Machine] = []
-    start = threading.Thread(target=lambda: back.append(Machine(one.root, bucket, say=lines.append)))
+    start = threading.Thread(
+        target=lambda: back.append(Machine(one.root, bucket, say=lines.append))
+    )
     start.start()
     until(lambda: any("is being compacted" in line for line in lines))
     goes_on.set()
@@ -265,13 +287,17 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     back[0].close()
 
 
-def test_start_without_bucket_ends_or_waits_as_a_standby(bucket: BucketServer, tmp_path: Path) -> None:
+def test_start_without_bucket_ends_or_waits_as_a_standby(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     bucket.stop()
     with pytest.raises(InputError, match="cannot be used .* see that it is reached"):
         Machine(tmp_path / "one", bucket, standby=False)
     lines: list[str] = []
     made: list[Machine] = []
-    start = threading.Thread(target=lambda: made.append(Machine(tmp_path / "two", bucket, lines.append)), daemon=True)
+    start = threading.Thread(
+        target=lambda: made.append(Machine(tmp_path / "two", bucket, lines.append)), daemon=True
+    )
     start.start()
     until(lambda: any(line.startswith("standby: the copy cannot be reached") for line in lines))
     bucket.start()
@@ -301,12 +327,16 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
         assert fetch(f"{address}/healthz")[0] == 200
         holder.close()
         two.part.line_with("ready: ")
-        lines = fetch(f"{two.part.line_with('ready: ').rpartition(', ')[2]}/metrics")[2].splitlines()
+        lines = fetch(f"{two.part.line_with('ready: ').rpartition(', ')[2]}/metrics")[
+            2
+        ].splitlines()
         assert 'gripmap_serves{regions="*/*/*"} 1.0' in lines
         assert two.part.stop() == 0
 
 
-def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(bucket: BucketServer, tmp_path: Path) -> None:
+def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
     one = Machine(tmp_path / "one", bucket)
     with pytest.raises(InputError, match="is served by shard-0"):
         Machine(tmp_path / "two", bucket, standby=False)
@@ -333,7 +363,9 @@ def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
     assert taken == [True, False, False]
 
 
-@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended")
+@pytest.mark.skipif(
+    not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended"
+)
 @pytest.mark.parametrize("lease_s", [4.0, 40.0])
 def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float

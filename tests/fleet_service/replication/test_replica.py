@@ -63,7 +63,9 @@ def filled(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> S
     return log
 
 
-def test_what_is_settled_is_in_the_bucket_byte_for_byte(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+def test_what_is_settled_is_in_the_bucket_byte_for_byte(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
     root = tmp_path / "archive"
     with closing(filled(root, make(root))):
         assert len(there(bucket)) == 2 * 3 + 1
@@ -81,7 +83,9 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
         with pytest.raises(CopyError):
             log.flush()
         log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 8), [8])
-        with pytest.raises(CopyError, match="is tried again"):  # at once, and nothing was asked of the network
+        with pytest.raises(
+            CopyError, match="is tried again"
+        ):  # at once, and nothing was asked of the network
             log.flush()
         assert (copy.failures, log.unsettled, log.rows) == (1, 2, 0)
         assert copy.away_s > 0
@@ -104,7 +108,9 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
     assert len(identities(root, Kind.OBSERVATION)) == 5 * 5
 
 
-def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
     root = tmp_path / "archive"
     copy = make(root)
     with closing(filled(root, None)):
@@ -117,7 +123,9 @@ def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(bucket: BucketServer
             copy.upload_segments([others[0]])
 
 
-def test_the_copy_follows_compaction_and_retention(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+def test_the_copy_follows_compaction_and_retention(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
     root = tmp_path / "archive"
     copy = make(root)
     with closing(filled(root, copy)):
@@ -146,7 +154,9 @@ def test_segment_compacted_before_its_upload_is_settled_by_the_result(
         assert any(name.startswith("observations/") for name in there(bucket))
 
 
-def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+def test_an_empty_disk_has_all_of_it_again(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
     root, new = tmp_path / "archive", tmp_path / "new"
     copy = make(root)
     with closing(filled(root, copy)):
@@ -154,7 +164,9 @@ def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp
         copy.sync()
     with closing(filled(root, copy, range(3, 5))):
         pass
-    (half := bucket.place("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(parents=True)
+    (half := bucket.place("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(
+        parents=True
+    )
     half.write_bytes(b"half a checkpoint")
     make(new)
     assert held(new) == held(root)
@@ -163,7 +175,9 @@ def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp
     assert last_copy_url(new) == bucket.url
 
 
-def test_what_was_cut_off_is_made_good_at_the_next_start(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+def test_what_was_cut_off_is_made_good_at_the_next_start(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
     root = tmp_path / "archive"
     copy = make(root)
     with closing(filled(root, copy)):
@@ -197,13 +211,18 @@ def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
 ) -> None:
     monkeypatch.setattr(replica, "SLOW_S", 1.0)
     bucket.away(kind)
-    with closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy, pytest.raises(InputError) as told:
+    with (
+        closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy,
+        pytest.raises(InputError) as told,
+    ):
         copy.begin(NAME)
     assert told.value.field == "archive.copy"
     assert SECRET not in str(told.value)
 
 
-def test_settings_that_cannot_be_used_say_which_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_that_cannot_be_used_say_which_and_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
     for url, store, field in [
         ("file:///elsewhere", {}, "archive.copy"),
@@ -242,7 +261,10 @@ def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) ->
     settings = {"path": "here", "copy": "s3://b/c", "store": {"secret_access_key": SECRET}}
     path.write_text(json.dumps({"archive": settings}))
     config = load(path, ServiceConfig)
-    assert (config.archive.second, config.archive.options) == ("s3://b/c", {"secret_access_key": SECRET})
+    assert (config.archive.second, config.archive.options) == (
+        "s3://b/c",
+        {"secret_access_key": SECRET},
+    )
     assert SECRET not in repr(config)
     again = ServiceConfig.model_validate_json(config.model_dump_json())
     assert again.archive.second == "s3://b/c", "what is written can be read"

@@ -10,7 +10,16 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.store.records import ICE
 from fleet_service.serve.alerts import LIKELY, RAISE_ABOVE, Alerts
 from schemas import grid
-from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, slippery, value
+from tests.fleet_service.examples import (
+    CELL,
+    SECOND,
+    START,
+    at_least,
+    belief,
+    observations,
+    slippery,
+    value,
+)
 
 HOUR = 3600 * SECOND
 COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
@@ -37,21 +46,34 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
     fusion, cells = Fusion(120.0), 64 * np.arange(40)  # too far from each other to tell
     for vehicle in range(3):
         fusion.update(
-            observations(20.0 * vehicle + cells / 256, cells * 9 + vehicle, value(cells / 2560 + 0.1), CELL + cells)
+            observations(
+                20.0 * vehicle + cells / 256,
+                cells * 9 + vehicle,
+                value(cells / 2560 + 0.1),
+                CELL + cells,
+            )
         )
     alerts, slots = Alerts(fusion), np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
-    known = {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
+    known = {
+        int(c): round(float(p), 2)
+        for c, p in zip(fusion.cell, believed, strict=True)
+        if p > RAISE_ABOVE
+    }
     assert told.items() <= known.items()
-    assert {cell for cell, p in known.items() if p > 0.95} <= set(told)  # evidence below 1 nat is no witness
+    assert {cell for cell, p in known.items() if p > 0.95} <= set(
+        told
+    )  # evidence below 1 nat is no witness
     assert 0 < len(told) < fusion.size
 
 
 def test_one_vehicle_with_many_unexcited_others_raises_nothing() -> None:
     fusion, alerts, raised = icy([1] * 20)
-    updated = fusion.update(observations(300.0 + np.arange(20), np.arange(2, 22), at_least(np.full(20, 0.1))))
+    updated = fusion.update(
+        observations(300.0 + np.arange(20), np.arange(2, 22), at_least(np.full(20, 0.1)))
+    )
     assert not alerts.update(updated.slots)
     assert not any(raised)
     assert fusion.live.vehicles[0] == 21
@@ -61,7 +83,11 @@ def test_an_alert_that_nobody_confirms_ends_by_itself_with_the_reason() -> None:
     _, alerts, _ = icy([1, 2, 3])
     assert not alerts.expire(START + HOUR // 4)
     (ended,) = alerts.expire(START + 6 * HOUR)
-    assert (ended.cell, ended.raised, ended.reason) == (CELL, False, "no visit has confirmed it for too long")
+    assert (ended.cell, ended.raised, ended.reason) == (
+        CELL,
+        False,
+        "no visit has confirmed it for too long",
+    )
     assert not alerts.expire(START + 7 * HOUR)
 
 
@@ -75,7 +101,9 @@ def test_between_the_two_limits_an_alert_stays() -> None:
 def test_old_ice_does_not_corroborate_new_ice() -> None:
     fusion, alerts, _ = icy([1, 2])
     alerts.expire(START + 6 * HOUR)
-    updated = fusion.update(observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2])))
+    updated = fusion.update(
+        observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2]))
+    )
     assert not alerts.update(updated.slots)
 
 
@@ -88,7 +116,9 @@ def called(
     under = []
     for k, vehicle in enumerate([*vehicles, *others]):
         later = k >= len(vehicles)  # by then the first ones are known
-        updated = fusion.update(observations([20.0 * k + wait * later], [vehicle], value([then if later else mu])))
+        updated = fusion.update(
+            observations([20.0 * k + wait * later], [vehicle], value([then if later else mu]))
+        )
         alerts.update(updated.slots)
         under.append(bool(alerts.slots))
     return fusion, under[len(vehicles) :]
@@ -105,17 +135,31 @@ def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> No
     assert under == [False, False, False, True, True, True]
 
 
-@pytest.mark.parametrize(("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)])
-def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(drivers: int, found: int, raised: bool) -> None:
-    fusion, (before, here, behind) = Fusion(120.0), grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
+@pytest.mark.parametrize(
+    ("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)]
+)
+def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
+    drivers: int, found: int, raised: bool
+) -> None:
+    fusion, (before, here, behind) = (
+        Fusion(120.0),
+        grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist(),
+    )
     for cell in (before, here, behind):  # of a road where more grip was used than ice has
         seconds = 20.0 * np.arange(drivers)
-        fusion.update(observations(seconds, np.arange(drivers), at_least(np.full(drivers, 0.5)), cell))
+        fusion.update(
+            observations(seconds, np.arange(drivers), at_least(np.full(drivers, 0.5)), cell)
+        )
     for cell, vehicles in ((before, 4), (behind, 4), (here, found)):
         seconds = 150.0 + 20.0 * np.arange(vehicles)
-        fusion.update(observations(seconds, 50 + np.arange(vehicles), value([0.2] * vehicles), cell))
+        fusion.update(
+            observations(seconds, 50 + np.arange(vehicles), value([0.2] * vehicles), cell)
+        )
     slots = fusion.slots_of(np.array([here]), np.array([0]))
-    own, believed = float(fusion.slippery(slots)[0]), float(fusion.believed(slots)[0] @ SLIPPERY_SHARE)
+    own, believed = (
+        float(fusion.slippery(slots)[0]),
+        float(fusion.believed(slots)[0] @ SLIPPERY_SHARE),
+    )
     assert own < 0.5
     assert believed > RAISE_ABOVE or not found
     assert bool(Alerts(fusion).update(slots)) is raised is (own > LIKELY and found == 2)
@@ -124,15 +168,21 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(drivers: i
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
     for used, stands in ((0.7, False), (0.5, True)):
         fusion, alerts, _ = icy([1, 2, 3])
-        updated = fusion.update(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))  # the belief turns
-        later = fusion.update(observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used))))
+        updated = fusion.update(
+            observations([100.0, 101.0], [4, 5], value([0.85, 0.85]))
+        )  # the belief turns
+        later = fusion.update(
+            observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used)))
+        )
         alerts.update(updated.slots)
         alerts.update(later.slots)
         assert bool(alerts.slots) is stands
 
 
 @pytest.mark.parametrize(("wait", "needed"), [(400.0, 5), (700.0, 4)])
-def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(wait: float, needed: int) -> None:
+def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(
+    wait: float, needed: int
+) -> None:
     fusion, under = called(0.2, range(20), 0.85, range(5, 11), wait)
     assert slippery(belief(fusion)) < 0.05
     assert under == [True] * (needed - 1) + [False] * (7 - needed)

@@ -15,9 +15,18 @@ CELLS = [int(grid.cell_of(LATITUDE, LONGITUDE + 0.05 * k)) for k in range(6)]
 
 def test_each_vehicle_supports_alerts_in_few_areas() -> None:
     roads = IdleRoads()
-    assert [roads.admit(cell, [1, 2], START, 2) for cell in CELLS] == [True, True, False, False, False, False]
+    assert [roads.admit(cell, [1, 2], START, 2) for cell in CELLS] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
     assert roads.admit(CELLS[0], [1, 2], START + SECOND, 2), "within an area of before"
-    assert not roads.admit(CELLS[2], [1, 3], START, 2), "a new partner does not renew the first vehicle"
+    assert not roads.admit(CELLS[2], [1, 3], START, 2), (
+        "a new partner does not renew the first vehicle"
+    )
     assert roads.admit(CELLS[2], [3, 4], START, 2)
     assert roads.admit(CELLS[3], [1, 2], START + AREA_NS, 2)
 

@@ -23,7 +23,9 @@ def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellV
     them."""
     fusion = Fusion(120.0)
     for place, mu in visited.items():
-        o = observations(np.arange(3) * 2.0, np.arange(3), value(np.full(3, mu)), cell=int(EAST[place]))
+        o = observations(
+            np.arange(3) * 2.0, np.arange(3), value(np.full(3, mu)), cell=int(EAST[place])
+        )
         fusion.update(o)
     now = int(fusion.live.time[: fusion.size].max())
     slots = np.arange(fusion.size)
@@ -35,7 +37,9 @@ def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellV
 def widths(cells: CellView) -> dict[int, float]:
     """Width of the interval by place in the row."""
     lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
-    return {int(np.flatnonzero(c == EAST)[0]): w for c, w in zip(cells.cell, upper - lower, strict=True)}
+    return {
+        int(np.flatnonzero(c == EAST)[0]): w for c, w in zip(cells.cell, upper - lower, strict=True)
+    }
 
 
 def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
@@ -52,7 +56,9 @@ def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
 
 def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
     cells = borrowed({5: 0.2, 12: 0.9})
-    found = {int(np.flatnonzero(c == EAST)[0]): b for c, b in zip(cells.cell, cells.belief, strict=True)}
+    found = {
+        int(np.flatnonzero(c == EAST)[0]): b for c, b in zip(cells.cell, cells.belief, strict=True)
+    }
     between = found[8]
     third = np.abs(mugrid.CENTRES - 0.55) < 0.1
     assert between[third].max() <= mugrid.PRIOR[0]

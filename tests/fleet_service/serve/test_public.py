@@ -24,10 +24,22 @@ from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, START, batch, key, observations, value
+from tests.fleet_service.examples import (
+    CELL,
+    LATITUDE,
+    LONGITUDE,
+    SECOND,
+    START,
+    batch,
+    key,
+    observations,
+    value,
+)
 
 Start = Callable[[int], Engine]
-MORE = tuple(f"sim-01{k}" for k in range(5))  # two vehicles may share a bit of 64, three of five never in practice
+MORE = tuple(
+    f"sim-01{k}" for k in range(5)
+)  # two vehicles may share a bit of 64, three of five never in practice
 
 
 @pytest.fixture
@@ -47,15 +59,22 @@ def start(tmp_path: Path) -> Iterator[Start]:
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
     """One visit of each."""
     now = time.time_ns() if now is None else now
-    sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "") for n in names]
+    sent = [
+        Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "")
+        for n in names
+    ]
     engine.intake.ingest(sent, now)
     engine.settlement.flush()
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
     """Cells of an answer."""
-    tiles = engine.queries.answer(query.parse(parameters), lambda _: True, time.time_ns() if now is None else now)
-    return [row for _, payload in tiles for row in pa.ipc.open_stream(payload).read_all().to_pylist()]
+    tiles = engine.queries.answer(
+        query.parse(parameters), lambda _: True, time.time_ns() if now is None else now
+    )
+    return [
+        row for _, payload in tiles for row in pa.ipc.open_stream(payload).read_all().to_pylist()
+    ]
 
 
 def test_a_cell_is_public_from_k_vehicles_on_in_answers_and_tiles(start: Start) -> None:
@@ -104,7 +123,15 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
     counts = np.arange(1, 4000)
     zeros = np.zeros(len(counts), np.int64)
     cells = CellView(
-        zeros, zeros, np.zeros((len(counts), 32)), zeros.astype(np.float32), counts, counts, zeros, zeros, zeros > 0
+        zeros,
+        zeros,
+        np.zeros((len(counts), 32)),
+        zeros.astype(np.float32),
+        counts,
+        counts,
+        zeros,
+        zeros,
+        zeros > 0,
     )
     seen = coarsen(cells)
     assert (seen.vehicles <= counts).all()
@@ -118,7 +145,12 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     names = [f"sim-{k:03}" for k in range(6)]
     route = f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}"
     hear(engine, *names, now=day)
-    assert len(rows(engine, day)) == len(rows(engine, day, route=route)) == engine.queries.whole_map(day).num_rows == 1
+    assert (
+        len(rows(engine, day))
+        == len(rows(engine, day, route=route))
+        == engine.queries.whole_map(day).num_rows
+        == 1
+    )
     night = day + 18 * 3600 * SECOND
     hear(engine, "sim-007", now=night)
     engine.queries.changed_tiles(day)
@@ -134,7 +166,9 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     assert not rows(engine, night, at=f"{hour + timedelta(hours=17):%Y-%m-%dT%H:%M:%SZ}")
 
 
-def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(start: Start, tmp_path: Path) -> None:
+def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
+    start: Start, tmp_path: Path
+) -> None:
     engine = start(3)
     hear(engine, *MORE)
     engine.settlement.flush()
@@ -176,7 +210,10 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
     assert visitors.count(slots, now + 2 * PART_NS)[0] == 0
     again = Visitors.of(fusion, visitors.columns())
     assert again.count(slots, now).tolist() == visitors.count(slots, now).tolist()
-    assert Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist() == []
+    assert (
+        Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist()
+        == []
+    )
 
 
 def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start) -> None:
@@ -184,7 +221,10 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
     names, alone = [f"sim-{k:03}" for k in range(4)], LATITUDE - 0.002
     old = now - 8 * 86_400 * SECOND
     where: dict[str, Any] = {"latitude": [alone], "cell": [grid.cell_of(alone, LONGITUDE)]}
-    sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 9, old, [0.8], **where)), "") for n in names]
+    sent = [
+        Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 9, old, [0.8], **where)), "")
+        for n in names
+    ]
     engine.intake.ingest(sent, old)
     hear(engine, *names, now=now)
     hear(engine, *(f"sim-1{k:02}" for k in range(4)), now=now + 300 * SECOND)

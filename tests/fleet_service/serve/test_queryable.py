@@ -26,12 +26,20 @@ from schemas.query import Format, MapQuery
 from tests.fleet_service.examples import TILE
 from tests.waiting import matched, until
 
-FAILURES = (pa.ArrowInvalid("a file is no Parquet"), OSError("the disk is gone"), ValueError("something else"))
+FAILURES = (
+    pa.ArrowInvalid("a file is no Parquet"),
+    OSError("the disk is gone"),
+    ValueError("something else"),
+)
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
     """All replies, errors too, in the order of the alphabet: Zenoh has none."""
-    return sorted(part.payload.to_string() for reply in session.get(selector) if (part := reply.ok or reply.err))
+    return sorted(
+        part.payload.to_string()
+        for reply in session.get(selector)
+        if (part := reply.ok or reply.err)
+    )
 
 
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
@@ -41,7 +49,9 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
 ) -> None:
     turns: list[int] = []
 
-    def answer(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+    def answer(
+        query: MapQuery, wanted: Callable[[int], bool], only: int | None
+    ) -> Iterator[tuple[int, bytes]]:
         turns.append(1)
         yield TILE, b"a tile"
         if len(turns) == 1:
@@ -55,8 +65,13 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
     querier = session.declare_querier(key)
     matched(querier)
     first = texts(session, key + parameters)
-    assert first == ["a tile", f"query: could not be answered ({type(failure).__name__}); ask again later"]
-    until(lambda: texts(session, key + parameters) == ["a tile"])  # the past before is let go a moment after its answer
+    assert first == [
+        "a tile",
+        f"query: could not be answered ({type(failure).__name__}); ask again later",
+    ]
+    until(
+        lambda: texts(session, key + parameters) == ["a tile"]
+    )  # the past before is let go a moment after its answer
     assert counts["answer_failures"] == 1
     querier.undeclare()
     queryable.undeclare()
@@ -80,22 +95,30 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
     queryable.undeclare()
 
 
-def nothing(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+def nothing(
+    query: MapQuery, wanted: Callable[[int], bool], only: int | None
+) -> Iterator[tuple[int, bytes]]:
     """An answer without tiles."""
     return iter(())
 
 
 @pytest.mark.parametrize(
-    "much", [AnswerSize(LIGHT + 1, 1), AnswerSize(1, LIGHT // TILE_COST + 1)], ids=["cells", "tiles"]
+    "much",
+    [AnswerSize(LIGHT + 1, 1), AnswerSize(1, LIGHT // TILE_COST + 1)],
+    ids=["cells", "tiles"],
 )
-def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.Session, much: AnswerSize) -> None:
+def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
+    session: zenoh.Session, much: AnswerSize
+) -> None:
     """The heavy answer does not end before the light one has come; many tiles of a cell each are heavy too."""
     key, counts, light_came = keys.map_key(TILE), Counter[str](), threading.Event()
 
     def size(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
         return much if query.min_vehicles == 2 else AnswerSize(1, 1)
 
-    def answer(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+    def answer(
+        query: MapQuery, wanted: Callable[[int], bool], only: int | None
+    ) -> Iterator[tuple[int, bytes]]:
         if query.min_vehicles == 2:
             assert light_came.wait(30.0)
         yield TILE, b"a tile"
@@ -129,7 +152,9 @@ class Half:
     def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
         return AnswerSize(COSTS[query.min_vehicles], 0)
 
-    def answer(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+    def answer(
+        self, query: MapQuery, wanted: Callable[[int], bool], only: int | None
+    ) -> Iterator[tuple[int, bytes]]:
         yield TILE, b"first"
         while query.min_vehicles == 2 and not self.go.is_set():
             self.begun.release()
@@ -172,11 +197,18 @@ def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> No
 
 
 def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) -> None:
-    large = [half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0) for _ in range(WAITING + 2)]
+    large = [
+        half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0) for _ in range(WAITING + 2)
+    ]
     until(lambda: half.counts["refused_queries"] >= 1)
     assert half.ask(3) == ["last"]
     half.go.set()
-    answers = [sorted(part.payload.to_string() for r in one if (part := r.ok or r.err)) for one in large]
+    answers = [
+        sorted(part.payload.to_string() for r in one if (part := r.ok or r.err)) for one in large
+    ]
     refused = [answer for answer in answers if "last" not in answer]
     assert len(refused) == half.counts["refused_queries"] < len(large)
-    assert all("query: too many ask for as much; ask again later, or for less" in answer for answer in refused)
+    assert all(
+        "query: too many ask for as much; ask again later, or for less" in answer
+        for answer in refused
+    )

@@ -22,7 +22,9 @@ NOW = START + 60 * SECOND
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
     """One visit, noted as the engine does."""
-    state.mark_changed(state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots)
+    state.mark_changed(
+        state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots
+    )
 
 
 @pytest.fixture
@@ -73,7 +75,9 @@ def test_cells_of_too_few_vehicles_are_not_in_a_tile(state: MapState) -> None:
     assert vehicles(made, NOW) == [2]
 
 
-def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(state: MapState, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(
+    state: MapState, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = TileCache(state, nullcontext(), 1)
     one = len(made.shown(TILE, NOW).payload)
     monkeypatch.setattr(tile_cache, "KEPT_BYTES", 2 * one)
@@ -103,7 +107,10 @@ def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
     west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
     lengths = set()
     for _ in range(200):
-        x, y = np.sort(rng.uniform(west - 0.02, east + 0.02, 2)), np.sort(rng.uniform(south - 0.01, north + 0.01, 2))
+        x, y = (
+            np.sort(rng.uniform(west - 0.02, east + 0.02, 2)),
+            np.sort(rng.uniform(south - 0.01, north + 0.01, 2)),
+        )
         query = MapQuery(bbox=(x[0], y[0], x[1], y[1]), min_vehicles=int(rng.integers(1, 3)))
         wanted = {
             cell["cell"] for cell in cells

@@ -13,7 +13,12 @@ class Made:
     """Tiles that change, a clock, and what was put when."""
 
     def __init__(self) -> None:
-        self.now, self.changed, self.puts, self.counts = 100.0, set[int](), list[tuple[int, float]](), Counter[str]()
+        self.now, self.changed, self.puts, self.counts = (
+            100.0,
+            set[int](),
+            list[tuple[int, float]](),
+            Counter[str](),
+        )
         self.rounds = TileRounds(1.0, self.take, self.put, self.counts, lambda: self.now)
 
     def take(self) -> list[int]:
@@ -43,7 +48,9 @@ def test_a_turn_puts_at_most_its_share_and_every_tile_has_its_turn() -> None:
 
 def test_skipped_tile_rounds_are_counted_and_changes_come_in_the_next() -> None:
     made = Made()
-    made.changed = set(range(300))  # three seconds of tiles alone, and as much of the rest of the turns
+    made.changed = set(
+        range(300)
+    )  # three seconds of tiles alone, and as much of the rest of the turns
     while len(made.puts) < 300:
         made.turn(SHARE_S)
         made.changed |= {3, 5}

@@ -33,7 +33,14 @@ class Machine:
 
     def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
         archive = {"path": str(root), **bucket.settings}
-        told = {"name": name, "zenoh": router, "standby": True, "lease_s": 10.0, "archive": archive, "segment_s": 0.1}
+        told = {
+            "name": name,
+            "zenoh": router,
+            "standby": True,
+            "lease_s": 10.0,
+            "archive": archive,
+            "segment_s": 0.1,
+        }
         self._config, self._root = ServiceConfig.model_validate(told), root
         self.lines: list[str] = []
         self.stop = threading.Event()
@@ -62,7 +69,9 @@ class Machine:
 
 
 @contextmanager
-def machines(router: ZenohSettings, bucket: BucketServer, folder: Path, *names: str) -> Iterator[list[Machine]]:
+def machines(
+    router: ZenohSettings, bucket: BucketServer, folder: Path, *names: str
+) -> Iterator[list[Machine]]:
     with ExitStack() as stack:
         made = [Machine(name, router, bucket, folder / name) for name in names]
         for one in made:
@@ -116,13 +125,18 @@ def test_a_region_stays_where_nobody_stands_by_for_it(
     with machines(router, bucket, tmp_path, "north-a") as (one,):
         one.start("ready: ")
         assert main([*words, "north-b"]) == 2
-        assert "error: to: no 'north-b' stands by, not for */*/*; start it with --standby" in capsys.readouterr().err
+        assert (
+            "error: to: no 'north-b' stands by, not for */*/*; start it with --standby"
+            in capsys.readouterr().err
+        )
         assert not one.said("handing over: ")
         one.stop.set()
         one.end()
 
 
-def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(bucket: BucketServer) -> None:
+def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
+    bucket: BucketServer,
+) -> None:
     store = ObjectBucket(bucket.url, bucket.store, 5.0)
     lease_s = 3.0
     one, two, three = (Lease(name, store, name, lease_s) for name in ("one", "two", "three"))

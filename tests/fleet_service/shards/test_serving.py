@@ -37,8 +37,19 @@ REGIONS = grid.interleave(np.array([COLUMN - 1, COLUMN, COLUMN + 1]), np.array([
 NAMES = [keys.chunks(region, grid.REGION_ZOOM) for region in REGIONS]
 WEST, SOUTH, EAST, NORTH = (float(side) for side in grid.bounds(MIDDLE, grid.REGION_ZOOM))
 LATITUDE = (SOUTH + NORTH) / 2
-ROUTE = "|".join(f"{longitude:.6f},{LATITUDE:.6f}" for longitude in (EAST + 0.03, EAST - 0.03, WEST - 0.03))
-LONGITUDES = (WEST - 0.02, WEST - 0.01, WEST + 0.01, WEST + 0.02, EAST - 0.02, EAST - 0.01, EAST + 0.01, EAST + 0.02)
+ROUTE = "|".join(
+    f"{longitude:.6f},{LATITUDE:.6f}" for longitude in (EAST + 0.03, EAST - 0.03, WEST - 0.03)
+)
+LONGITUDES = (
+    WEST - 0.02,
+    WEST - 0.01,
+    WEST + 0.01,
+    WEST + 0.02,
+    EAST - 0.02,
+    EAST - 0.01,
+    EAST + 0.01,
+    EAST + 0.02,
+)
 CARS = 3
 
 
@@ -64,7 +75,9 @@ def visits(vehicle: str) -> list[Batch]:
 def three(router: ZenohSettings, folder: Path) -> Iterator[list[Running]]:
     with ExitStack() as stack:
         yield [
-            stack.enter_context(running(router, folder / f"shard-{i}", name=f"shard-{i}", regions=[name]))
+            stack.enter_context(
+                running(router, folder / f"shard-{i}", name=f"shard-{i}", regions=[name])
+            )
             for i, name in enumerate(NAMES)
         ]
 
@@ -82,7 +95,10 @@ def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
 
 
 def test_answers_over_three_services_are_ordered_and_name_gaps(
-    router: ZenohSettings, session: zenoh.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    router: ZenohSettings,
+    session: zenoh.Session,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     box = f"{WEST - 0.05},{SOUTH},{EAST + 0.05},{NORTH}"
     dead = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
@@ -110,7 +126,12 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
             until(lambda: any(json.loads(line)["event"] == "watching" for line in lines))
             services[1].end()
             silent = 0
-            asked = [{"bbox": box}, {"bbox": dead}, {"route": ROUTE}, {"bbox": dead, "format": "json"}]
+            asked = [
+                {"bbox": box},
+                {"bbox": dead},
+                {"route": ROUTE},
+                {"bbox": dead, "format": "json"},
+            ]
             for parameters in asked:
                 answer = ask(router, **parameters)
                 silent += answer.missing != (NAMES[1],)
@@ -120,7 +141,9 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
             assert 0 < part.num_rows < along.table.num_rows
             with pytest.raises(InputError, match=NAMES[1]):
                 map_client.served_table(ask(router, bbox=dead))
-            assert map_client.served_table(ask(router, bbox=box)).schema.metadata == {b"missing": NAMES[1].encode()}
+            assert map_client.served_table(ask(router, bbox=box)).schema.metadata == {
+                b"missing": NAMES[1].encode()
+            }
             assert main(["query", "--connect", router.connect[0], "--bbox", dead]) == 1
             assert f"nobody serves {NAMES[1]}" in capsys.readouterr().err
             until(lambda: {"event": "away", "regions": [NAMES[1]]} in map(json.loads, lines))
@@ -134,20 +157,32 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
 
 
 @pytest.mark.campaign
-def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tmp_path: Path) -> None:
+def test_a_second_service_of_a_region_refuses_to_start(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
     wide = NAMES[1].rpartition("/")[0] + "/*"
 
     def refused(name: str) -> None:
         with (
-            pytest.raises(InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"),
+            pytest.raises(
+                InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"
+            ),
             zenoh_session(router) as other,
             claim_regions(other, name, NAMES[1:2], threading.Event()),
         ):
             pass
 
-    with running(router, tmp_path / "one", name="first", regions=[wide]), ThreadPoolExecutor() as both:
-        list(both.map(refused, ("first", "second")))  # also one of the same name, on another machine
-    with zenoh_session(router) as other, claim_regions(other, "second", NAMES[1:2], threading.Event()) as mine:
+    with (
+        running(router, tmp_path / "one", name="first", regions=[wide]),
+        ThreadPoolExecutor() as both,
+    ):
+        list(
+            both.map(refused, ("first", "second"))
+        )  # also one of the same name, on another machine
+    with (
+        zenoh_session(router) as other,
+        claim_regions(other, "second", NAMES[1:2], threading.Event()) as mine,
+    ):
         assert tokens.active_tokens(other) == set()
         with (
             pytest.raises(InputError, match="served by second already"),
@@ -175,7 +210,10 @@ def test_region_is_announced_only_while_queries_are_answered(
             seen.append(set())
 
     monkeypatch.setattr(Service, "_declared", looked)
-    with running(router, tmp_path / "one", name="first", regions=NAMES[:1]), zenoh_session(router) as other:
+    with (
+        running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
+        zenoh_session(router) as other,
+    ):
         assert {token.service for token in tokens.active_tokens(other)} == {"first"}
     assert seen == [set(), set()]
 
@@ -235,8 +273,14 @@ def test_a_leaving_service_may_be_asked_instead_of_its_successor(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, comes_back: bool
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
-    frozen, follows = (frozenset({keys.ServiceToken(NAMES[1], name, "1f")}) for name in ("frozen", "follows"))
-    with zenoh_session(router) as other, zenoh_session(router) as third, announce_regions(other, follows):
+    frozen, follows = (
+        frozenset({keys.ServiceToken(NAMES[1], name, "1f")}) for name in ("frozen", "follows")
+    )
+    with (
+        zenoh_session(router) as other,
+        zenoh_session(router) as third,
+        announce_regions(other, follows),
+    ):
         held, again = announce_regions(other, frozen), announce_regions(other, frozen)
         held.__enter__()
         until(lambda: len(tokens.active_tokens(third)) == 2)
@@ -286,7 +330,9 @@ def test_what_nobody_serves_is_said_in_as_few_regions_as_there_are() -> None:
     first = NAMES[1].split("/")
     assert regions.unserved(box, ["*/*/*"]) == []
     assert regions.unserved(box, NAMES) == []
-    assert regions.unserved(box, NAMES[:2]) == [NAMES[2]] or regions.unserved(box, NAMES[:2])[0].endswith("*")
+    assert regions.unserved(box, NAMES[:2]) == [NAMES[2]] or regions.unserved(box, NAMES[:2])[
+        0
+    ].endswith("*")
     assert set(regions.unserved(box, [])) == {f"{name.split('/')[0]}/*/*" for name in NAMES[1:]}
     assert regions.unserved(query.parse({}), [f"{first[0]}/*/*"]) == [
         f"{grid.quadkey(one, 4)}/*/*" for one in range(256) if grid.quadkey(one, 4) != first[0]
@@ -298,6 +344,11 @@ def test_a_token_says_its_region_and_a_stranger_says_none() -> None:
     for region in ("*/*/*", NAMES[0], "1202/*/*"):
         told = keys.ServiceToken(region, "shard-0", "1f")
         assert keys.parse_served(told.key) == told
-    for key in ("gripmap/v1/shard/shard-0", f"{keys.SERVES}/1202/all/x/a/b", f"{keys.SERVES}/1/2/3", keys.SERVES):
+    for key in (
+        "gripmap/v1/shard/shard-0",
+        f"{keys.SERVES}/1202/all/x/a/b",
+        f"{keys.SERVES}/1/2/3",
+        keys.SERVES,
+    ):
         with pytest.raises(InputError):
             keys.parse_served(key)

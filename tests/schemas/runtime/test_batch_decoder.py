@@ -73,7 +73,9 @@ def agrees(kind: Kind, payload: bytes) -> bool:
 
 @compiled
 @given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), sent(kind))))
-def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(case: tuple[Kind, Any]) -> None:
+def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(
+    case: tuple[Kind, Any],
+) -> None:
     kind, message = case
     assert agrees(kind, message.SerializeToString())
 
@@ -100,7 +102,9 @@ def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
 
 @compiled
 @given(st.binary(max_size=200), KINDS)
-def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(payload: bytes, kind: Kind) -> None:
+def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(
+    payload: bytes, kind: Kind
+) -> None:
     agrees(kind, payload)
 
 
@@ -143,8 +147,12 @@ def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> Non
 def test_unknown_fields_and_unpacked_columns_are_read() -> None:
     message = _example()
     plain = decode(message.SerializeToString(), "", Kind.OBSERVATION)
-    unpacked = b"".join(bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", v) for v in (3.0, 4.0))
-    odd = decode(_run(40, b"later version") + message.SerializeToString() + unpacked, "", Kind.OBSERVATION)
+    unpacked = b"".join(
+        bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", v) for v in (3.0, 4.0)
+    )
+    odd = decode(
+        _run(40, b"later version") + message.SerializeToString() + unpacked, "", Kind.OBSERVATION
+    )
     assert odd.columns["speed"].tolist() == [3.0, 4.0]
     assert (odd.vehicle, odd.boot, odd.seq) == (plain.vehicle, plain.boot, plain.seq)
     assert odd.columns["health"].tolist() == [-1, 2]

@@ -10,7 +10,9 @@ import pytest
 from schemas.runtime.durable import draft_of, make_folder, open_durably
 
 
-def test_a_file_has_its_name_when_it_is_whole_and_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_has_its_name_when_it_is_whole_and_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     order: list[str] = []
     fsync, rename = os.fsync, Path.rename
 

@@ -30,7 +30,9 @@ def test_figure_holds_on_the_right_side_and_never_when_missing(figure: Figure, h
 
 def _git(folder: Path, *words: str) -> str:
     who = ("-c", "user.name=nobody", "-c", "user.email=nobody@example.org")
-    done = subprocess.run(["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip()
 
 
@@ -38,7 +40,10 @@ def test_the_commit_is_that_of_the_source_and_says_whether_it_was_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    source, other = tmp_path / "house" / "room" / "code.py", tmp_path / "house" / "room" / "site-packages.py"
+    source, other = (
+        tmp_path / "house" / "room" / "code.py",
+        tmp_path / "house" / "room" / "site-packages.py",
+    )
     source.parent.mkdir(parents=True)
     source.write_text("1")
     assert commit(source) == "unknown"
@@ -64,6 +69,12 @@ def test_the_file_starts_with_a_header_and_says_what_does_not_hold(tmp_path: Pat
 
 
 def test_a_value_of_numpy_is_written_like_any_other(tmp_path: Path) -> None:
-    found = [Figure("a", np.float64(0.5), "", 1.0), Figure("b", np.float64(0.5), "", (0.6, 1.0), "within")]
+    found = [
+        Figure("a", np.float64(0.5), "", 1.0),
+        Figure("b", np.float64(0.5), "", (0.6, 1.0), "within"),
+    ]
     write(tmp_path / "figures.json", "demo", [1], found)
-    assert [row["holds"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == [True, False]
+    assert [row["holds"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == [
+        True,
+        False,
+    ]

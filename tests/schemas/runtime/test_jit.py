@@ -40,7 +40,9 @@ def run(folder: Path, factor: str, before: str = "") -> str:
         "PYTHONDONTWRITEBYTECODE": "1"
     }  # Python's own cache takes two texts of one second and length for one
     words = [sys.executable, "-c", f"{before}from kernels.outer import outer; print(outer(1.0))"]
-    return subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+    return subprocess.run(
+        words, env=environment, cwd=folder, capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> None:
@@ -72,7 +74,10 @@ def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, 
     )
     assert run(tmp_path, "2.0", homeless) == "3.0"
     assert not (tmp_path / "cache").exists()
-    assert run(tmp_path, "2.0", homeless.replace("'/proc/nowhere'; from", f"{str(tmp_path)!r}; from")) == "3.0"
+    assert (
+        run(tmp_path, "2.0", homeless.replace("'/proc/nowhere'; from", f"{str(tmp_path)!r}; from"))
+        == "3.0"
+    )
 
 
 def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
@@ -82,6 +87,9 @@ def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "cache" / "gripmap"
     shared.mkdir(parents=True)
     shared.chmod(0o777)
-    assert run(tmp_path, "2.0", f"import os; os.environ['HOME'] = {str(tmp_path / 'home')!r}; ") == "3.0"
+    assert (
+        run(tmp_path, "2.0", f"import os; os.environ['HOME'] = {str(tmp_path / 'home')!r}; ")
+        == "3.0"
+    )
     assert not list(shared.iterdir())
     assert list((tmp_path / "home" / ".cache" / "gripmap").iterdir())

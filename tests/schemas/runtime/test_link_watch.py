@@ -17,7 +17,9 @@ from tests.fleet_service.examples import key
 from tests.secured import READER, ROUTERS, VEHICLES, network
 from tests.waiting import until
 
-RETRY = {"connect/retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}}
+RETRY = {
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}
+}
 
 
 def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -22,7 +22,9 @@ HOSTILE = 'a"b\\c\nd<script>'
 
 def read() -> Sequence[Metric]:
     return [
-        Metric("refused_messages", "counter", "refused, by reason", {"time": 3, HOSTILE: 4}, "reason"),
+        Metric(
+            "refused_messages", "counter", "refused, by reason", {"time": 3, HOSTILE: 4}, "reason"
+        ),
         gauge("queue_messages", "waiting", 7),
     ]
 
@@ -42,7 +44,10 @@ def test_metric_values_survive_the_formats_own_parser() -> None:
     families = {family.name: family for family in text_string_to_metric_families(text)}
     assert status == 200
     assert form.startswith("application/openmetrics-text; version=1.0.0")
-    refused = {sample.labels["reason"]: sample.value for sample in families["gripmap_refused_messages"].samples}
+    refused = {
+        sample.labels["reason"]: sample.value
+        for sample in families["gripmap_refused_messages"].samples
+    }
     assert refused == {"time": 3, HOSTILE: 4}
     assert [sample.value for sample in families["gripmap_queue_messages"].samples] == [7]
 
@@ -84,7 +89,12 @@ def test_lines_are_text_for_people_and_json_for_programs() -> None:
     line_logger("json", structured)("compacted: 7 rows\nof <many>")
     assert plain.getvalue() == "status: 3 rows\n"
     first, second = (json.loads(text) for text in structured.getvalue().splitlines())
-    assert (first["event"], first["rows"], first["counts"], first["service"]) == ("status", 3, {"late": 1}, "shard-0")
+    assert (first["event"], first["rows"], first["counts"], first["service"]) == (
+        "status",
+        3,
+        {"late": 1},
+        "shard-0",
+    )
     assert (second["event"], second["message"], second["level"]) == (
         "compacted",
         "compacted: 7 rows\nof <many>",

@@ -23,7 +23,9 @@ print("said", end=" ")
 
 
 def test_finished_command_exits_without_interpreter_teardown() -> None:
-    done = subprocess.run([sys.executable, "-c", f"{LEAVE}exit_fast(3)"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{LEAVE}exit_fast(3)"], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (3, "said registered\n")
 
 
@@ -35,14 +37,20 @@ def work():
     print("worked")
 threading.Thread(target=work).start()
 exit_fast(3)"""
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (3, "said worked\nregistered\n")
 
 
 def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
     with Path("/dev/full").open("w") as full:
-        assert subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7
-    heard = subprocess.run([sys.executable, "-c", TALK], capture_output=True, text=True, check=False)
+        assert (
+            subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7
+        )
+    heard = subprocess.run(
+        [sys.executable, "-c", TALK], capture_output=True, text=True, check=False
+    )
     assert heard.stderr == "hello\n" * 3
 
 
@@ -82,4 +90,6 @@ threads = [threading.Thread(target=talk, args=(who,)) for who in "abcd"]
 
 def test_lines_of_many_threads_stay_whole() -> None:
     done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, check=True)
-    assert sorted(done.stdout.splitlines()) == sorted(f"{who} {number}" for who in "abcd" for number in range(5000))
+    assert sorted(done.stdout.splitlines()) == sorted(
+        f"{who} {number}" for who in "abcd" for number in range(5000)
+    )

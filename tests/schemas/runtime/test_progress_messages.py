@@ -20,7 +20,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_progress_is_shown_while_the_drawing_library_still_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_while_the_drawing_library_still_loads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     terminal, loaded = Terminal(), threading.Event()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)

@@ -58,7 +58,12 @@ def test_the_annotations_are_the_fields_and_those_of_a_base_come_first() -> None
     kind = record_type(Outer)
     assert kind.names == Outer._fields
     assert kind == record_type(Row)
-    assert [kind[name].base for name in ("begun", "seen", "table", "marks")] == ["?", "i8", "f8", "i8"]
+    assert [kind[name].base for name in ("begun", "seen", "table", "marks")] == [
+        "?",
+        "i8",
+        "f8",
+        "i8",
+    ]
     assert [kind[name].shape for name in ("begun", "table", "marks")] == [(), (2, SIZE), (4,)]
     assert kind["inner"].names == Inner._fields
     assert record_type(Widest).names == ("first", "second")
@@ -76,6 +81,8 @@ def test_a_kernel_reads_and_writes_the_rows_it_is_given_and_no_other() -> None:
 
 def test_a_named_tuple_is_put_into_a_row_with_what_it_holds() -> None:
     rows = records(Outer, 2)
-    put_record(rows[1], Outer(True, 7, Inner(0.25, np.arange(3.0)), np.ones((2, SIZE)), np.arange(4)))
+    put_record(
+        rows[1], Outer(True, 7, Inner(0.25, np.arange(3.0)), np.ones((2, SIZE)), np.arange(4))
+    )
     assert rows[1]["inner"]["curve"].tolist() == [0.0, 1.0, 2.0]
     assert rows["seen"].tolist() == [0, 7]

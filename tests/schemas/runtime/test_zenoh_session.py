@@ -28,7 +28,9 @@ def test_alerts_have_the_highest_priority_and_are_sent_at_once() -> None:
     first = zenoh_session.quality_of(keys.TOPICS["alert"])
     assert (first["priority"], first["express"]) == (zenoh.Priority.REAL_TIME, True)
     assert keys.TOPICS["obs"].block
-    others = [zenoh_session.quality_of(topic) for name, topic in keys.TOPICS.items() if name != "alert"]
+    others = [
+        zenoh_session.quality_of(topic) for name, topic in keys.TOPICS.items() if name != "alert"
+    ]
     assert all(one["priority"] != first["priority"] for one in others)
 
 

@@ -19,7 +19,9 @@ from schemas.wire.tile import decode_tile
 
 def table(rows: int) -> pa.Table:
     columns = [
-        pa.array(["measured"] * rows) if f.type == pa.string() else pa.array(np.arange(rows) % 100).cast(f.type)
+        pa.array(["measured"] * rows)
+        if f.type == pa.string()
+        else pa.array(np.arange(rows) % 100).cast(f.type)
         for f in tables.MAP_SCHEMA
     ]
     return pa.Table.from_arrays(columns, schema=tables.MAP_SCHEMA)
@@ -27,7 +29,9 @@ def table(rows: int) -> pa.Table:
 
 def stream(content: pa.Table, compression: Literal["lz4", "zstd"] | None = None) -> bytes:
     sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, content.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
+    with pa.ipc.new_stream(
+        sink, content.schema, options=pa.ipc.IpcWriteOptions(compression=compression)
+    ) as writer:
         writer.write_table(content)
     return bytes(sink.getvalue())
 
@@ -38,7 +42,9 @@ def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_what_would_have_to_be_unpacked_is_refused_before_it_is(compression: Literal["zstd", "lz4"]) -> None:
+def test_what_would_have_to_be_unpacked_is_refused_before_it_is(
+    compression: Literal["zstd", "lz4"],
+) -> None:
     bomb = stream(table(tile.MAX_ROWS), compression)
     assert len(bomb) < 0.2 * table(tile.MAX_ROWS).nbytes
     with pytest.raises(WireError, match="^tile: is compressed; "):

@@ -16,7 +16,15 @@ from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 from schemas.signals import FLAGS
 from schemas.wire import Batch, Kind, decode
-from tests.schemas.examples import DATA, LATER, MESSAGES, acknowledgement, alert, batch, batch_of_version_1
+from tests.schemas.examples import (
+    DATA,
+    LATER,
+    MESSAGES,
+    acknowledgement,
+    alert,
+    batch,
+    batch_of_version_1,
+)
 
 NUMPY_OF = {"double": "float64", "float": "float32", "sfixed64": "int64"}
 HEADER = {"vehicle", "boot", "region", "seq", "first_held", "estimator"}
@@ -41,20 +49,27 @@ def test_a_batch_comes_back_as_it_was_sent(kind: Kind) -> None:
 @pytest.mark.parametrize("kind", Kind)
 def test_the_json_mapping_says_the_same_as_the_bytes(kind: Kind) -> None:
     sent = batch(kind)
-    message = (pb.ObservationBatch if kind is Kind.OBSERVATION else pb.StateBatch).FromString(wire.encode(sent))
+    message = (pb.ObservationBatch if kind is Kind.OBSERVATION else pb.StateBatch).FromString(
+        wire.encode(sent)
+    )
     text = json_format.MessageToJson(message, preserving_proto_field_name=True)
     same(decode(text.encode(), wire.JSON, kind), sent)
 
 
 @pytest.mark.parametrize(
-    ("message", "fields"), [(pb.ObservationBatch, tables.OBSERVATION), (pb.StateBatch, tables.STATE)]
+    ("message", "fields"),
+    [(pb.ObservationBatch, tables.OBSERVATION), (pb.StateBatch, tables.STATE)],
 )
-def test_protobuf_and_arrow_agree_field_by_field(message: type, fields: tuple[tables.Field, ...]) -> None:
+def test_protobuf_and_arrow_agree_field_by_field(
+    message: type, fields: tuple[tables.Field, ...]
+) -> None:
     on_wire = [f for f in message.DESCRIPTOR.fields if f.name not in HEADER]  # type: ignore[attr-defined]
     assert [f.name for f in on_wire] == [f.name for f in fields]
     kind = Kind.OBSERVATION if fields is tables.OBSERVATION else Kind.STATE
     names = {
-        v: k.removeprefix("TYPE_").lower() for k, v in on_wire[0].__class__.__dict__.items() if k.startswith("TYPE_")
+        v: k.removeprefix("TYPE_").lower()
+        for k, v in on_wire[0].__class__.__dict__.items()
+        if k.startswith("TYPE_")
     }
     for field in on_wire:
         dtype, sent = wire.column_types(kind)[field.name], names[field.type]
@@ -78,7 +93,10 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
         kind = Kind.OBSERVATION if name.startswith("obs") else Kind.STATE
         found, sent = decode(kept, wire.ENCODING[kind], kind), batch_of_version_1(kind)
         absent = {name: found.columns.pop(name) for name in LATER if name in found.columns}
-        assert all((column == -1 if name in FLAGS else np.isnan(column)).all() for name, column in absent.items())
+        assert all(
+            (column == -1 if name in FLAGS else np.isnan(column)).all()
+            for name, column in absent.items()
+        )
         same(found, sent)
     elif name == "ack":
         assert wire.decode_ack(kept) == acknowledgement()
@@ -89,8 +107,9 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
 
 def test_a_person_can_publish_with_one_line() -> None:
     line = (
-        '{"vehicle":"anna","boot":1,"seq":1,"enter_time":[1790000000000000000],"latitude":[57.7],"longitude":[11.97],'
+        '{"vehicle":"anna","boot":1,"seq":1,"enter_time":[1790000000000000000],"latitude":[57.7],'
     )
+    line += '"longitude":[11.97],'
     line += '"yaw":[1.6],"mu":[0.3],"mu_lower":[0.2],"mu_upper":[0.4],"mu_utilised":[0.28]}'
     got = decode(line.encode(), wire.JSON, Kind.OBSERVATION)
     assert got.columns["cell"][0] == grid.cell_of(57.7, 11.97)
@@ -127,8 +146,16 @@ def test_too_many_records_are_refused_on_both_sides() -> None:
         (b"[" * 5000, wire.JSON),
         (b'{"nobody":1}', wire.JSON),
         (b"\xff\xfe", wire.JSON),
-        (json.dumps({"enter_time": [1], "latitude": ["NaN"], "longitude": [0]}).encode(), wire.JSON),
-        (json.dumps({"enter_time": [1], "latitude": [1], "longitude": [0], "sector": [999]}).encode(), wire.JSON),
+        (
+            json.dumps({"enter_time": [1], "latitude": ["NaN"], "longitude": [0]}).encode(),
+            wire.JSON,
+        ),
+        (
+            json.dumps(
+                {"enter_time": [1], "latitude": [1], "longitude": [0], "sector": [999]}
+            ).encode(),
+            wire.JSON,
+        ),
         (bytes(wire.MAX_BYTES + 1), ""),
         (b"", "image/png"),
     ],
@@ -139,7 +166,9 @@ def test_garbage_is_refused_with_a_reason(payload: bytes, encoding: str) -> None
 
 
 @given(st.binary(max_size=300), st.sampled_from(["", wire.JSON]), st.sampled_from(list(Kind)))
-def test_no_bytes_raise_anything_but_a_wire_error(payload: bytes, encoding: str, kind: Kind) -> None:
+def test_no_bytes_raise_anything_but_a_wire_error(
+    payload: bytes, encoding: str, kind: Kind
+) -> None:
     with contextlib.suppress(WireError):
         assert 1 <= decode(payload, encoding, kind).rows <= wire.MAX_ROWS
 

@@ -35,5 +35,8 @@ def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Value
     """Return the measures of a paper's estimator and of the default, on drives with ordinary
     sensors."""
     batch = realistic(PAPERS[name], seeds)
-    found = [means(batch, estimates(bank_of(each, batch.vehicles), batch)) for each in (estimator, DEFAULT)]
+    found = [
+        means(batch, estimates(bank_of(each, batch.vehicles), batch))
+        for each in (estimator, DEFAULT)
+    ]
     return found[0], found[1]

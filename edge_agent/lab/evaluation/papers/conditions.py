@@ -56,8 +56,12 @@ CONSTANT_003: Final = DriveSpec("straight", SEDAN, None, kmh(40), duration_s=10.
 
 MATCHED: Final[dict[str, DriveSpec]] = {
     "004.dlc": replace(PAPERS["004.dlc"], vehicle=as_printed(SEDAN)),
-    "004.dlc.proportional": replace(PAPERS["004.dlc"], vehicle=as_printed(SEDAN, proportional=True)),
-    "000.jump": replace(PAPERS["000.jump"], vehicle=as_printed(steered_behind(kmh(30)), proportional=True)),
+    "004.dlc.proportional": replace(
+        PAPERS["004.dlc"], vehicle=as_printed(SEDAN, proportional=True)
+    ),
+    "000.jump": replace(
+        PAPERS["000.jump"], vehicle=as_printed(steered_behind(kmh(30)), proportional=True)
+    ),
     "000.jump.similarity": replace(PAPERS["000.jump"], vehicle=as_printed(steered_behind(kmh(30)))),
     **{
         name: replace(PAPERS[name], vehicle=as_printed(PAPERS[name].vehicle))
@@ -66,7 +70,9 @@ MATCHED: Final[dict[str, DriveSpec]] = {
     # a rear axle that turns less than (53) says: there v_y is not almost zero
     "001.dlc.front": replace(PAPERS["001.dlc"], vehicle=as_printed(LIGHT)),
     **{
-        name: replace(PAPERS[name], vehicle=replace(matched(IN_WHEEL), shape=SHAPE_002, curvature=0.0))
+        name: replace(
+            PAPERS[name], vehicle=replace(matched(IN_WHEEL), shape=SHAPE_002, curvature=0.0)
+        )
         for name in ("002.sine", "002.jturn")
     },
     "002.sine.drag": replace(
@@ -84,9 +90,13 @@ MATCHED: Final[dict[str, DriveSpec]] = {
         vehicle=with_losses(as_printed(MOTORED, proportional=True)),
         mu=split(0.30, 0.85),
     ),
-    "003.jump": DriveSpec("throttle", as_printed(MOTORED, proportional=True), TimedFriction(0.85, 0.50, 4.0), kmh(20)),
+    "003.jump": DriveSpec(
+        "throttle", as_printed(MOTORED, proportional=True), TimedFriction(0.85, 0.50, 4.0), kmh(20)
+    ),
     **{
-        f"003.low.{mu:g}": replace(CONSTANT_003, vehicle=with_losses(as_printed(MOTORED, proportional=True)), mu=mu)
+        f"003.low.{mu:g}": replace(
+            CONSTANT_003, vehicle=with_losses(as_printed(MOTORED, proportional=True)), mu=mu
+        )
         for mu in LOW
     },
 }

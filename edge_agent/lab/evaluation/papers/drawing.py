@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from edge_agent.lab.evaluation.papers.outcome import Curve, Heat, Panel, PaperPlot
+from edge_agent.lab.evaluation.papers.outcome import Curve, Heat, PaperPlot, PlotPanel
 from schemas.runtime.palette import ESTIMATORS, TRUTH
 
 if TYPE_CHECKING:
@@ -66,10 +66,12 @@ def _style(curve: Curve, place: int) -> dict[str, Any]:
     return {"color": OTHERS[place % len(OTHERS)], "linestyle": "-", "lw": 1.0}
 
 
-def _draw_panel(axis: Axes, panel: Panel) -> None:
+def _draw_panel(axis: Axes, panel: PlotPanel) -> None:
     for place, curve in enumerate(panel.curves):
         marker = "o" if len(curve.x) < 20 else ""
-        axis.plot(curve.x, curve.y, **_style(curve, place), marker=marker, ms=3, label=curve.name or None)
+        axis.plot(
+            curve.x, curve.y, **_style(curve, place), marker=marker, ms=3, label=curve.name or None
+        )
     axis.set(xlabel=panel.x, ylabel=panel.y)
     axis.set_title(panel.title, fontsize="small")
     axis.grid(alpha=0.25)
@@ -82,7 +84,9 @@ def _draw_panel(axis: Axes, panel: Panel) -> None:
 
 
 def _draw_heat(figure: Figure, axis: Axes, heat: Heat) -> None:
-    image = axis.imshow(heat.values, aspect="auto", cmap="viridis", origin="lower", interpolation="nearest")
+    image = axis.imshow(
+        heat.values, aspect="auto", cmap="viridis", origin="lower", interpolation="nearest"
+    )
     axis.set(xlabel=heat.x, ylabel=heat.y)
     axis.set_title(heat.title, fontsize="small")
     axis.set_yticks(range(len(heat.ticks)), heat.ticks, fontsize="xx-small")

@@ -39,6 +39,10 @@ def elements_page() -> str:
     """Return the page as Markdown."""
     parts = [INTRODUCTION]
     for paper, (estimator, elements) in PAPERS.items():
-        counts = ", ".join(f"{sum(e.verdict == verdict for e in elements)} {verdict}" for verdict in VERDICTS)
-        parts.append(f"## Paper {paper}: `{estimator}`\n\n{counts}.\n\n{markdown_elements(elements)}\n")
+        counts = ", ".join(
+            f"{sum(e.verdict == verdict for e in elements)} {verdict}" for verdict in VERDICTS
+        )
+        parts.append(
+            f"## Paper {paper}: `{estimator}`\n\n{counts}.\n\n{markdown_elements(elements)}\n"
+        )
     return "\n".join(parts)

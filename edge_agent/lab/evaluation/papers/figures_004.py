@@ -11,7 +11,7 @@ from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.dual_motor import EFFICIENCY, RATIO, motor_torque
 from edge_agent.lab.evaluation.papers.conditions import MATCHED, given_motion
-from edge_agent.lab.evaluation.papers.outcome import Curve, Heat, Panel, PaperPlot
+from edge_agent.lab.evaluation.papers.outcome import Curve, Heat, PaperPlot, PlotPanel
 from edge_agent.lab.tuning.paper_004_tuning import POSITIONS, PaperTuning
 from schemas.numeric import FloatArray
 from schemas.signals import S
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 
 
-def plots(constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning) -> list[PaperPlot]:
+def plots(
+    constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
+) -> list[PaperPlot]:
     """Return all figures, of the first noise seed."""
     return [
         _path_plot(constant),
@@ -40,7 +42,7 @@ def plots(constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: Pa
 def _path_plot(run: NoisyRun) -> PaperPlot:
     truth = run.batch.truth
     line = Curve("", truth["true_x"][:, 0], truth["true_y"][:, 0], "truth")
-    return PaperPlot("path", "Figure 8: path", (Panel("", "x [m]", "y [m]", (line,)),))
+    return PaperPlot("path", "Figure 8: path", (PlotPanel("", "x [m]", "y [m]", (line,)),))
 
 
 def _torque_plot(run: NoisyRun) -> PaperPlot:
@@ -56,10 +58,12 @@ def _torque_plot(run: NoisyRun) -> PaperPlot:
         Curve("rear", t, force[:, 2:].sum(axis=1)),
     )
     panels = (
-        Panel("motors", "t [s]", "torque [N·m]", motors),
-        Panel("axles", "t [s]", "F_x [N]", forces),
+        PlotPanel("motors", "t [s]", "torque [N·m]", motors),
+        PlotPanel("axles", "t [s]", "F_x [N]", forces),
     )
-    return PaperPlot("torques", "Figure 9: torque of the front and rear motor, and the axles' force", panels)
+    return PaperPlot(
+        "torques", "Figure 9: torque of the front and rear motor, and the axles' force", panels
+    )
 
 
 def _state_plot(run: NoisyRun, name: str, title: str) -> PaperPlot:
@@ -74,10 +78,17 @@ def _state_plot(run: NoisyRun, name: str, title: str) -> PaperPlot:
     )
     panels = []
     for label, true, column, limits in quantities:
-        lines = tuple(Curve(each, t, getattr(run.reported[each], column)[:, 0], kind) for each, kind in FILTERS.items())
-        panels.append(Panel("", "t [s]", label, (Curve("true", t, true, "truth"), *lines), limits))
-    adapted = tuple(Curve(each, t, run.reported[each].adaptation[:, 0], kind) for each, kind in FILTERS.items())
-    panels.append(Panel("", "t [s]", "largest factor on R", adapted))
+        lines = tuple(
+            Curve(each, t, getattr(run.reported[each], column)[:, 0], kind)
+            for each, kind in FILTERS.items()
+        )
+        panels.append(
+            PlotPanel("", "t [s]", label, (Curve("true", t, true, "truth"), *lines), limits)
+        )
+    adapted = tuple(
+        Curve(each, t, run.reported[each].adaptation[:, 0], kind) for each, kind in FILTERS.items()
+    )
+    panels.append(PlotPanel("", "t [s]", "largest factor on R", adapted))
     return PaperPlot(f"states-{name}", title, tuple(panels), 2)
 
 
@@ -87,7 +98,7 @@ def _noisy_ay(run: NoisyRun) -> PaperPlot:
         Curve("measured", t, run.batch.signals[:, 0, S.AY], "comparator"),
         Curve("true", t, run.batch.truth["true_ay"][:, 0], "truth"),
     )
-    panel = Panel("", "t [s]", "a_y [m/s²]", curves)
+    panel = PlotPanel("", "t [s]", "a_y [m/s²]", curves)
     return PaperPlot("noisy-ay", "Figure 14: lateral acceleration with variable noise", (panel,))
 
 
@@ -96,20 +107,30 @@ def _set_plot(tuned: Memberships) -> PaperPlot:
     for title, sets in (("before", Memberships()), ("after", tuned)):
         for label, peaks in (("mismatch [1]", sets.inputs), ("step of ln R [1]", sets.outputs)):
             at = np.asarray(peaks)
-            curves = tuple(Curve(f"peak {peak:.2g}", at, np.eye(len(at))[k]) for k, peak in enumerate(peaks))
-            panels.append(Panel(title, label, "membership [1]", curves))
-    return PaperPlot("memberships", "Figures 2, 3, 6, 7: sets before and after, as shipped", tuple(panels), 2)
+            curves = tuple(
+                Curve(f"peak {peak:.2g}", at, np.eye(len(at))[k]) for k, peak in enumerate(peaks)
+            )
+            panels.append(PlotPanel(title, label, "membership [1]", curves))
+    return PaperPlot(
+        "memberships", "Figures 2, 3, 6, 7: sets before and after, as shipped", tuple(panels), 2
+    )
 
 
 def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
     panels = []
     for title, sets in (("before", LowerVertices()), ("after", tuned)):
-        for label, triangles in zip(("mismatch [1]", "step of ln R [1]"), sets.triangles(), strict=True):
+        for label, triangles in zip(
+            ("mismatch [1]", "step of ln R [1]"), sets.triangles(), strict=True
+        ):
             curves = tuple(
-                Curve("", triangle, np.array([0.0, 1.0, 0.0]) if k not in (0, 4) else _shoulder_values(k))
+                Curve(
+                    "",
+                    triangle,
+                    np.array([0.0, 1.0, 0.0]) if k not in (0, 4) else _shoulder_values(k),
+                )
                 for k, triangle in enumerate(triangles)
             )
-            panels.append(Panel(title, label, "membership [1]", curves))
+            panels.append(PlotPanel(title, label, "membership [1]", curves))
     title = "Lower vertices before and after the colony, on the likelihood"
     return PaperPlot("lower-vertices", title, tuple(panels), 2)
 
@@ -126,7 +147,7 @@ def _search_plot(tuning: PaperTuning) -> PaperPlot:
         Curve("best so far", at, np.array([line.best for line in history]), "improved"),
         Curve("mean of the iteration", at, np.array([line.mean for line in history]), "comparator"),
     )
-    panel = Panel("", "iteration", "log-likelihood [nat per sample]", curves)
+    panel = PlotPanel("", "iteration", "log-likelihood [nat per sample]", curves)
     return PaperPlot("search", "Best objective of the colony over its iterations", (panel,))
 
 

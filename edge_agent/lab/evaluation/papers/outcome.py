@@ -76,7 +76,7 @@ class Curve(NamedTuple):
     kind: str = ""  # "truth", "improved", "comparator" or "": its colour
 
 
-class Panel(NamedTuple):
+class PlotPanel(NamedTuple):
     """One pair of axes."""
 
     title: str
@@ -103,7 +103,7 @@ class PaperPlot(NamedTuple):
 
     name: str
     title: str
-    panels: tuple[Panel | Heat, ...]
+    panels: tuple[PlotPanel | Heat, ...]
     columns: int = 1
 
 
@@ -148,5 +148,7 @@ class Reproduction:
                 ("default", row.default),
             ):
                 if not math.isnan(value):
-                    listed.append(Figure(f"papers.{self.paper}.{column}.{row.name}", value, row.unit))
+                    listed.append(
+                        Figure(f"papers.{self.paper}.{column}.{row.name}", value, row.unit)
+                    )
         return listed + self.figures

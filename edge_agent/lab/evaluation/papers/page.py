@@ -63,7 +63,9 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
         lines = [f"## {table.title}", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         for row in table.rows:
             verdict = "" if row.limit is None else "holds" if row.holds else "MISSED"
-            lines.append("| " + " | ".join((row.what, *cells(row), limit_text(row), verdict)) + " |")
+            lines.append(
+                "| " + " | ".join((row.what, *cells(row), limit_text(row), verdict)) + " |"
+            )
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
 
@@ -95,7 +97,8 @@ def report_html(done: Reproduction, seconds: float) -> str:
     """Return the report as one HTML page that shows the SVG files of its folder; `seconds` it
     took."""
     counts = ", ".join(
-        f"{sum(element.verdict == verdict for element in done.elements)} {verdict}" for verdict in VERDICTS
+        f"{sum(element.verdict == verdict for element in done.elements)} {verdict}"
+        for verdict in VERDICTS
     )
     title = f"Paper {done.paper}: {done.title}"
     parts = [
@@ -125,7 +128,9 @@ def report_html(done: Reproduction, seconds: float) -> str:
 
 def _table(table: PaperTable) -> str:
     head = "".join(f'<th class="number">{column}</th>' for column in COLUMNS)
-    lines = [f"<h3>{escape(table.title)}</h3><table><tr><th></th>{head}<th>bar of matched</th></tr>"]
+    lines = [
+        f"<h3>{escape(table.title)}</h3><table><tr><th></th>{head}<th>bar of matched</th></tr>"
+    ]
     for row in table.rows:
         found = cells(row)
         verdict = "" if row.limit is None else " held" if row.holds else " missed"
@@ -134,14 +139,22 @@ def _table(table: PaperTable) -> str:
             f'<td class="number{verdict}">{found[1]}</td>',
         ]
         body += [f'<td class="number">{cell}</td>' for cell in found[2:]]
-        lines.append(f"<tr><td>{escape(row.what)}</td>{''.join(body)}<td>{limit_text(row)}</td></tr>")
+        lines.append(
+            f"<tr><td>{escape(row.what)}</td>{''.join(body)}<td>{limit_text(row)}</td></tr>"
+        )
     return "\n".join(lines) + "</table>"
 
 
 def _elements(elements: Sequence[Element]) -> str:
-    lines = ["<table><tr><th>paper</th><th>element</th><th>verdict</th><th>why</th><th>where</th></tr>"]
+    lines = [
+        "<table><tr><th>paper</th><th>element</th><th>verdict</th><th>why</th><th>where</th></tr>"
+    ]
     for element in elements:
         where = f"<code>{escape(element.where)}</code>" if element.where else ""
         texts = (element.place, element.what, element.verdict, element.why)
-        lines.append("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in texts) + f"<td>{where}</td></tr>")
+        lines.append(
+            "<tr>"
+            + "".join(f"<td>{escape(text)}</td>" for text in texts)
+            + f"<td>{where}</td></tr>"
+        )
     return "\n".join(lines) + "</table>"

@@ -17,10 +17,10 @@ from edge_agent.lab.evaluation.papers.conditions import MATCHED, given_motion
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
-    Panel,
     PaperPlot,
     PaperRow,
     PaperTable,
+    PlotPanel,
     Reproduction,
 )
 from edge_agent.lab.evaluation.scenarios import PAPERS
@@ -54,13 +54,19 @@ def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet,
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run the experiment of the paper; `seeds`: of the drives with ordinary sensors."""
-    done = Reproduction("000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS)
+    done = Reproduction(
+        "000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS
+    )
     batch, mu = _run_friction(MATCHED[SCENARIO], AS_PRINTED)
     first, after = seconds_near(batch, mu.mean(axis=1))
     own_batch, own_mu = _run_friction(PAPERS[SCENARIO], AS_PRINTED)
     own_first, own_after = seconds_near(own_batch, own_mu.mean(axis=1))
-    similar_batch, similar_mu = _run_friction(MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False))
-    joint_batch, joint = without_noise(MATCHED[SCENARIO], lambda vehicles: federated_ckf.bank(vehicles, PROPORTIONAL))
+    similar_batch, similar_mu = _run_friction(
+        MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False)
+    )
+    joint_batch, joint = without_noise(
+        MATCHED[SCENARIO], lambda vehicles: federated_ckf.bank(vehicles, PROPORTIONAL)
+    )
     matched = means(joint_batch, joint)
     own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.bank))
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
@@ -144,7 +150,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         ("(c)", "sideslip β [rad]", beta, joint.sideslip[:, 0]),
     )
     panels = [
-        Panel(
+        PlotPanel(
             part,
             "t [s]",
             label,
@@ -153,10 +159,11 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         for part, label, true, found in states
     ]
     wheels = tuple(
-        Curve(f"wheel {place.removeprefix('_')}", t, mu[:, wheel]) for wheel, place in enumerate(per_wheel(""))
+        Curve(f"wheel {place.removeprefix('_')}", t, mu[:, wheel])
+        for wheel, place in enumerate(per_wheel(""))
     )
     true_mu = Curve("true, mean", t, batch.mu[:, 0], "truth")
-    panels.append(Panel("(d) as printed", "t [s]", "μ", (true_mu, *wheels), (0.0, 1.2)))
+    panels.append(PlotPanel("(d) as printed", "t [s]", "μ", (true_mu, *wheels), (0.0, 1.2)))
     done.plots = [
         PaperPlot(
             "states",
@@ -201,11 +208,14 @@ def _signal_plot(batch: DriveSet) -> PaperPlot:
     )
     places = [place.removeprefix("_") for place in per_wheel("")]
     panels = tuple(
-        Panel(
+        PlotPanel(
             part,
             "t [s]",
             label,
-            tuple(Curve(places[k] if count > 1 else "", t, signals[:, first + k]) for k in range(count)),
+            tuple(
+                Curve(places[k] if count > 1 else "", t, signals[:, first + k])
+                for k in range(count)
+            ),
         )
         for part, label, first, count in groups
     )
@@ -214,4 +224,4 @@ def _signal_plot(batch: DriveSet) -> PaperPlot:
 
 def _path_plot(batch: DriveSet) -> PaperPlot:
     line = Curve("", batch.truth["true_x"][:, 0], batch.truth["true_y"][:, 0], "truth")
-    return PaperPlot("path", "Path of the car", (Panel("", "x [m]", "y [m]", (line,)),))
+    return PaperPlot("path", "Path of the car", (PlotPanel("", "x [m]", "y [m]", (line,)),))

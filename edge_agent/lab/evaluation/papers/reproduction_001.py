@@ -18,10 +18,10 @@ from edge_agent.lab.evaluation.papers.conditions import MATCHED
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
-    Panel,
     PaperPlot,
     PaperRow,
     PaperTable,
+    PlotPanel,
     Reproduction,
     Values,
 )
@@ -72,7 +72,9 @@ BOTH: Final = {"improved": AdaptiveSetting(), "FKF": FKF}
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run all drives of the paper; `seeds`: of the drives with ordinary sensors."""
-    done = Reproduction("001", "Adaptive fuzzy federated cubature filter", adaptive_federated_ckf.ELEMENTS)
+    done = Reproduction(
+        "001", "Adaptive fuzzy federated cubature filter", adaptive_federated_ckf.ELEMENTS
+    )
     drives = {name: run_drive(MATCHED[name], BOTH) for name in DRIVES}
     own = run_drive(PAPERS[SCENARIO], BOTH)
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
@@ -82,7 +84,9 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             "Table 3: double lane change, improved filter",
             _table_rows("improved", matched, own, real, default),
         ),
-        PaperTable("Table 3: double lane change, comparator FKF", _table_rows("FKF", matched, own, {}, {})),
+        PaperTable(
+            "Table 3: double lane change, comparator FKF", _table_rows("FKF", matched, own, {}, {})
+        ),
         PaperTable("What v_y is worth", _lateral_rows(matched)),
         PaperTable("Options of the filter", _option_rows()),
         PaperTable("The five drives, improved filter and FKF", _all_drives(drives)),
@@ -106,12 +110,16 @@ NOTES: Final = (
         "equally good."
     ),
     "The gap in v_y and β is not reproduced.",
-    ("Friction is set by hand in the paper and here. On realistic drives it is set to .85, which is the truth there."),
+    (
+        "Friction is set by hand in the paper and here. On realistic drives it is set to .85, which is the truth there."
+    ),
     "β is printed in degrees; that of the printed v_y is in radians.",
 )
 
 
-def _table_rows(name: str, matched: MotionRun, own: MotionRun, real: Values, default: Values) -> tuple[PaperRow, ...]:
+def _table_rows(
+    name: str, matched: MotionRun, own: MotionRun, real: Values, default: Values
+) -> tuple[PaperRow, ...]:
     rows = []
     place = 0 if name == "improved" else 1
     prefix = "" if name == "improved" else "fkf."
@@ -141,12 +149,16 @@ def _lateral_rows(matched: MotionRun) -> tuple[PaperRow, ...]:
         ("front", "rear wheels do not steer", front),
     ):
         still = float(np.abs(run.batch.truth["true_vy"]).mean())
-        rows.append(PaperRow(f"{name}.zero.mae_vy", f'{what}: "always zero", MAE v_y [m/s]', NONE, still))
+        rows.append(
+            PaperRow(f"{name}.zero.mae_vy", f'{what}: "always zero", MAE v_y [m/s]', NONE, still)
+        )
         for filter_name in BOTH:
             error = run.values(filter_name)["mae_vy"]
             bar = 0.0024 if name == "front" and filter_name == "improved" else None
             label = f"{what}: {filter_name}, MAE v_y [m/s]"
-            rows.append(PaperRow(f"{name}.{filter_name.lower()}.mae_vy", label, NONE, error, bar=bar))
+            rows.append(
+                PaperRow(f"{name}.{filter_name.lower()}.mae_vy", label, NONE, error, bar=bar)
+            )
     return tuple(rows)
 
 
@@ -209,13 +221,13 @@ def _state_plot(name: str, run: MotionRun) -> PaperPlot:
             Curve("FKF", t, getattr(run.reported["FKF"], column)[:, 0], "comparator"),
             Curve("improved", t, getattr(run.reported["improved"], column)[:, 0], "improved"),
         )
-        panels.append(Panel("", "t [s]", label, (Curve("true", t, true, "truth"), *lines)))
+        panels.append(PlotPanel("", "t [s]", label, (Curve("true", t, true, "truth"), *lines)))
     off = run.batch.truth["true_vy"][:, 0]
     errors = tuple(
         Curve(f"v_y, {each}", t, run.reported[each].vy[:, 0] - off, kind)
         for each, kind in (("FKF", "comparator"), ("improved", "improved"))
     )
-    panels.append(Panel("", "t [s]", "error [m/s]", errors))
+    panels.append(PlotPanel("", "t [s]", "error [m/s]", errors))
     return PaperPlot(f"states-{name.removeprefix('001.')}", DRIVES[name], tuple(panels))
 
 
@@ -225,6 +237,8 @@ def _set_plot() -> PaperPlot:
         ("Figure 3: sets of the mismatch", "α [1]", ALPHA),
         ("Figure 4: sets of its rate", "rate of α [1/s]", RATE),
     ):
-        curves = tuple(Curve(f"{peak:g}", peaks, np.eye(len(peaks))[k]) for k, peak in enumerate(peaks))
-        panels.append(Panel(title, label, "membership [1]", curves))
+        curves = tuple(
+            Curve(f"{peak:g}", peaks, np.eye(len(peaks))[k]) for k, peak in enumerate(peaks)
+        )
+        panels.append(PlotPanel(title, label, "membership [1]", curves))
     return PaperPlot("memberships", "Fuzzy sets of the rules", tuple(panels), 2)

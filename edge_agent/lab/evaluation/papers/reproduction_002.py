@@ -18,10 +18,10 @@ from edge_agent.lab.evaluation.papers.conditions import IN_WHEEL_TYRE, MATCHED, 
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
-    Panel,
     PaperPlot,
     PaperRow,
     PaperTable,
+    PlotPanel,
     Reproduction,
     Values,
 )
@@ -91,7 +91,10 @@ class ForceRun:
     def erms(self, stage: str) -> Values:
         """Root of the mean squared error (38)."""
         found = self.first if stage == "A" else self.second
-        return {name: float(np.sqrt(np.mean((found[name] - true) ** 2))) for name, true in self.truth.items()}
+        return {
+            name: float(np.sqrt(np.mean((found[name] - true) ** 2)))
+            for name, true in self.truth.items()
+        }
 
     def pre(self, stage: str) -> Values:
         """Relative error of the peak (37), as a share: peaks are those of the largest size."""
@@ -133,7 +136,9 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run both drives; `seeds`: of the drives with ordinary sensors."""
-    done = Reproduction("002", "Weighted cubature filters with tyre-force compensation", compensated_wckf.ELEMENTS)
+    done = Reproduction(
+        "002", "Weighted cubature filters with tyre-force compensation", compensated_wckf.ELEMENTS
+    )
     runs = {drive: run_drive(MATCHED[f"002.{drive}"], IN_WHEEL_TYRE) for drive in PRINTED}
     own = {drive: run_drive(PAPERS[f"002.{drive}"], None) for drive in PRINTED}
     real = {drive: with_sensors(f"002.{drive}", ESTIMATOR, seeds) for drive in PRINTED}
@@ -143,9 +148,15 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             ("pre", "2" if drive == "sine" else "4"),
         ):
             title = f"Table {number}: {'ERMS' if measure == 'erms' else 'PRE'}, {TITLES[drive]}"
-            done.tables.append(PaperTable(title, _table_rows(drive, measure, runs[drive], own[drive], real[drive])))
+            done.tables.append(
+                PaperTable(title, _table_rows(drive, measure, runs[drive], own[drive], real[drive]))
+            )
     dragged = run_drive(MATCHED["002.sine.drag"], IN_WHEEL_TYRE)
-    done.tables.append(PaperTable("The same sine with drag in the plant, which no filter knows", _with_drag(dragged)))
+    done.tables.append(
+        PaperTable(
+            "The same sine with drag in the plant, which no filter knows", _with_drag(dragged)
+        )
+    )
     vx = real["sine"][1]["rmse_vx"]
     done.figures = [Figure("papers.002.default.sine.rmse_vx", vx, "m/s", 0.04, "less")]
     done.plots = [plot for drive in PRINTED for plot in _drive_plots(drive, runs[drive])]
@@ -224,21 +235,28 @@ def _drive_plots(drive: str, run: ForceRun) -> list[PaperPlot]:
     numbers = {"sine": ("4", "5", "6"), "jturn": ("7", "8", "9")}[drive]
     steering = Curve("front left wheel", t, signals[:, S.DELTA])
     inputs = (
-        Panel("", "t [s]", "v_x [m/s]", (Curve("true", t, run.truth["v_x"], "truth"),)),
-        Panel("", "t [s]", "wheel angle [rad]", (steering,)),
+        PlotPanel("", "t [s]", "v_x [m/s]", (Curve("true", t, run.truth["v_x"], "truth"),)),
+        PlotPanel("", "t [s]", "wheel angle [rad]", (steering,)),
     )
     forces = tuple(
-        Panel(f"wheel {place.removeprefix('_')}", "t [s]", "F_x [N]", _stage_curves(run, t, name, "TFC"))
+        PlotPanel(
+            f"wheel {place.removeprefix('_')}",
+            "t [s]",
+            "F_x [N]",
+            _stage_curves(run, t, name, "TFC"),
+        )
         for name, place in zip(FORCES, per_wheel(""), strict=True)
     )
     motion = tuple(
-        Panel("", "t [s]", label, _stage_curves(run, t, name, "WCKF-B"))
+        PlotPanel("", "t [s]", label, _stage_curves(run, t, name, "WCKF-B"))
         for name, label in (("v_x", "v_x [m/s]"), ("v_y", "v_y [m/s]"), ("β", "sideslip β [rad]"))
     )
     title = TITLES[drive]
     return [
         PaperPlot(f"inputs-{drive}", f"Figure {numbers[0]}: {title}", inputs),
-        PaperPlot(f"forces-{drive}", f"Figure {numbers[1]}: longitudinal forces, {title}", forces, 2),
+        PaperPlot(
+            f"forces-{drive}", f"Figure {numbers[1]}: longitudinal forces, {title}", forces, 2
+        ),
         PaperPlot(f"states-{drive}", f"Figure {numbers[2]}: motion, {title}", motion),
     ]
 

@@ -24,10 +24,10 @@ from edge_agent.lab.evaluation.papers.conditions import LOW, MATCHED, given_moti
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
-    Panel,
     PaperPlot,
     PaperRow,
     PaperTable,
+    PlotPanel,
     Reproduction,
     Values,
 )
@@ -68,7 +68,9 @@ CASES: Final = (
         "figure 7",
         "003.straight.split",
     ),
-    FrictionCase("jump", "acceleration, .85 to .5 at 4 s", 0.0059, 0.1922, 0.2, "figure 8", "003.jump"),
+    FrictionCase(
+        "jump", "acceleration, .85 to .5 at 4 s", 0.0059, 0.1922, 0.2, "figure 8", "003.jump"
+    ),
 )
 FILTERS: Final[dict[str, UnscentedSetting]] = {
     "sr-ukf": AS_PRINTED,
@@ -110,7 +112,9 @@ def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run all experiments of the paper; `seeds`: of the drives with ordinary sensors."""
-    done = Reproduction("003", "Square-root unscented filter for the friction of four wheels", sr_ukf.ELEMENTS)
+    done = Reproduction(
+        "003", "Square-root unscented filter for the friction of four wheels", sr_ukf.ELEMENTS
+    )
     cases = {case.name: run_case(MATCHED[f"003.{case.name}"], FILTERS) for case in CASES}
     lows = {mu: run_case(MATCHED[f"003.low.{mu:g}"], {"sr-ukf": AS_PRINTED}) for mu in LOW}
     real = {case.name: with_sensors(case.realistic, ESTIMATOR, seeds) for case in CASES}
@@ -120,18 +124,31 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             "Seconds until every wheel is within .02, from the start or the change",
             _arrival_rows(cases),
         ),
-        PaperTable("Table 7 and figure 9: constant speed on low friction, mean absolute error", _low_rows(lows)),
+        PaperTable(
+            "Table 7 and figure 9: constant speed on low friction, mean absolute error",
+            _low_rows(lows),
+        ),
         PaperTable("Comparator UKF: double and single precision", _comparator_rows(cases)),
-        PaperTable("What the conditions are worth: the same filter without one of them", _ablation_rows()),
-        PaperTable("Constant speed straight on, split friction: errors of sensors", _sensor_errors()),
+        PaperTable(
+            "What the conditions are worth: the same filter without one of them", _ablation_rows()
+        ),
+        PaperTable(
+            "Constant speed straight on, split friction: errors of sensors", _sensor_errors()
+        ),
     ]
     lost = float(np.mean([each.runs["ukf-single"].lost for each in cases.values()]))
-    gap = max(float(np.abs(each.runs["ukf"].mu - each.runs["sr-ukf"].mu).max()) for each in cases.values())
+    gap = max(
+        float(np.abs(each.runs["ukf"].mu - each.runs["sr-ukf"].mu).max()) for each in cases.values()
+    )
     done.figures = [
         Figure("papers.003.ukf_float32.lost_factor", lost, "1", 0.5, "more"),
         Figure("papers.003.ukf.double_gap", gap, "1", 1e-3, "less"),
-        Figure("papers.003.default.accel.mu_error", real["accel"][1]["mu_error"], "1", 0.12, "less"),
-        Figure("papers.003.default.accel.coverage90", real["accel"][1]["coverage90"], "1", 0.85, "more"),
+        Figure(
+            "papers.003.default.accel.mu_error", real["accel"][1]["mu_error"], "1", 0.12, "less"
+        ),
+        Figure(
+            "papers.003.default.accel.coverage90", real["accel"][1]["coverage90"], "1", 0.85, "more"
+        ),
     ]
     done.plots = [
         *(friction_plot(case, cases[case.name]) for case in CASES),
@@ -171,7 +188,9 @@ NOTES: Final = (
 )
 
 
-def _error_rows(cases: dict[str, CaseRuns], real: dict[str, tuple[Values, Values]]) -> tuple[PaperRow, ...]:
+def _error_rows(
+    cases: dict[str, CaseRuns], real: dict[str, tuple[Values, Values]]
+) -> tuple[PaperRow, ...]:
     rows = []
     for case in CASES:
         own = run_case(replace(PAPERS[case.realistic], duration_s=10.0), {"sr-ukf": AS_PRINTED})
@@ -204,7 +223,9 @@ def _arrival_rows(cases: dict[str, CaseRuns]) -> tuple[PaperRow, ...]:
 
 def _low_rows(lows: dict[float, CaseRuns]) -> tuple[PaperRow, ...]:
     return tuple(
-        PaperRow(f"low.{mu:g}.mae_mu", f"μ {mu:g}", NONE, each.error("sr-ukf"), bar=0.0037, shown="small")
+        PaperRow(
+            f"low.{mu:g}.mae_mu", f"μ {mu:g}", NONE, each.error("sr-ukf"), bar=0.0037, shown="small"
+        )
         for mu, each in lows.items()
     )
 
@@ -246,7 +267,9 @@ def _ablation_rows() -> tuple[PaperRow, ...]:
             ("similarity", "plant whose stiffness does not depend on μ", similar, AS_PRINTED),
         ):
             error = run_case(drive, {"sr-ukf": setting}).error("sr-ukf")
-            rows.append(PaperRow(f"{case.name}.{name}.mae_mu", f"{case.what}: {what}, MAE μ", NONE, error))
+            rows.append(
+                PaperRow(f"{case.name}.{name}.mae_mu", f"{case.what}: {what}, MAE μ", NONE, error)
+            )
     return tuple(rows)
 
 
@@ -256,8 +279,16 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
     given = given_motion(batch, spec.vehicle)
     rows = []
     for name, what, omega in (
-        ("noise", f"wheel speed noise {WHEEL_SPEED_NOISE:g} rad/s, MAE μ", _add_noise(given.signals)),
-        ("radius", f"wheel radius off by {WHEEL_RADIUS_ERROR:g}, MAE μ", _scale_radius(given.signals)),
+        (
+            "noise",
+            f"wheel speed noise {WHEEL_SPEED_NOISE:g} rad/s, MAE μ",
+            _add_noise(given.signals),
+        ),
+        (
+            "radius",
+            f"wheel radius off by {WHEEL_RADIUS_ERROR:g}, MAE μ",
+            _scale_radius(given.signals),
+        ),
     ):
         run = estimate(replace(given, signals=omega), AS_PRINTED)
         error = float(np.abs(run.mu - batch.mu_wheel[:, 0]).mean())
@@ -269,7 +300,9 @@ def _add_noise(signals: FloatArray) -> FloatArray:
     """Signals with white noise on the wheel speeds."""
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
-    changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(size=shape)
+    changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(
+        size=shape
+    )
     return changed
 
 
@@ -291,7 +324,7 @@ def friction_plot(case: FrictionCase, runs: CaseRuns) -> PaperPlot:
             Curve("SR-UKF", t, runs.runs["sr-ukf"].mu[:, wheel], "improved"),
         )
         name = place.removeprefix("_")
-        panels.append(Panel(f"wheel {name}", "t [s]", "μ", (truth, *lines), (0.0, 1.2)))
+        panels.append(PlotPanel(f"wheel {name}", "t [s]", "μ", (truth, *lines), (0.0, 1.2)))
     return PaperPlot(f"friction-{case.name}", f"{case.figure}: {case.what}", tuple(panels), 2)
 
 
@@ -300,23 +333,28 @@ def _low_plot(lows: dict[float, CaseRuns]) -> PaperPlot:
     curves = []
     for wheel, place in enumerate(per_wheel("")):
         errors = [
-            float(np.abs(each.runs["sr-ukf"].mu - each.batch.mu_wheel[:, 0])[:, wheel].mean()) for each in lows.values()
+            float(np.abs(each.runs["sr-ukf"].mu - each.batch.mu_wheel[:, 0])[:, wheel].mean())
+            for each in lows.values()
         ]
         curves.append(Curve(place.removeprefix("_"), at, np.array(errors)))
-    panel = Panel("", "μ of the road", "MAE of μ", tuple(curves), (0.0, 0.004))
-    return PaperPlot("low-friction", "Figure 9: error per wheel on low friction, constant speed", (panel,))
+    panel = PlotPanel("", "μ of the road", "MAE of μ", tuple(curves), (0.0, 0.004))
+    return PaperPlot(
+        "low-friction", "Figure 9: error per wheel on low friction, constant speed", (panel,)
+    )
 
 
 def _input_plot(runs: CaseRuns) -> PaperPlot:
     t, signals = runs.batch.t[:, 0], runs.batch.signals[:, 0]
     panels = (
-        Panel(
+        PlotPanel(
             "",
             "t [s]",
             "v_x [m/s]",
             (Curve("true", t, runs.batch.truth["true_vx"][:, 0], "truth"),),
         ),
-        Panel("", "t [s]", "a_x [m/s²]", (Curve("measured", t, signals[:, S.AX]),)),
-        Panel("", "t [s]", "torque of wheel fl [N·m]", (Curve("motor", t, signals[:, S.TORQUE]),)),
+        PlotPanel("", "t [s]", "a_x [m/s²]", (Curve("measured", t, signals[:, S.AX]),)),
+        PlotPanel(
+            "", "t [s]", "torque of wheel fl [N·m]", (Curve("motor", t, signals[:, S.TORQUE]),)
+        ),
     )
     return PaperPlot("inputs-accel", "Signals of the acceleration: PMSM at each wheel", panels)

@@ -61,7 +61,9 @@ class NoisyRun:
     def values(self, name: str) -> Values:
         """MAE and RMSE of each state, mean over the seeds, and relative errors of the peaks."""
         found: Values = {}
-        truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {"mu": self.batch.mu}
+        truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {
+            "mu": self.batch.mu
+        }
         for key, true in truth.items():
             got = getattr(self.reported[name], key)
             found[f"mae_{key}"] = float(np.abs(got - true).mean())
@@ -88,14 +90,17 @@ def run_noise(
     for n, seed in enumerate(seeds):
         add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 4]))
     reported = {
-        name: estimates(bank(batch.vehicles, sets, setting), batch) for name, (sets, setting) in filters.items()
+        name: estimates(bank(batch.vehicles, sets, setting), batch)
+        for name, (sets, setting) in filters.items()
     }
     return NoisyRun(batch, reported)
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
     """Run both experiments; `seeds`: of the noise, and of the drives with ordinary sensors."""
-    done = Reproduction("004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS)
+    done = Reproduction(
+        "004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS
+    )
     tuned = shipped(ESTIMATOR)
     filters = {"FCKF": (Memberships(), AT_THE_TRUTH), "ACOFCKF": (tuned, AT_THE_TRUTH)}
     both = {noise: run_noise(MATCHED[SCENARIO], noise, filters, seeds) for noise in NOISES}
@@ -105,14 +110,22 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     printed = {noise: run_noise(MATCHED[SCENARIO], noise, printed_set, seeds) for noise in NOISES}
     for noise, number in zip(NOISES, ("3", "4"), strict=True):
         for place, name in ((1, "ACOFCKF"), (0, "FCKF")):
-            rows = _table_rows(noise, place, both[noise].values(name), own[noise].values(name), (real, default))
+            rows = _table_rows(
+                noise, place, both[noise].values(name), own[noise].values(name), (real, default)
+            )
             done.tables.append(PaperTable(f"Table {number}: {noise} noise, {name}", rows))
-    done.tables.append(PaperTable("The same with the printed P₀, Q = .1·T², R and μ₀", _as_printed(printed)))
-    done.tables.append(PaperTable("Errors of the peaks in the text, as shares", _peak_rows(both["constant"])))
+    done.tables.append(
+        PaperTable("The same with the printed P₀, Q = .1·T², R and μ₀", _as_printed(printed))
+    )
+    done.tables.append(
+        PaperTable("Errors of the peaks in the text, as shares", _peak_rows(both["constant"]))
+    )
     done.tables.append(PaperTable("Options of the filter, constant noise", _option_rows(seeds)))
     tuning, rows = _tuning_rows(seeds)
     done.tables.append(
-        PaperTable("Sixteen lower vertices tuned under the printed conditions, judged on other noise", rows)
+        PaperTable(
+            "Sixteen lower vertices tuned under the printed conditions, judged on other noise", rows
+        )
     )
     done.plots = plots(both["constant"], both["variable"], tuned, tuning)
     done.notes = list(NOTES)
@@ -176,7 +189,9 @@ def _as_printed(printed: dict[str, NoisyRun]) -> tuple[PaperRow, ...]:
                 full = f"{measure}_{key}"
                 what = f"{noise} noise, {measure.upper()} {name}"
                 bar = None if barred else NONE
-                rows.append(PaperRow(f"as_printed.{noise}.{full}", what, number, values[full], bar=bar))
+                rows.append(
+                    PaperRow(f"as_printed.{noise}.{full}", what, number, values[full], bar=bar)
+                )
     return tuple(rows)
 
 

@@ -30,7 +30,9 @@ REPRODUCTIONS: Final[dict[str, Callable[[Sequence[int]], Reproduction]]] = {
 LONGEST_S: Final = 90.0  # of one paper on two cores
 
 
-def write_paper(paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True) -> Reproduction:
+def write_paper(
+    paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
+) -> Reproduction:
     """Reproduce a paper and write figures.json, report.md, and index.html with its plots."""
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)

@@ -17,7 +17,12 @@ from edge_agent.lab.evaluation.detection import (
     slides_of,
 )
 from edge_agent.lab.evaluation.detection_bars import DETECTION, detection_figures
-from edge_agent.lab.evaluation.detection_campaign import DetectionTown, judge_towns, town_named, towns
+from edge_agent.lab.evaluation.detection_campaign import (
+    DetectionTown,
+    judge_towns,
+    town_named,
+    towns,
+)
 from edge_agent.lab.evaluation.detection_drives import (
     DetectionDrive,
     DetectionVisits,
@@ -46,7 +51,9 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
     wheels = np.repeat(mu[:, :, None], 4, axis=2)
     likelihood = np.zeros((2, BINS))
     likelihood[0, CENTRES > 0.3] = -5.0
-    visits = DetectionVisits(np.array([0, 0]), np.array([250, 700]), np.array([550, 900]), likelihood)
+    visits = DetectionVisits(
+        np.array([0, 0]), np.array([250, 700]), np.array([550, 900]), likelihood
+    )
     return DetectionDrive(
         speed=10.0 * ones,
         ax=-1.0 * ones,
@@ -69,7 +76,12 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
 
 def test_always_reporting_ice_misses_none_and_is_false_on_every_road() -> None:
     found = judge_drive(drive_saying(0.05, 0.3))
-    assert found.mean("passes.ice") == found.mean("slide.told.some_wheels") == found.mean("coverage90.ice") == 1.0
+    assert (
+        found.mean("passes.ice")
+        == found.mean("slide.told.some_wheels")
+        == found.mean("coverage90.ice")
+        == 1.0
+    )
     assert found.mean("false_ice") == found.mean("false_ice.settled") == 1.0
     assert found.mean("coverage90.dry") == found.mean("false_grip") == 0.0
     assert found.total["false_events"] == 2.0
@@ -78,7 +90,12 @@ def test_always_reporting_ice_misses_none_and_is_false_on_every_road() -> None:
 
 def test_always_reporting_grip_finds_nothing_and_is_false_grip_on_ice() -> None:
     found = judge_drive(drive_saying(0.7, 1.1))
-    assert found.mean("passes.ice") == found.mean("slide.told.some_wheels") == found.mean("warned") == 0.0
+    assert (
+        found.mean("passes.ice")
+        == found.mean("slide.told.some_wheels")
+        == found.mean("warned")
+        == 0.0
+    )
     assert found.mean("false_ice") == found.total["false_events"] == 0.0
     assert found.mean("false_grip") == found.mean("false_grip.sure") == 1.0
     assert found.mean("score.ice") == pytest.approx(0.4 + 20.0 * 0.55, rel=1e-5)
@@ -100,7 +117,9 @@ def test_slip_flag_and_contradictions_are_counted_in_the_slide() -> None:
     assert found.mean("flag.passes.ice") == found.mean("controller.passes.ice") == 1.0
     assert found.seconds["flag.seconds.ice.braking"] == [0.0]
     assert found.total["contradictions.slide"] == found.total["contradictions.elsewhere"] == 1.0
-    assert found.total["s.slide"] == pytest.approx(0.5), "what is contradicted already cannot be so again"
+    assert found.total["s.slide"] == pytest.approx(0.5), (
+        "what is contradicted already cannot be so again"
+    )
 
 
 def test_cars_that_stood_where_ice_appeared_are_judged_apart() -> None:
@@ -126,7 +145,9 @@ def test_the_slip_flag_sees_a_slide_on_ice_and_nothing_on_dry_road() -> None:
     found = []
     for mu in (jump(0.9, 0.15, at=30.0), 0.9):
         log, vehicle = simulate_manoeuvre("braking", mu=mu, speed=20.0, seed=3)
-        signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[:, None]
+        signals = np.stack(
+            [log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1
+        )[:, None]
         found.append(friction_flagged(log["t"].to_numpy()[:, None], signals, [vehicle]).min())
     assert found[0] < 0.25
     assert found[1] > 0.35, "no road is called slippery while the car stops"
@@ -143,7 +164,10 @@ def test_the_oracle_finds_the_friction_of_a_slide_and_not_of_rolling() -> None:
 
 def test_a_town_goes_through_the_whole_pipeline_and_fills_the_table() -> None:
     lines: list[str] = []
-    chosen = [DetectionTown(FIGURES, "rough", 45.0, 3), DetectionTown(FIGURES, "rough", 45.0, 3, winter=True)]
+    chosen = [
+        DetectionTown(FIGURES, "rough", 45.0, 3),
+        DetectionTown(FIGURES, "rough", 45.0, 3, winter=True),
+    ]
     results = judge_towns(chosen, lambda vehicles: bank_of("aco-fckf", vehicles), lines.append)
     found = {figure.name: figure.value for figure in detection_figures(results)}
     assert len(lines) == 2

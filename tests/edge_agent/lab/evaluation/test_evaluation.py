@@ -58,7 +58,11 @@ def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
         truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
     )
     output[..., Column.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
-    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = mu, lower, upper
+    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = (
+        mu,
+        lower,
+        upper,
+    )
     output[..., Column.VX_STD : Column.MU], output[..., Column.INNOVATION_NIS] = 1.0, 1.0
     return Estimates(output)
 
@@ -82,11 +86,15 @@ def test_what_was_not_measured_is_told_as_missing_except_when_quick() -> None:
 def test_every_printed_figure_names_a_scenario_and_an_estimator_that_exist() -> None:
     assert set(OWN.values()) | {DEFAULT} <= set(ESTIMATORS)
     for row in PRINTED:
-        assert not row.real or any(row.real.startswith(f"real.{scenario}.ESTIMATOR.") for scenario in PAPERS), row
+        assert not row.real or any(
+            row.real.startswith(f"real.{scenario}.ESTIMATOR.") for scenario in PAPERS
+        ), row
         assert row.same.split(".")[0] in ("ideal", "noise"), row
 
 
-def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumping: DriveSet) -> None:
+def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(
+    jumping: DriveSet,
+) -> None:
     found = measures.measures(jumping, fake(0.6, 0.45, 0.7, jumping))
     assert found["rmse_vx"] == pytest.approx([0.0, 0.0])
     assert found["nees"] == pytest.approx([0.0, 0.0])
@@ -97,7 +105,9 @@ def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumpi
     assert found["width"] == pytest.approx([0.25, 0.25])
 
 
-def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(jumping: DriveSet) -> None:
+def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(
+    jumping: DriveSet,
+) -> None:
     assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
     late = fake(0.85, 0.7, 0.9, jumping)
     late.mu[-50:] = 0.5
@@ -156,7 +166,9 @@ def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
     assert "not reproducible" in text
 
 
-@pytest.mark.parametrize(("arguments", "field"), [(["--seeds", "1"], "seeds"), (["--out", "/dev/null/x"], "out")])
+@pytest.mark.parametrize(
+    ("arguments", "field"), [(["--seeds", "1"], "seeds"), (["--out", "/dev/null/x"], "out")]
+)
 def test_misuse_is_one_line_and_exit_code_two(
     arguments: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,7 +177,9 @@ def test_misuse_is_one_line_and_exit_code_two(
 
 
 @pytest.mark.campaign
-def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_quick_campaign_writes_figures_report_and_plots(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--plots", "svg"]) in (0, 1)
     output = capsys.readouterr()
     assert "double lane change" in output.err
@@ -175,7 +189,11 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
     named = {row["name"]: row for row in rows}
     assert named["papers.004.constant.mae_vy"]["holds"]
     assert {"papers.003.split.low_error", "default.jump.accel_s"} <= set(named)
-    assert {"faults.time-gap.aco-fckf.coverage90", "reliability.aco-fckf.below_35", "bounds.nees.upper"} <= set(named)
+    assert {
+        "faults.time-gap.aco-fckf.coverage90",
+        "reliability.aco-fckf.below_35",
+        "bounds.nees.upper",
+    } <= set(named)
     assert named["faults.no-torque-at-all.paper-aco-fckf.told"]["value"] == 1.0
     text = (tmp_path / "report.md").read_text()
     assert all(f"| {case} |" in text for case in CASES)
@@ -188,8 +206,15 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
 
 @pytest.mark.campaign
 def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
-    assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (0, 1)
-    assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [FIGURES, FIGURES + 1, FIGURES + 2]
+    assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (
+        0,
+        1,
+    )
+    assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [
+        FIGURES,
+        FIGURES + 1,
+        FIGURES + 2,
+    ]
     assert not [path for ending in ("png", "svg", "pdf") for path in tmp_path.glob(f"*.{ending}")]
     assert (tmp_path / "report.md").exists()
 

@@ -33,7 +33,9 @@ def test_every_fault_that_was_asked_for_has_a_row_with_an_expectation() -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_no_fault_loses_an_estimate_and_health_tells_every_one_that_can_be_told(estimator: str) -> None:
+def test_no_fault_loses_an_estimate_and_health_tells_every_one_that_can_be_told(
+    estimator: str,
+) -> None:
     found = faults.campaign(range(1), [estimator], ("slalom", "braking"))
     for (case, _), measured in found.items():
         assert (measured["finite"] == 1.0).all(), case
@@ -49,7 +51,9 @@ def test_under_a_fault_the_interval_of_the_default_stays_honest() -> None:
 @pytest.mark.parametrize("name", [name for name in CASES if name != "none"])
 def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom: DriveSet) -> None:
     broken = harmed(slalom, CASES[name])
-    same = (broken.signals == slalom.signals) | (np.isnan(broken.signals) & np.isnan(slalom.signals))
+    same = (broken.signals == slalom.signals) | (
+        np.isnan(broken.signals) & np.isnan(slalom.signals)
+    )
     assert not same.all() or not np.array_equal(broken.t, slalom.t)
     channels = {i for fault in CASES[name].faults for i in fault.indices}
     assert {int(i) for i in np.flatnonzero(~same.all(axis=(0, 1)))} <= channels

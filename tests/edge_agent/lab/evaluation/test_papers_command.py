@@ -22,10 +22,10 @@ from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
     Heat,
-    Panel,
     PaperPlot,
     PaperRow,
     PaperTable,
+    PlotPanel,
     Reproduction,
 )
 from edge_agent.lab.evaluation.papers.page import limit_text, markdown_tables, report_html, summary
@@ -39,7 +39,7 @@ SHOWN = PaperRow("mae_mu", "MAE μ", NONE, 0.5)
 PLOT = PaperPlot(
     "path",
     "Path",
-    (Panel("", "x", "y", (Curve("true", np.arange(3.0), np.arange(3.0), "truth"),)),),
+    (PlotPanel("", "x", "y", (Curve("true", np.arange(3.0), np.arange(3.0), "truth"),)),),
 )
 
 
@@ -129,7 +129,9 @@ def test_dugoff_tyres_in_the_plant_reach_the_printed_friction_error() -> None:
     assert run.values("it")["mae_vy"] <= 0.0131
     assert run.values("printed")["mae_vx"] <= 0.072
     assert run.values("printed")["mae_vy"] <= 0.0131
-    magic = replace(MATCHED["004.dlc"], vehicle=replace(MATCHED["004.dlc"].vehicle, curve="magic-formula"))
+    magic = replace(
+        MATCHED["004.dlc"], vehicle=replace(MATCHED["004.dlc"].vehicle, curve="magic-formula")
+    )
     assert run_noise(magic, "constant", filters, range(20)).values("it")["mae_mu"] > 0.0095
 
 
@@ -146,7 +148,9 @@ def test_vehicle_of_002_has_the_printed_axle_stiffness_and_inertia() -> None:
     weight = vehicle.mass * 9.81
     slope = vehicle.cornering_stiffness / (weight / 4.0)
     assert slope * weight * vehicle.cg_to_rear_axle / base == pytest.approx(60_000.0)
-    assert slope * IN_WHEEL.rear_slope * weight * vehicle.cg_to_front_axle / base == pytest.approx(40_000.0)
+    assert slope * IN_WHEEL.rear_slope * weight * vehicle.cg_to_front_axle / base == pytest.approx(
+        40_000.0
+    )
     assert vehicle.wheel_inertia == 7.143
 
 

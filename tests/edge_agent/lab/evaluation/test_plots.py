@@ -20,10 +20,15 @@ from schemas.runtime.palette import line_of
 def drives() -> dict[str, PlottedDrive]:
     """Two estimators on a double lane change."""
     batch = realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
-    return {name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch)) for name in ("ckf", "sr-ukf")}
+    return {
+        name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch))
+        for name in ("ckf", "sr-ukf")
+    }
 
 
-def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(drives: dict[str, PlottedDrive]) -> None:
+def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(
+    drives: dict[str, PlottedDrive],
+) -> None:
     said = plots.title("004.dlc", drives["ckf"], 7)
     assert said == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
     assert plots.title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
@@ -31,8 +36,15 @@ def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(drives: dict[str
 
 def test_the_roc_plot_shows_belief_slip_flag_and_oracle(tmp_path: Path) -> None:
     names = [f"roc.{limit:g}" for limit in ROC_NATS] + [f"flag.{limit:g}" for limit in ROC_FLAG_MU]
-    found = [Figure(f"{name}.{what}.rough", 0.5, "1") for name in names for what in ("ice", "snow", "false_events")]
-    found += [Figure("passes.ice.short.rough", 0.8, "1"), Figure("false_events.short.rough", 50.0, "per 1000 km")]
+    found = [
+        Figure(f"{name}.{what}.rough", 0.5, "1")
+        for name in names
+        for what in ("ice", "snow", "false_events")
+    ]
+    found += [
+        Figure("passes.ice.short.rough", 0.8, "1"),
+        Figure("false_events.short.rough", 50.0, "per 1000 km"),
+    ]
     found += [Figure("oracle.ice.favoured.short.rough", 0.9, "1")]
     text = plots.draw_detection(found, tmp_path / "detection.svg").read_text()
     assert text.startswith("<?xml")

@@ -25,7 +25,12 @@ TRUTH = {"t": "t", "vx": "true_vx", "vy": "true_vy", "mu": "true_mu_fl"}
 
 
 def judge(
-    friction: float, *, known: float | None = None, slippery: float = 0.0, health: int = 0, used: float = 0.0
+    friction: float,
+    *,
+    known: float | None = None,
+    slippery: float = 0.0,
+    health: int = 0,
+    used: float = 0.0,
 ) -> LogFigures:
     """Ten seconds at 20 m/s with an interval from .4 to .8 after a wide first one; NaN: friction is not measured."""
     t = np.arange(0.0, 10.0, 0.01)
@@ -36,21 +41,30 @@ def judge(
     values[:, [Column.MU_LOWER, Column.MU_UPPER]] = [0.4, 0.8]
     values[0, [Column.MU_LOWER, Column.MU_UPPER]] = [0.1, 1.1]
     values[:, [Column.VX, Column.VY, Column.HEALTH]] = [SPEED, 0.5, health]
-    truth = {"vx": np.full(len(t), SPEED), "vy": np.full(len(t), 0.2), "mu": np.full(len(t), friction)}
+    truth = {
+        "vx": np.full(len(t), SPEED),
+        "vy": np.full(len(t), 0.2),
+        "mu": np.full(len(t), friction),
+    }
     adopted = Adopted(SignalLog(t, signals, None, None, None), CAR, Diagnosis(), [])
     return judge_estimates("log", adopted, (values, np.full(len(t), slippery)), truth, known, 2)
 
 
 @pytest.mark.parametrize(("friction", "right"), [(0.6, 1.0), (0.3, 0.0), (0.9, 0.0)])
-def test_measured_friction_lies_in_the_interval_or_it_is_wrong(friction: float, right: float) -> None:
+def test_measured_friction_lies_in_the_interval_or_it_is_wrong(
+    friction: float, right: float
+) -> None:
     found = judge(friction)
     assert (found.informative, found.right) == (1.0, right)
     assert found.vy == pytest.approx(0.3)
-    assert found.sideslip == pytest.approx(np.degrees(np.arctan(0.5 / 20.0) - np.arctan(0.2 / 20.0)))
+    assert found.sideslip == pytest.approx(
+        np.degrees(np.arctan(0.5 / 20.0) - np.arctan(0.2 / 20.0))
+    )
 
 
 @pytest.mark.parametrize(
-    ("known", "used", "right"), [(0.8, 0.0, 1.0), (1.0, 0.0, 0.0), (None, 0.7, 1.0), (None, 0.9, 0.0)]
+    ("known", "used", "right"),
+    [(0.8, 0.0, 1.0), (1.0, 0.0, 0.0), (None, 0.7, 1.0), (None, 0.9, 0.0)],
 )
 def test_without_it_the_interval_reaches_what_is_known_or_was_used(
     known: float | None, used: float, right: float
@@ -77,7 +91,9 @@ def test_logs_of_a_folder_are_judged_and_reported(tmp_path: Path) -> None:
     pq.write_table(truth, logs / "a.truth.parquet")
     (logs / "a.meta.json").write_text(json.dumps({"mu_known": 0.5}))
     assert main(["evaluate", "--only", "real", "--logs", str(logs), "--out", str(out)]) in (0, 1)
-    figures = {row["name"]: row["value"] for row in json.loads((out / "figures.json").read_text())[1:]}
+    figures = {
+        row["name"]: row["value"] for row in json.loads((out / "figures.json").read_text())[1:]
+    }
     assert figures["real.logs"] == 1
     assert 0.0 < figures["real.sideslip"] < 2.0
     assert table_row(judge_folder(logs)[0]) in (out / "report.md").read_text()

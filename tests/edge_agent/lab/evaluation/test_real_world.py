@@ -44,7 +44,9 @@ def figures(driven: tuple[DriveSet, FloatArray], reported: Estimates) -> dict[st
     return tally.means()
 
 
-def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[DriveSet, FloatArray]) -> None:
+def test_the_prior_is_always_right_and_never_tells_anything(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
     found = figures(driven, saying(driven[0], *PRIOR))
     baseline = Tally()
     real_world.baseline(baseline, driven[0])
@@ -60,13 +62,17 @@ def test_contradiction_is_counted_by_surface_and_by_whether_grip_is_used(
 ) -> None:
     reported, excited = saying(driven[0], *PRIOR), real_world.lately(driven[1]) >= 0.6
     assert figures(driven, reported)["contradiction_share"] == 0.0
-    reported.values[..., Column.HEALTH] = np.where(excited & (driven[0].mu > 0.75), Health.CONTRADICTION, Health.OK)
+    reported.values[..., Column.HEALTH] = np.where(
+        excited & (driven[0].mu > 0.75), Health.CONTRADICTION, Health.OK
+    )
     found = figures(driven, reported)
     assert 0.0 < found["contradiction_share"] < found["contradiction_share.dry.excited"] == 1.0
     assert found["contradiction_share.dry.calm"] == found["contradiction_share.snow.excited"] == 0.0
 
 
-def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet, FloatArray]) -> None:
+def test_who_says_ice_of_every_road_is_right_on_ice_alone(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
     found = figures(driven, saying(driven[0], 0.05, 0.2))
     assert [found[f"coverage90.{name}"] for name in ("snow", "wet", "dry")] == [0.0, 0.0, 0.0]
     assert found["false_ice"] == found["false_ice.settled"] == 1.0
@@ -78,19 +84,28 @@ def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet
 def test_the_prior_misses_ice_and_always_reporting_grip_is_false_grip(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
-    prior, ice, grip = (figures(driven, saying(driven[0], *ends)) for ends in (PRIOR, (0.05, 0.3), (0.7, 1.1)))
+    prior, ice, grip = (
+        figures(driven, saying(driven[0], *ends)) for ends in (PRIOR, (0.05, 0.3), (0.7, 1.1))
+    )
     assert (prior["missed_ice"], prior["false_grip"]) == (1.0, 0.0)
     assert (ice["missed_ice"], ice["false_grip"]) == (0.0, 0.0)
     assert (grip["missed_ice"], grip["false_grip"]) == (1.0, 1.0)
 
 
 def test_every_second_town_is_in_winter() -> None:
-    assert [real_world.in_winter(seed) for seed in range(FIGURES, FIGURES + 4)] == [False, True, False, True]
+    assert [real_world.in_winter(seed) for seed in range(FIGURES, FIGURES + 4)] == [
+        False,
+        True,
+        False,
+        True,
+    ]
     batch, _ = real_world.town(FIGURES + 1, 2, 2.0)
     assert np.isfinite(batch.mu).all()
 
 
-def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[DriveSet, FloatArray]) -> None:
+def test_each_surface_and_cars_without_torque_are_met_in_a_town(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
     batch, used = driven
     for above, most in SURFACES.values():
         assert ((batch.mu > above) & (batch.mu <= most)).any()
@@ -103,11 +118,15 @@ def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[Dr
     assert 0.0 < (real_world.lately(used) >= 0.6).mean() < 1.0
 
 
-def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(driven: tuple[DriveSet, FloatArray]) -> None:
+def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
     batch, _ = driven
     one = np.ptp(batch.mu_wheel, axis=-1) == 0.0
     steady = one & (np.abs(np.gradient(batch.mu, axis=0)) == 0.0)
-    assert (real_world.in_use(batch) <= batch.mu)[steady].mean() > 0.999  # it remembers a fifth of a second
+    assert (real_world.in_use(batch) <= batch.mu)[
+        steady
+    ].mean() > 0.999  # it remembers a fifth of a second
     assert real_world.in_use(batch).max() > 0.3
 
 
@@ -128,7 +147,10 @@ def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
     speeds, (frictions, expected) = oracle.speed(seeds), oracle.friction(seeds)
     batch = realistic(PAPERS["002.sine"], seeds)
     true = PAPERS["002.sine"].vehicle.vehicle.wheel_radius
-    by_wheels = [abs(vehicle.wheel_radius / true - 1.0) * batch.truth["true_vx"].mean() for vehicle in batch.vehicles]
+    by_wheels = [
+        abs(vehicle.wheel_radius / true - 1.0) * batch.truth["true_vx"].mean()
+        for vehicle in batch.vehicles
+    ]
     assert 0.2 < speeds.mean() / np.mean(by_wheels) < 1.1
     assert (frictions < 0.1).all()
     assert 0.2 < frictions.mean() / expected.mean() < 2.0

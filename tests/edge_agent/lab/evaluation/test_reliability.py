@@ -9,10 +9,21 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.friction_mixture.reported_interval import LEARNED_END, LOWER_END, NEARER, UPPER_END
+from edge_agent.estimators.friction_mixture.reported_interval import (
+    LEARNED_END,
+    LOWER_END,
+    NEARER,
+    UPPER_END,
+)
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
 from edge_agent.lab.evaluation.measures import bounds, consistency
-from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched
+from edge_agent.lab.evaluation.reliability import (
+    LEVELS,
+    between_quantiles,
+    on_the_grid,
+    shares,
+    watched,
+)
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from schemas.mugrid import BINS, CENTRES
 from tests.edge_agent.lab.evaluation.test_evaluation import fake
@@ -51,12 +62,16 @@ def test_the_prior_is_uniform_and_a_posterior_on_the_grid_is_its_own_distributio
 
 
 def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
-    cut = between_quantiles(np.array([0.15]), np.array([0.05]), np.array([0.10]), np.array([0.2645]))
+    cut = between_quantiles(
+        np.array([0.15]), np.array([0.05]), np.array([0.10]), np.array([0.2645])
+    )
     assert cut == pytest.approx([0.692], abs=0.01)
 
 
 @pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
-def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: DriveSet) -> None:
+def test_watching_a_drive_changes_nothing_that_is_said_of_it(
+    estimator: str, turning: DriveSet
+) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
     reported, ranks = watched(bank_of(estimator, turning.vehicles), turning)
     assert np.array_equal(plain.values, reported.values)
@@ -64,7 +79,9 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, tur
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
 
 
-def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: DriveSet) -> None:
+def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(
+    turning: DriveSet,
+) -> None:
     """The ends are told at the levels at which they hold, and patches of ice lower the lower one."""
     reported, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (
@@ -74,7 +91,9 @@ def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_with
     ):
         for side, level in ((-1.0, most), (1.0, least)):
             beside = output + side * 1.15 / BINS
-            moved = replace(turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")})
+            moved = replace(
+                turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")}
+            )
             _, ranks = watched(bank_of("aco-fckf", turning.vehicles), moved)
             assert (side * (ranks - level) > 0.0).all()
 

@@ -45,7 +45,9 @@ def test_another_seed_is_another_day() -> None:
     assert first.vehicles != second.vehicles
 
 
-def test_signals_have_the_shape_of_the_contract(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
+def test_signals_have_the_shape_of_the_contract(
+    drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
+) -> None:
     fleet, t, signals, truth = drive
     assert signals.shape == (6000, 30, len(CHANNELS))
     assert t.shape == truth.x.shape == (6000, 30)
@@ -56,7 +58,9 @@ def test_signals_have_the_shape_of_the_contract(drive: tuple[SimulatedFleet, Flo
     assert [vehicle.name for vehicle in fleet.vehicles] == fleet.names
 
 
-def test_ideal_signals_are_those_of_the_truth(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
+def test_ideal_signals_are_those_of_the_truth(
+    drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
+) -> None:
     fleet, t, signals, truth = drive
     x, y = fleet.scenario.from_latlon(signals[::5, :, S.LATITUDE], signals[::5, :, S.LONGITUDE])
     np.testing.assert_allclose(x, truth.x[::5], atol=1e-4)
@@ -66,10 +70,14 @@ def test_ideal_signals_are_those_of_the_truth(drive: tuple[SimulatedFleet, Float
     turned = np.diff(truth.yaw, axis=0) * fleet.rate_hz
     np.testing.assert_allclose(turned, signals[:-1, :, S.YAW_RATE], atol=0.1)
     ground = fleet.scenario.friction(t, truth.x, truth.y)
-    assert np.mean(np.abs(ground - truth.mu_wheel.mean(axis=2)) < 0.01) > 0.85  # elsewhere wheels are on two surfaces
+    assert (
+        np.mean(np.abs(ground - truth.mu_wheel.mean(axis=2)) < 0.01) > 0.85
+    )  # elsewhere wheels are on two surfaces
 
 
-def test_everybody_stays_on_the_road(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
+def test_everybody_stays_on_the_road(
+    drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
+) -> None:
     fleet, _, _, truth = drive
     lanes = fleet.scenario.network.points[:, [LanePoint.X, LanePoint.Y]]
     off = np.asarray(cKDTree(lanes).query(np.column_stack([truth.x.ravel(), truth.y.ravel()]))[0])
@@ -78,12 +86,17 @@ def test_everybody_stays_on_the_road(drive: tuple[SimulatedFleet, FloatArray, Fl
     assert (truth.vx > 0.0).all()
 
 
-def test_the_fleet_moves_and_covers_the_network(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
+def test_the_fleet_moves_and_covers_the_network(
+    drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
+) -> None:
     fleet, _, _, truth = drive
     assert 7.0 < truth.vx.mean() < 13.0
     lanes = fleet.scenario.network.points[:, [LanePoint.X, LanePoint.Y]]
     cells = {(round(x / 10), round(y / 10)) for x, y in lanes}
-    seen = {(round(x / 10), round(y / 10)) for x, y in zip(truth.x[::5].ravel(), truth.y[::5].ravel(), strict=True)}
+    seen = {
+        (round(x / 10), round(y / 10))
+        for x, y in zip(truth.x[::5].ravel(), truth.y[::5].ravel(), strict=True)
+    }
     assert len(cells & seen) / len(cells) > 0.95
 
 
@@ -93,7 +106,10 @@ def test_tyres_are_excited_and_most_of_all_where_it_is_slippery(
     _, _, _, truth = drive
     used, mu = truth.utilisation.max(axis=2), truth.mu_wheel.mean(axis=2)
     assert truth.utilisation.max() <= 1 + 1e-9
-    share = [float((used[(mu > low) & (mu < high)] > 0.6).mean()) for low, high in ((0.8, 1), (0.3, 0.4), (0.1, 0.25))]
+    share = [
+        float((used[(mu > low) & (mu < high)] > 0.6).mean())
+        for low, high in ((0.8, 1), (0.3, 0.4), (0.1, 0.25))
+    ]
     assert 0.03 < share[0] < share[1] < share[2] < 0.95
 
 
@@ -102,7 +118,9 @@ def test_ice_lies_under_the_wheels_only_once_it_has_appeared(
 ) -> None:
     fleet, t, _, truth = drive
     (event,) = fleet.scenario.events
-    there = (np.abs(truth.x - event.x) < event.length / 2 - 3) & (np.abs(truth.y - event.y) < event.width / 2 - 2)
+    there = (np.abs(truth.x - event.x) < event.length / 2 - 3) & (
+        np.abs(truth.y - event.y) < event.width / 2 - 2
+    )
     assert (truth.mu_wheel[there & (t < event.start)] > 0.8).all()
     assert (truth.mu_wheel[there & (t >= event.start)] == ICE).all()
     assert (there & (t >= event.start)).any(axis=0).sum() >= 3
@@ -124,7 +142,9 @@ def test_patchy_sensors_fall_silent_now_and_then() -> None:
         ("seed", ("test", 1, -1, 100.0)),
     ],
 )
-def test_bad_arguments_are_refused_by_name(field: str, arguments: tuple[str, int, int, float]) -> None:
+def test_bad_arguments_are_refused_by_name(
+    field: str, arguments: tuple[str, int, int, float]
+) -> None:
     with pytest.raises(InputError, match=f"^{field}: "):
         SimulatedFleet(*arguments)
 

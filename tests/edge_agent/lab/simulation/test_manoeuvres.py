@@ -35,7 +35,9 @@ def test_a_log_has_every_signal_and_its_truth_fits(name: str) -> None:
     assert column(log, "true_vx")[0] == row.speed
     idle = used.max(axis=1) < 0.02
     rolling = wheels(log, "omega")[idle] * vehicle.wheel_radius
-    np.testing.assert_allclose(rolling, np.repeat(column(log, "true_vx")[idle, None], 4, axis=1), rtol=0.02, atol=1e-3)
+    np.testing.assert_allclose(
+        rolling, np.repeat(column(log, "true_vx")[idle, None], 4, axis=1), rtol=0.02, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("name", MANOEUVRES)

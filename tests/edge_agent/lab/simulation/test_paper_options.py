@@ -39,11 +39,15 @@ def slip_per_force(vehicle: TrueVehicle, mu: float) -> float:
 def test_stiffness_of_the_plant_is_proportional_to_friction_if_asked() -> None:
     similar = as_printed(SEDAN)
     assert slip_per_force(similar, 0.9) == pytest.approx(slip_per_force(similar, 0.75), rel=0.02)
-    assert slip_per_force(PRINTED, 0.75) / slip_per_force(PRINTED, 0.9) == pytest.approx(0.9 / 0.75, rel=0.02)
+    assert slip_per_force(PRINTED, 0.75) / slip_per_force(PRINTED, 0.9) == pytest.approx(
+        0.9 / 0.75, rel=0.02
+    )
 
 
 def test_friction_jumps_in_time_under_all_wheels_at_once() -> None:
-    log, _ = simulate_manoeuvre("straight", mu=TimedFriction(0.8, 0.4, 1.0), duration_s=2.0, sensors="ideal")
+    log, _ = simulate_manoeuvre(
+        "straight", mu=TimedFriction(0.8, 0.4, 1.0), duration_s=2.0, sensors="ideal"
+    )
     for wheel in ("fl", "fr", "rl", "rr"):
         mu = log[f"true_mu_{wheel}"].to_numpy()
         assert (mu[:100] == 0.8).all()
@@ -74,7 +78,9 @@ def test_car_with_motors_holds_its_speed_against_drag() -> None:
     dragged = replace(as_printed(SEDAN), drag=2.0, rolling=0.01)
     ends = []
     for vehicle in (dragged, replace(dragged, motors=Pmsm())):
-        log, _ = simulate_manoeuvre("straight", vehicle=vehicle, speed=15.0, duration_s=20.0, sensors="ideal")
+        log, _ = simulate_manoeuvre(
+            "straight", vehicle=vehicle, speed=15.0, duration_s=20.0, sensors="ideal"
+        )
         ends.append(abs(log["true_vx"].to_numpy()[-1] - 15.0))
     assert ends[1] < 0.02 < ends[0]
 

@@ -10,7 +10,14 @@ import pytest
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.motor import Pmsm
-from edge_agent.lab.simulation.plant import advance, body_accelerations, command, start_at, substeps_of, wheel_forces
+from edge_agent.lab.simulation.plant import (
+    advance,
+    body_accelerations,
+    command,
+    start_at,
+    substeps_of,
+    wheel_forces,
+)
 from edge_agent.lab.simulation.presets import TrueVehicle
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.numeric import FloatArray
@@ -19,19 +26,29 @@ from schemas.thresholds import GRAVITY
 ROUNDING = 1e-9
 
 
-def some_instant(rng: np.random.Generator, mu: float = 0.6) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def some_instant(
+    rng: np.random.Generator, mu: float = 0.6
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and filled wheels of a vehicle in the middle of something rough."""
     p = PRESETS["sedan"].row()
     x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
-    x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = rng.uniform(3, 30), rng.normal(0, 1), rng.normal(0, 0.4)
-    x[Motion.OMEGA : Motion.OMEGA + 4] = x[Motion.VX] / p[Parameter.RADIUS] * rng.uniform(0.8, 1.2, 4)
+    x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = (
+        rng.uniform(3, 30),
+        rng.normal(0, 1),
+        rng.normal(0, 0.4),
+    )
+    x[Motion.OMEGA : Motion.OMEGA + 4] = (
+        x[Motion.VX] / p[Parameter.RADIUS] * rng.uniform(0.8, 1.2, 4)
+    )
     x[Motion.AX_LAGGED], x[Motion.AY_LAGGED] = rng.uniform(-4, 4, 2)
     u[Control.STEER], u[Control.MU] = rng.normal(0, 0.1, 4), mu
     wheel_forces(x, p, u, w)
     return x, p, u, w
 
 
-def rolling(speed: float, mu: float, vehicle: TrueVehicle | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+def rolling(
+    speed: float, mu: float, vehicle: TrueVehicle | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State, parameters and inputs of a vehicle rolling straight on."""
     p, x, u = (vehicle or PRESETS["sedan"]).row(), np.zeros(STATES), np.zeros((len(Control), 4))
     start_at(x, p, (0.0, 0.0, 0.0), speed)
@@ -39,7 +56,9 @@ def rolling(speed: float, mu: float, vehicle: TrueVehicle | None = None) -> tupl
     return x, p, u
 
 
-def run(x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3) -> FloatArray:
+def run(
+    x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
+) -> FloatArray:
     """Wheels at the end of so many seconds with the inputs held."""
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
@@ -49,7 +68,8 @@ def run(x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float =
 def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
     wheels = p[Parameter.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
     body = (
-        p[Parameter.MASS] * (x[Motion.VX] ** 2 + x[Motion.VY] ** 2) + p[Parameter.YAW_INERTIA] * x[Motion.YAW_RATE] ** 2
+        p[Parameter.MASS] * (x[Motion.VX] ** 2 + x[Motion.VY] ** 2)
+        + p[Parameter.YAW_INERTIA] * x[Motion.YAW_RATE] ** 2
     )
     return float(0.5 * (body + wheels))
 
@@ -57,13 +77,17 @@ def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
 @pytest.mark.parametrize("seed", range(20))
 def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> None:
     x, p, u, w = some_instant(np.random.default_rng(seed))
-    force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(1j * u[Control.STEER])  # the body's axes as the complex plane
+    force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(
+        1j * u[Control.STEER]
+    )  # the body's axes as the complex plane
     half = 0.5 * np.repeat([p[Parameter.TRACK_FRONT], p[Parameter.TRACK_REAR]], 2) * [1, -1, 1, -1]
     place = np.repeat([p[Parameter.TO_FRONT], -p[Parameter.TO_REAR]], 2) + 1j * half
     ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
     total = force.sum() - p[TrueParameter.DRAG] * x[Motion.VX] ** 2
     assert complex(ax, ay) == pytest.approx(total / p[Parameter.MASS], rel=ROUNDING)
-    assert yaw_acceleration == pytest.approx((place.conj() * force).imag.sum() / p[Parameter.YAW_INERTIA], rel=ROUNDING)
+    assert yaw_acceleration == pytest.approx(
+        (place.conj() * force).imag.sum() / p[Parameter.YAW_INERTIA], rel=ROUNDING
+    )
 
 
 @pytest.mark.parametrize("mu", [0.05, 0.2, 0.6, 1.2])
@@ -136,7 +160,9 @@ def test_driving_goes_forward_and_loads_the_rear() -> None:
     command(p, u, 0.0, 4000.0)
     w = run(x, p, u, 1.0)
     assert x[Motion.VX] > 11.0
-    assert w[Wheel.FZ, 2:].sum() > w[Wheel.FZ, :2].sum() * p[Parameter.TO_FRONT] / p[Parameter.TO_REAR]
+    assert (
+        w[Wheel.FZ, 2:].sum() > w[Wheel.FZ, :2].sum() * p[Parameter.TO_FRONT] / p[Parameter.TO_REAR]
+    )
     assert (w[Wheel.TORQUE] > 0).all()
 
 
@@ -148,7 +174,11 @@ def test_an_anti_lock_stop_uses_most_of_the_grip_and_never_more(mu: float) -> No
     fast = x[Motion.VX]
     run(x, p, u, 0.5)
     deceleration = (fast - x[Motion.VX]) / 0.5
-    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[TrueParameter.DRAG] * fast**2 / p[Parameter.MASS]
+    assert (
+        0.7 * mu * GRAVITY
+        < deceleration
+        < mu * GRAVITY + p[TrueParameter.DRAG] * fast**2 / p[Parameter.MASS]
+    )
     assert (x[Motion.OMEGA : Motion.OMEGA + 4] > 0.5 * x[Motion.VX] / p[Parameter.RADIUS]).all()
 
 
@@ -165,10 +195,17 @@ def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
 
 def test_a_steady_circle_has_its_centripetal_acceleration() -> None:
     log, _ = simulate_manoeuvre("constant-radius", mu=0.8, sensors="ideal")
-    truth = {name: log[name].to_numpy()[-500:] for name in ("true_vx", "true_vy", "true_ay", "true_yaw_rate")}
+    truth = {
+        name: log[name].to_numpy()[-500:]
+        for name in ("true_vx", "true_vy", "true_ay", "true_yaw_rate")
+    }
     speed = np.hypot(truth["true_vx"], truth["true_vy"])
-    assert truth["true_ay"].mean() == pytest.approx((speed**2).mean() / 40.0, rel=0.05)  # his radius is not quite 40 m
-    assert truth["true_ay"].mean() == pytest.approx((truth["true_yaw_rate"] * truth["true_vx"]).mean(), rel=0.01)
+    assert truth["true_ay"].mean() == pytest.approx(
+        (speed**2).mean() / 40.0, rel=0.05
+    )  # his radius is not quite 40 m
+    assert truth["true_ay"].mean() == pytest.approx(
+        (truth["true_yaw_rate"] * truth["true_vx"]).mean(), rel=0.01
+    )
 
 
 def test_a_stopped_vehicle_stays_where_it_is() -> None:
@@ -224,9 +261,18 @@ def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
     logs = []
     for vehicle in (usual, changed):
         drives = [
-            simulate_manoeuvre(m, mu=mu, vehicle=vehicle, sensors="mems-leak")[0] for m in ("acceleration", "braking")
+            simulate_manoeuvre(m, mu=mu, vehicle=vehicle, sensors="mems-leak")[0]
+            for m in ("acceleration", "braking")
         ]
         drives.append(simulate_manoeuvre("j-turn", mu=mu, vehicle=vehicle, sensors="mems-leak")[0])
-        drives += [simulate_manoeuvre("double-lane-change", mu=mu, vehicle=vehicle)[0]] if of_controllers else []
-        logs.append(np.concatenate([drive[c].to_numpy() for drive in drives for c in ("ax", "ay", "omega_fl")]))
+        drives += (
+            [simulate_manoeuvre("double-lane-change", mu=mu, vehicle=vehicle)[0]]
+            if of_controllers
+            else []
+        )
+        logs.append(
+            np.concatenate(
+                [drive[c].to_numpy() for drive in drives for c in ("ax", "ay", "omega_fl")]
+            )
+        )
     assert np.abs(logs[0] - logs[1]).max() > 1e-3

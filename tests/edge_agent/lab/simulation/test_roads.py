@@ -9,7 +9,15 @@ import pytest
 
 from edge_agent.lab.simulation import SCENARIOS, Scenario, SimulatedFleet
 from edge_agent.lab.simulation.friction import ICE, Patch
-from edge_agent.lab.simulation.roads import BRAKING, LanePoint, Network, Road, build_network, network_of, rounded
+from edge_agent.lab.simulation.roads import (
+    BRAKING,
+    LanePoint,
+    Network,
+    Road,
+    build_network,
+    network_of,
+    rounded,
+)
 from schemas.errors import InputError
 
 EVERY = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS.keys())
@@ -33,7 +41,11 @@ def test_every_lane_joins_the_next_without_a_gap_or_a_kink(scenario: Scenario) -
         for way in onward(network, k):
             end, start = network.lane(k)[-1], network.lane(way)[0]
             assert np.hypot(*(end[:2] - start[:2])) < 0.01
-            assert end[LanePoint.COS] * start[LanePoint.COS] + end[LanePoint.SIN] * start[LanePoint.SIN] > 0.95
+            assert (
+                end[LanePoint.COS] * start[LanePoint.COS]
+                + end[LanePoint.SIN] * start[LanePoint.SIN]
+                > 0.95
+            )
 
 
 @EVERY
@@ -57,7 +69,9 @@ def test_one_keeps_to_the_right_four_metres_from_the_other_lane(scenario: Scenar
         for point in there[10:-10]:
             offset = back[:, :2] - point[:2]
             nearest = offset[np.hypot(*offset.T).argmin()]
-            assert nearest @ (-point[LanePoint.SIN], point[LanePoint.COS]) == pytest.approx(4.0, abs=0.2)  # to the left
+            assert nearest @ (-point[LanePoint.SIN], point[LanePoint.COS]) == pytest.approx(
+                4.0, abs=0.2
+            )  # to the left
 
 
 @EVERY
@@ -86,7 +100,10 @@ def test_roads_that_lead_nowhere_are_refused() -> None:
 def test_ice_appears_at_its_time_and_not_before(scenario: Scenario) -> None:
     (event,) = scenario.events
     x, y = np.array([event.x]), np.array([event.y])
-    before, after = scenario.friction(event.start - 0.01, x, y), scenario.friction(event.start, x, y)
+    before, after = (
+        scenario.friction(event.start - 0.01, x, y),
+        scenario.friction(event.start, x, y),
+    )
     assert before[0] > 0.5
     assert after[0] == ICE
 
@@ -118,8 +135,12 @@ def test_the_demonstration_has_dry_wet_snowy_icy_and_split_roads() -> None:
     points = scenario.network.points
     mu = scenario.friction(0.0, points[:, LanePoint.X], points[:, LanePoint.Y])
     assert set(mu.tolist()) == {0.9, 0.6, 0.35, 0.18}
-    right = points[:, [LanePoint.X, LanePoint.Y]] + 0.8 * points[:, [LanePoint.SIN, LanePoint.COS]] * [1, -1]
-    left = points[:, [LanePoint.X, LanePoint.Y]] - 0.8 * points[:, [LanePoint.SIN, LanePoint.COS]] * [1, -1]
+    right = points[:, [LanePoint.X, LanePoint.Y]] + 0.8 * points[
+        :, [LanePoint.SIN, LanePoint.COS]
+    ] * [1, -1]
+    left = points[:, [LanePoint.X, LanePoint.Y]] - 0.8 * points[
+        :, [LanePoint.SIN, LanePoint.COS]
+    ] * [1, -1]
     sides = [scenario.friction(0.0, *side.T) for side in (left, right)]
     assert (sides[0] > sides[1] + 0.1).sum() > 50  # [m] of lane
 
@@ -131,7 +152,9 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
         Patch("line", 0.0, 0.0, 1.0, 0.0, 0.5)
 
 
-def test_vehicles_start_on_the_lanes_that_are_given_and_keep_the_speed_that_traffic_leaves_them() -> None:
+def test_vehicles_start_on_the_lanes_that_are_given_and_keep_the_speed_that_traffic_leaves_them() -> (
+    None
+):
     """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a driver of 5 m/s²."""
     x = np.arange(0.0, 400.0)
     lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]

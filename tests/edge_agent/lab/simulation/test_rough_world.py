@@ -19,7 +19,14 @@ from edge_agent.lab.simulation import (
     Wave,
     simulate_manoeuvre,
 )
-from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, Misaligned, Misalignment, misalignment_row
+from edge_agent.lab.simulation.misaligned import (
+    DEVICE_OF,
+    DEVICES,
+    WIDE,
+    Misaligned,
+    Misalignment,
+    misalignment_row,
+)
 from edge_agent.lab.simulation.plant import advance, command, held, start_at, wheel_forces
 from edge_agent.lab.simulation.relief import STEEPEST, cross_slope, gradient, tilt
 from edge_agent.lab.simulation.roads import LanePoint
@@ -43,7 +50,9 @@ def sine(slope: float) -> float:
     return slope / float(np.hypot(1.0, slope))
 
 
-def still(slope: float, bank: float = 0.0, mu: float = 0.85) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def still(
+    slope: float, bank: float = 0.0, mu: float = 0.85
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and wheels of a standing sedan."""
     p, x = PRESETS["sedan"].row(), np.zeros(STATES)
     u, w = np.zeros((INPUTS, 4)), np.zeros((len(Wheel), 4))
@@ -60,7 +69,9 @@ def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope:
         assert not column(log, name).any(), name
     torque = sum(column(log, name)[-1] for name in per_wheel("torque"))
     vehicle = PRESETS["sedan"].vehicle
-    assert torque == pytest.approx(vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=1e-9)
+    assert torque == pytest.approx(
+        vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=1e-9
+    )
     used = np.mean([column(log, name)[-1] for name in per_wheel("true_utilisation")])
     assert used == pytest.approx(abs(slope) / 0.85, rel=1e-9)  # tangent over friction
 
@@ -71,7 +82,9 @@ def test_climbing_at_constant_speed_takes_the_torque_that_the_slope_asks_for(slo
     log, _ = simulate_manoeuvre("straight", sensors="ideal", slope=slope, vehicle=light)
     vehicle = light.vehicle
     torque = sum(column(log, name)[-500:].mean() for name in per_wheel("torque"))
-    assert torque == pytest.approx(vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=2e-3)
+    assert torque == pytest.approx(
+        vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=2e-3
+    )
     assert column(log, "ax")[-500:].mean() == pytest.approx(GRAVITY * sine(slope), rel=2e-3)
     assert column(log, "true_vx")[-1] == pytest.approx(column(log, "true_vx")[0], abs=0.1)
 
@@ -112,16 +125,27 @@ def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill
     command(p, u, 0.0, -8000.0)
     advance(x, p, u, w, 1e-3, 1000)
     wheel_forces(x, p, u, w)
-    assert w[Wheel.FZ].sum() == pytest.approx(p[Parameter.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
+    assert w[Wheel.FZ].sum() == pytest.approx(
+        p[Parameter.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9
+    )
     level, *_ = still(0.0)
     flat = np.zeros((len(Wheel), 4))
-    wheel_forces(level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == Control.MU)[:, None], flat)
-    assert (w[Wheel.FZ, 2:] > flat[Wheel.FZ, 2:])[0]  # uphill the rear carries more, and here the left lies lower
+    wheel_forces(
+        level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == Control.MU)[:, None], flat
+    )
+    assert (w[Wheel.FZ, 2:] > flat[Wheel.FZ, 2:])[
+        0
+    ]  # uphill the rear carries more, and here the left lies lower
     assert w[Wheel.FZ, 0] > w[Wheel.FZ, 1]
 
 
 def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
-    for force, mu, stays in ((-8000.0, 0.85, True), (-400.0, 0.85, False), (-8000.0, 0.05, False), (0.0, 0.85, False)):
+    for force, mu, stays in (
+        (-8000.0, 0.85, True),
+        (-400.0, 0.85, False),
+        (-8000.0, 0.05, False),
+        (0.0, 0.85, False),
+    ):
         x, p, u, w = still(0.08, mu=mu)
         command(p, u, 0.0, force)
         assert held(x, p, u) == stays
@@ -141,8 +165,12 @@ def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
     assert speed.min() > -0.05  # between brake and gas it may roll back a little
     for name in per_wheel("omega"):
         assert not column(log, name)[stands].any()
-    held_fast = np.flatnonzero(stands[:-1] & stands[1:])  # the last sample of a stand is that of the foot coming off
-    np.testing.assert_allclose(column(log, "ax")[held_fast], GRAVITY * sine(slope), rtol=1e-12, atol=1e-12)
+    held_fast = np.flatnonzero(
+        stands[:-1] & stands[1:]
+    )  # the last sample of a stand is that of the foot coming off
+    np.testing.assert_allclose(
+        column(log, "ax")[held_fast], GRAVITY * sine(slope), rtol=1e-12, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ROADS)
@@ -150,13 +178,18 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
     for seed in range(20):
         table = ROADS[name](seed).table
         slopes = np.array(
-            [gradient(table, (x, 0.0), (1.0, 0.0), cross_slope(table, 0.0)) for x in np.arange(0.0, 1e3, 3.0)]
+            [
+                gradient(table, (x, 0.0), (1.0, 0.0), cross_slope(table, 0.0))
+                for x in np.arange(0.0, 1e3, 3.0)
+            ]
         )
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name != "level")
         east, north = slopes[7].tolist()
         there, back = tilt(east, north, 0.3), tilt(east, north, 0.3 + np.pi)
-        np.testing.assert_allclose(there, np.negative(back), atol=1e-15)  # up one way is down the other
+        np.testing.assert_allclose(
+            there, np.negative(back), atol=1e-15
+        )  # up one way is down the other
 
 
 def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
@@ -167,7 +200,9 @@ def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
         for start, end in (((0.0, 0.0), corner), (corner, (180.0, 120.0))):
             line = np.linspace(start, end, 4001)
             middle, step = 0.5 * (line[1:] + line[:-1]), (np.array(end) - start) / 4000
-            climbed += sum(float(np.dot(gradient(table, (x, y), (1.0, 0.0), 0.0), step)) for x, y in middle)
+            climbed += sum(
+                float(np.dot(gradient(table, (x, y), (1.0, 0.0), 0.0), step)) for x, y in middle
+            )
         ways.append(climbed)
     assert ways[0] == pytest.approx(ways[1], abs=0.05)
     assert abs(ways[0]) > 0.5
@@ -214,7 +249,9 @@ ONLY = {
 }
 
 
-def two(manoeuvre: str, mounted: Misalignment) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
+def two(
+    manoeuvre: str, mounted: Misalignment
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
     """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their row."""
     exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
     reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
@@ -238,7 +275,9 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
         if name == "radius":
             wanted[f"omega_{wheel}"] = speed * (1.0 + row[Misaligned.RADIUS + i])
         if name == "step":
-            wanted[f"omega_{wheel}"] = np.floor(speed / row[Misaligned.STEP] + 0.5) * row[Misaligned.STEP]
+            wanted[f"omega_{wheel}"] = (
+                np.floor(speed / row[Misaligned.STEP] + 0.5) * row[Misaligned.STEP]
+            )
         if name == "torque":
             wanted[f"torque_{wheel}"] = np.full_like(speed, np.nan)
     if name == "lag":
@@ -246,7 +285,9 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
             wanted[channel] = np.interp(t - row[Misaligned.LAG + DEVICE_OF[c]], t, exact[channel])
         assert np.ptp(row[Misaligned.LAG : Misaligned.LAG + DEVICES]) > 0.005
     for channel in CHANNELS[: S.LATITUDE]:
-        np.testing.assert_allclose(reported[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel)
+        np.testing.assert_allclose(
+            reported[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel
+        )
     assert any(not np.array_equal(reported[c], exact[c], equal_nan=True) for c in CHANNELS)
 
 
@@ -255,7 +296,8 @@ def test_one_misalignment_does_not_move_another_and_sizes_are_those_of_the_table
     rows = np.array([misalignment_row(whole, 1, k) for k in range(400)])
     alone = np.array([misalignment_row(ONLY["radius"], 1, k) for k in range(400)])
     np.testing.assert_array_equal(
-        rows[:, Misaligned.RADIUS : Misaligned.RADIUS + 4], alone[:, Misaligned.RADIUS : Misaligned.RADIUS + 4]
+        rows[:, Misaligned.RADIUS : Misaligned.RADIUS + 4],
+        alone[:, Misaligned.RADIUS : Misaligned.RADIUS + 4],
     )
     assert rows[:, Misaligned.AX].std() == pytest.approx(GRAVITY * whole.tilt[0], rel=0.1)
     assert 0.25 < rows[:, Misaligned.AX].std() < 0.5
@@ -272,7 +314,9 @@ def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None
     step = misalignment_row(SENSORS["rough-coarse"].mounted, 3, 0)[Misaligned.STEP]
     for name in per_wheel("omega"):
         assert not column(log, name)[stands].any()
-        np.testing.assert_allclose(column(log, name) / step, np.round(column(log, name) / step), atol=1e-6)
+        np.testing.assert_allclose(
+            column(log, name) / step, np.round(column(log, name) / step), atol=1e-6
+        )
 
 
 def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> None:
@@ -299,11 +343,15 @@ def test_the_road_under_a_car_is_smooth() -> None:
     slope, speed = fleet.truth.slope, np.abs(fleet.truth.vx)
     driven = np.maximum(speed[1:], 1.0) / 100.0
     assert np.ptp(slope) > 0.06
-    assert (np.abs(np.diff(slope, axis=0)) / driven).max() < 0.03  # per metre; at 10 m/s, 3 m/s^2 in a second
+    assert (
+        np.abs(np.diff(slope, axis=0)) / driven
+    ).max() < 0.03  # per metre; at 10 m/s, 3 m/s^2 in a second
 
 
 def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
-    missing = [misalignment_row(ROUGH_FLEET.mounted, 2, k)[Misaligned.TORQUELESS] for k in range(300)]
+    missing = [
+        misalignment_row(ROUGH_FLEET.mounted, 2, k)[Misaligned.TORQUELESS] for k in range(300)
+    ]
     assert 0.4 < np.mean(missing) < 0.6
 
 

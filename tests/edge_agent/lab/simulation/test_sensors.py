@@ -80,7 +80,9 @@ def test_position_comes_ten_times_a_second_and_wanders_by_metres() -> None:
 
 def test_metres_go_to_degrees_and_back() -> None:
     x, y = np.array([0.0, 200.0, -3e3]), np.array([0.0, -150.0, 4e3])
-    np.testing.assert_allclose(GOTHENBURG.from_latlon(*GOTHENBURG.to_latlon(x, y)), (x, y), atol=1e-6)
+    np.testing.assert_allclose(
+        GOTHENBURG.from_latlon(*GOTHENBURG.to_latlon(x, y)), (x, y), atol=1e-6
+    )
     latitude, longitude = GOTHENBURG.to_latlon(x, y)
     assert latitude[1] < latitude[0]  # y is north
     assert longitude[1] > longitude[0]  # x is east
@@ -89,7 +91,9 @@ def test_metres_go_to_degrees_and_back() -> None:
 def test_a_rolling_body_lets_gravity_into_the_accelerometer() -> None:
     level, _ = simulate_manoeuvre("constant-radius", sensors="mems")
     leaky, _ = simulate_manoeuvre("constant-radius", sensors="mems-leak")
-    leak = (column(leaky, "ay") - column(level, "ay"))[-500:].mean() / column(level, "true_ay")[-500:].mean()
+    leak = (column(leaky, "ay") - column(level, "ay"))[-500:].mean() / column(level, "true_ay")[
+        -500:
+    ].mean()
     assert leak == pytest.approx(PRESETS["sedan"].roll_leak, rel=0.05)
 
 
@@ -99,7 +103,9 @@ def test_vehicle_files_are_wrong_by_a_few_per_cent_and_only_where_it_is_said() -
     for name in type(truth).model_fields:
         values = [getattr(vehicle, name) for vehicle in reported]
         if name in KNOWN:
-            assert np.std(np.array(values) / getattr(truth, name)) == pytest.approx(KNOWN[name], rel=0.2)
+            assert np.std(np.array(values) / getattr(truth, name)) == pytest.approx(
+                KNOWN[name], rel=0.2
+            )
         else:
             assert set(values) == {getattr(truth, name)}
 
@@ -117,7 +123,12 @@ def test_a_fault_changes_its_channel_in_its_time_and_nothing_else(kind: str) -> 
 
 def test_a_fault_may_name_the_four_wheels_at_once() -> None:
     log, _ = simulate_manoeuvre("straight", duration_s=1.0, faults=(Fault("missing", "torque"),))
-    assert [n for n in CHANNELS if log[n].null_count == 100] == ["torque_fl", "torque_fr", "torque_rl", "torque_rr"]
+    assert [n for n in CHANNELS if log[n].null_count == 100] == [
+        "torque_fl",
+        "torque_fr",
+        "torque_rl",
+        "torque_rr",
+    ]
 
 
 def test_unknown_faults_channels_and_sensors_are_refused_with_the_choice() -> None:

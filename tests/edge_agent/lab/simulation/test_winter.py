@@ -18,7 +18,9 @@ from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 
 
-def equipped(preset: str, *, tcs: float = 1.0, esc: float = 1.0, regeneration: float = 0.0) -> TrueVehicle:
+def equipped(
+    preset: str, *, tcs: float = 1.0, esc: float = 1.0, regeneration: float = 0.0
+) -> TrueVehicle:
     vehicle = replace(PRESETS[preset], relaxation=0.4, abs_hz=8.0)
     return replace(vehicle, tcs=tcs, esc=esc, regeneration=regeneration)
 
@@ -45,7 +47,9 @@ def test_traction_control_ends_a_spin_which_is_endless_without_it() -> None:
     faster = {}
     for tcs in (0.0, 1.0):
         vehicle = equipped("small", tcs=tcs)
-        log, _ = simulate_manoeuvre("acceleration", mu=0.2, speed=3.0, vehicle=vehicle, sensors="ideal", duration_s=6.0)
+        log, _ = simulate_manoeuvre(
+            "acceleration", mu=0.2, speed=3.0, vehicle=vehicle, sensors="ideal", duration_s=6.0
+        )
         rim = column(log, "omega_fl") * vehicle.vehicle.wheel_radius
         faster[tcs] = np.median(rim - column(log, "true_vx"))
         assert (column(log, "true_tcs_active").mean() > 0.3) == (tcs > 0.0)
@@ -57,7 +61,11 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
     drift = {}
     for esc in (0.0, 1.0):
         log, _ = simulate_manoeuvre(
-            "double-lane-change", mu=0.3, speed=16.0, vehicle=equipped("small", esc=esc), sensors="ideal"
+            "double-lane-change",
+            mu=0.3,
+            speed=16.0,
+            vehicle=equipped("small", esc=esc),
+            sensors="ideal",
         )
         drift[esc] = np.abs(np.arctan2(column(log, "true_vy"), column(log, "true_vx"))).max()
         assert (column(log, "true_esc_active").max() > 0.0) == (esc > 0.0)
@@ -67,12 +75,18 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
 def test_no_controller_works_in_ordinary_driving_on_dry_road() -> None:
     for manoeuvre in ("gentle-braking", "straight", "stop-and-go", "j-turn"):
         log, _ = simulate_manoeuvre(manoeuvre, mu=0.9, vehicle=equipped("van"), sensors="ideal")
-        assert not any(column(log, f"true_{name}_active").any() for name in ("abs", "tcs", "esc")), manoeuvre
+        assert not any(
+            column(log, f"true_{name}_active").any() for name in ("abs", "tcs", "esc")
+        ), manoeuvre
 
 
 def test_regeneration_brakes_the_driven_axle_alone() -> None:
     log, _ = simulate_manoeuvre(
-        "gentle-braking", mu=0.9, vehicle=equipped("van", regeneration=3.0), sensors="ideal", duration_s=9.0
+        "gentle-braking",
+        mu=0.9,
+        vehicle=equipped("van", regeneration=3.0),
+        sensors="ideal",
+        duration_s=9.0,
     )
     fast = (column(log, "true_vx") > 5.0) & (column(log, "t") > 3.0)
     assert np.abs(column(log, "torque_fl")[fast]).max() < 1.0
@@ -92,7 +106,9 @@ def test_a_tyre_builds_up_its_side_force_over_its_relaxation_length() -> None:
 
 
 def test_split_road_makes_unlike_brake_torques() -> None:
-    log, _ = simulate_manoeuvre("split-braking", mu=split(0.8, 0.15), vehicle=equipped("sedan"), sensors="ideal")
+    log, _ = simulate_manoeuvre(
+        "split-braking", mu=split(0.8, 0.15), vehicle=equipped("sedan"), sensors="ideal"
+    )
     works = np.flatnonzero(column(log, "true_abs_active"))
     left, right = (np.abs(column(log, f"torque_{side}")[works].mean()) for side in ("fl", "fr"))
     assert max(left, right) > 2.0 * min(left, right)
@@ -103,7 +119,9 @@ def test_winter_equipment_is_drawn_for_each_vehicle_and_changes_no_other() -> No
     drawn_ones = [winter_equipped(PRESETS["van"], rng) for _ in range(200)]
     assert all(6.0 <= one.abs_hz <= 10.0 and 0.3 <= one.relaxation <= 0.6 for one in drawn_ones)
     assert 0.7 < np.mean([one.esc for one in drawn_ones]) < 1.0
-    plain, half, few = (SimulatedFleet("test", n, 5, 50.0, winter=w) for n, w in ((4, 0.0), (4, 0.5), (3, 0.5)))
+    plain, half, few = (
+        SimulatedFleet("test", n, 5, 50.0, winter=w) for n, w in ((4, 0.0), (4, 0.5), (3, 0.5))
+    )
     assert half.winter.tolist() == [False, False, True, True]
     signals = [fleet.step(400)[1] for fleet in (plain, half, few)]
     np.testing.assert_array_equal(signals[0][:, :2], signals[1][:, :2])
@@ -131,9 +149,17 @@ def test_a_winter_town_has_ice_in_each_place_and_ruts_of_slush() -> None:
     town = winter(50_001)
     own = town.patches[len(drawn(50_001).patches) :]
     assert town.name == "winter-50001" == scenario_named("winter-50001").name
-    for word, count in (("ice before", 3), ("ice in bend", 3), ("ice left", 2), ("ice right", 2), ("rut", 6)):
+    for word, count in (
+        ("ice before", 3),
+        ("ice in bend", 3),
+        ("ice left", 2),
+        ("ice right", 2),
+        ("rut", 6),
+    ):
         assert sum(patch.name.startswith(word) for patch in own) == count
-    assert all(patch.mu < 0.2 or (patch.name.startswith("rut") and patch.mu < SNOW + 0.06) for patch in own)
+    assert all(
+        patch.mu < 0.2 or (patch.name.startswith("rut") and patch.mu < SNOW + 0.06) for patch in own
+    )
     assert -6.0 <= town.air_temperature <= 1.0
 
 

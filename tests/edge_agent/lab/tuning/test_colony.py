@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from edge_agent.lab.tuning import colony, random_search
-from edge_agent.lab.tuning.colony import Habits, deposit, lowest_pheromone, renew, transition_probabilities
+from edge_agent.lab.tuning.colony import (
+    Habits,
+    deposit,
+    lowest_pheromone,
+    renew,
+    transition_probabilities,
+)
 from edge_agent.lab.tuning.search import Graph, Iteration, Objective, Problem, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -33,7 +39,9 @@ def decoy(seed: int) -> Objective:
 
 
 def run(search: object, objective: Objective, seed: int, **options: object) -> Result:
-    of_the_problem = {name: options.pop(name) for name in ("start", "admissible") if name in options}
+    of_the_problem = {
+        name: options.pop(name) for name in ("start", "admissible") if name in options
+    }
     problem = Problem(objective, CHOICES, **of_the_problem)  # type: ignore[arg-type]
     return search.optimise(  # type: ignore[attr-defined, no-any-return]
         problem, ants=ANTS, iterations=ITERATIONS, rng=np.random.default_rng(seed), **options
@@ -59,7 +67,10 @@ def test_colony_reaches_the_optimum_where_random_search_of_equal_budget_does_not
     for trial in range(TRIALS):
         for name, search in (("colony", colony), ("random", random_search)):
             result = search.optimise(
-                Problem(decoy(trial), CHOICES), ants=20, iterations=40, rng=np.random.default_rng(3000 + trial)
+                Problem(decoy(trial), CHOICES),
+                ants=20,
+                iterations=40,
+                rng=np.random.default_rng(3000 + trial),
             )
             found[name] += result.value > VERTICES - 1e-9
     assert found["colony"] >= 18
@@ -87,7 +98,9 @@ def test_every_vertex_receives_the_whole_deposit() -> None:
 
 def test_evaporation_takes_its_share_and_the_deposit_is_added() -> None:
     reachable = np.ones((1, 2), dtype=np.bool_)
-    renewed = renew(np.array([[0.8, 0.8]]), np.array([[0.1, 0.0]]), reachable, evaporation=0.25, retrace=0.9)
+    renewed = renew(
+        np.array([[0.8, 0.8]]), np.array([[0.1, 0.0]]), reachable, evaporation=0.25, retrace=0.9
+    )
     np.testing.assert_allclose(renewed, [[0.7, 0.6]])
 
 
@@ -129,7 +142,9 @@ def test_progress_tells_every_iteration_and_the_best_never_falls(search: object)
 
 
 @pytest.mark.parametrize("search", [colony, random_search])
-def test_result_is_never_worse_than_the_start_and_no_vector_is_evaluated_twice(search: object) -> None:
+def test_result_is_never_worse_than_the_start_and_no_vector_is_evaluated_twice(
+    search: object,
+) -> None:
     start = CHOICES[0][np.random.default_rng(3).integers(POSITIONS, size=VERTICES)]
     asked: list[bytes] = []
 
@@ -195,7 +210,8 @@ def test_every_habit_changes_the_way_of_the_colony(habits: Habits) -> None:
 def test_weight_of_visibility_matters_where_visibility_is_given() -> None:
     favour_low = [np.linspace(1.0, 0.1, POSITIONS)] * VERTICES
     plain, strong = (
-        run(colony, decoy(3), 15, visibility=favour_low, habits=Habits(theta=theta)) for theta in (1.0, 3.0)
+        run(colony, decoy(3), 15, visibility=favour_low, habits=Habits(theta=theta))
+        for theta in (1.0, 3.0)
     )
     assert plain.history != strong.history
 
@@ -210,7 +226,8 @@ def test_habits_outside_their_range_are_refused_by_name(name: str) -> None:
 def test_a_vertex_without_positions_and_an_empty_budget_are_refused(search: object) -> None:
     with pytest.raises(InputError, match="choices"):
         search.optimise(Problem(bowl(0), []), ants=1, iterations=1, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+    problem = Problem(bowl(0), CHOICES)
     with pytest.raises(InputError, match="ants"):
-        search.optimise(Problem(bowl(0), CHOICES), ants=4, iterations=0, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+        search.optimise(problem, ants=4, iterations=0, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="admissible"):
         run(search, bowl(0), 0, admissible=lambda _vector: False)

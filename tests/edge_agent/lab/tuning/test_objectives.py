@@ -49,7 +49,9 @@ def test_recorded_drives_stand_side_by_side(drives: TuningSet) -> None:
 def test_drives_that_judge_share_no_seed_and_no_setting_with_those_that_are_searched_on() -> None:
     assert not {drive.seed for drive in TRAIN} & {drive.seed for drive in HELD_OUT}
     assert len({drive.seed for drive in TRAIN + HELD_OUT}) == len(TRAIN + HELD_OUT)
-    searched, judged = ({(drive.manoeuvre, drive.vehicle) for drive in drives} for drives in (TRAIN, HELD_OUT))
+    searched, judged = (
+        {(drive.manoeuvre, drive.vehicle) for drive in drives} for drives in (TRAIN, HELD_OUT)
+    )
     assert not searched & judged
 
 
@@ -64,7 +66,13 @@ def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
     single = [
         scores_of(
             Memberships(),
-            TuningSet((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]], drives.used[:, [n]]),
+            TuningSet(
+                (vehicle,),
+                drives.t[:, [n]],
+                drives.signals[:, [n]],
+                drives.mu[:, [n]],
+                drives.used[:, [n]],
+            ),
             ESTIMATOR,
         )
         for n, vehicle in enumerate(drives.vehicles)
@@ -76,20 +84,29 @@ def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
 
 
 def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
-    lower, upper, truth = np.array([0.2, 0.2, 0.2]), np.array([0.6, 0.6, 0.6]), np.array([0.4, 0.1, 0.7])
+    lower, upper, truth = (
+        np.array([0.2, 0.2, 0.2]),
+        np.array([0.6, 0.6, 0.6]),
+        np.array([0.4, 0.1, 0.7]),
+    )
     np.testing.assert_allclose(interval_score(lower, upper, truth), [0.4, 2.4, 2.4])
 
 
 def test_interval_score_is_least_at_the_true_quantiles() -> None:
     """A proper score: neither a wider nor a narrower interval does better on draws from a known distribution."""
     draws = np.random.default_rng(1).normal(size=200_000)
-    scores = {z: float(interval_score(np.full(1, -z), np.full(1, z), draws).mean()) for z in (1.2, 1.645, 2.2)}
+    scores = {
+        z: float(interval_score(np.full(1, -z), np.full(1, z), draws).mean())
+        for z in (1.2, 1.645, 2.2)
+    }
     assert scores[1.645] < min(scores[1.2], scores[2.2])
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
     """R times 4.5 makes the innovations less likely than R as it is, however seldom it is surprised."""
-    usual, inflated = (scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5))
+    usual, inflated = (
+        scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)
+    )
     assert inflated.log_likelihood < usual.log_likelihood
     assert inflated.nis_ratio < usual.nis_ratio
 
@@ -128,7 +145,9 @@ def test_an_unknown_objective_is_refused(drives: TuningSet) -> None:
 
 def test_default_is_among_the_choices_and_all_lie_within_the_bounds() -> None:
     lower, upper = Memberships.bounds()
-    for value, positions, least, largest in zip(Memberships().to_vector(), choices(7), lower, upper, strict=True):
+    for value, positions, least, largest in zip(
+        Memberships().to_vector(), choices(7), lower, upper, strict=True
+    ):
         assert value in positions
         assert np.all((least <= positions) & (positions <= largest))
         assert np.all(np.diff(positions) > 0)
@@ -161,7 +180,10 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], objective: str
 ) -> None:
     out = tmp_path / "tuned.json"
-    assert tune.run(arguments("--quick", "--seed", "4", "--objective", objective, "--out", str(out))) == 0
+    assert (
+        tune.run(arguments("--quick", "--seed", "4", "--objective", objective, "--out", str(out)))
+        == 0
+    )
     reported = capsys.readouterr().out
     assert reported.count("elapsed") == 2 * tune.QUICK_ITERATIONS
     for way in WAYS:
@@ -175,13 +197,20 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         provenance.command
         == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --repeats 1 --objective {objective} --quick"
     )
-    assert max(scores, key=lambda way: tune._worth(scores[way].held_out, objective)) == tuned.document.winner
-    assert {way: len(found) for way, found in tuned.document.candidates.items()} == {"random": 1, "colony": 1}
+    assert (
+        max(scores, key=lambda way: tune._worth(scores[way].held_out, objective))
+        == tuned.document.winner
+    )
+    assert {way: len(found) for way, found in tuned.document.candidates.items()} == {
+        "random": 1,
+        "colony": 1,
+    }
     assert provenance.budget.evaluations == {"random": 6, "colony": 6}
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--ants", "0"), ("--repeats", "0"), ("--iterations", "-2"), ("--seed", "-1")]
+    ("option", "value"),
+    [("--ants", "0"), ("--repeats", "0"), ("--iterations", "-2"), ("--seed", "-1")],
 )
 def test_options_out_of_range_are_refused_by_name(option: str, value: str) -> None:
     with pytest.raises(InputError, match=option):
@@ -199,7 +228,9 @@ def test_progress_line_tells_iteration_best_mean_elapsed_and_remaining_time() ->
 
 def test_table_has_a_row_per_way_and_set_of_drives() -> None:
     score = Score(interval_score=0.5, coverage=0.9, log_likelihood=1.0, nis_ratio=1.1)
-    rows = tune.table({way: SplitScores(train=score, held_out=score) for way in WAYS}).splitlines()[1:]
+    rows = tune.table({way: SplitScores(train=score, held_out=score) for way in WAYS}).splitlines()[
+        1:
+    ]
     assert [row.split()[0] for row in rows] == [way for way in WAYS for _ in range(2)]
 
 
@@ -213,8 +244,21 @@ def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
     logs, found = [], []
     for name, seed in (("one", "1"), ("two", "2")):
         logs.append(str(tmp_path / f"{name}.parquet"))
-        words = ["--duration", "6", "--seed", seed, "--sensors", "rough", "--rate", "50", "--out", logs[-1]]
-        assert main(["simulate", "slalom", *words, "--vehicle-out", str(tmp_path / "car.json")]) == 0
+        words = [
+            "--duration",
+            "6",
+            "--seed",
+            seed,
+            "--sensors",
+            "rough",
+            "--rate",
+            "50",
+            "--out",
+            logs[-1],
+        ]
+        assert (
+            main(["simulate", "slalom", *words, "--vehicle-out", str(tmp_path / "car.json")]) == 0
+        )
     car = ["--vehicle", str(tmp_path / "car.json")]
     for given in (logs[:1], logs):
         out = tmp_path / f"{len(given)}.json"
@@ -224,7 +268,15 @@ def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
         assert found[-1].scores["default"].held_out.interval_score is None
         assert str(tmp_path) not in out.read_text()
     assert found[0].scores != found[1].scores
-    replayed = ["replay", logs[0], *car, "--memberships", str(out), "--out", str(tmp_path / "e.parquet")]
+    replayed = [
+        "replay",
+        logs[0],
+        *car,
+        "--memberships",
+        str(out),
+        "--out",
+        str(tmp_path / "e.parquet"),
+    ]
     assert main(replayed) in (0, 3)
     assert main(["tune", *logs, *car, "--quick", "--objective", "interval", "--out", str(out)]) == 2
     assert main(["tune", logs[0], *car, "--out", str(out)]) == 2

@@ -24,7 +24,9 @@ def hill(vector: FloatArray) -> float:
     return -float(((vector - PEAK) ** 2).sum())
 
 
-def run(search: Search, *, evaluations: int, seed: int = 1, start: FloatArray | None = None) -> Result:
+def run(
+    search: Search, *, evaluations: int, seed: int = 1, start: FloatArray | None = None
+) -> Result:
     problem = Problem(hill, [RANGE] * 4, start)
     return search(problem, ants=10, iterations=evaluations // 10, rng=np.random.default_rng(seed))
 
@@ -47,7 +49,9 @@ def test_budget_is_kept_and_the_start_is_never_lost(name: str) -> None:
 
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_same_seed_gives_the_same_vector(name: str) -> None:
-    first, again, other = (run(CONTINUOUS[name], evaluations=50, seed=seed).best for seed in (1, 1, 2))
+    first, again, other = (
+        run(CONTINUOUS[name], evaluations=50, seed=seed).best for seed in (1, 1, 2)
+    )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -60,7 +64,9 @@ def test_vectors_stay_in_range_and_admissible(name: str) -> None:
         seen.append(vector)
         return float(vector.sum())
 
-    problem = Problem(objective, [RANGE] * 2, admissible=lambda vector: bool(vector[0] <= vector[1]))
+    problem = Problem(
+        objective, [RANGE] * 2, admissible=lambda vector: bool(vector[0] <= vector[1])
+    )
     CONTINUOUS[name](problem, ants=5, iterations=10, rng=np.random.default_rng(0))
     vectors = np.array(seen)
     assert np.abs(vectors).max() <= 1.0

@@ -36,9 +36,13 @@ def drives() -> StudySet:
     return record(TRAIN[:2])
 
 
-def test_drives_that_judge_share_neither_seed_nor_manoeuvre_with_those_that_are_searched_on() -> None:
+def test_drives_that_judge_share_neither_seed_nor_manoeuvre_with_those_that_are_searched_on() -> (
+    None
+):
     for name in ("seed", "manoeuvre"):
-        assert not {getattr(drive, name) for drive in TRAIN} & {getattr(drive, name) for drive in HELD_OUT}
+        assert not {getattr(drive, name) for drive in TRAIN} & {
+            getattr(drive, name) for drive in HELD_OUT
+        }
 
 
 def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: StudySet) -> None:
@@ -48,16 +52,25 @@ def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: Stud
     error = schedule[:, :, S.YAW_RATE] - drives.truth[:, :, 2]
     seconds = [error[k : k + 100].var() for k in (0, 100, 200)]
     assert seconds == pytest.approx(SCHEDULE, rel=0.35)
-    assert (right[:, :, S.YAW_RATE] - drives.truth[:, :, 2]).var() == pytest.approx(VARIANCE, rel=0.2)
+    assert (right[:, :, S.YAW_RATE] - drives.truth[:, :, 2]).var() == pytest.approx(
+        VARIANCE, rel=0.2
+    )
 
 
 def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
-    scales = [study.setting(CONDITIONS[name]).noise[0] / VARIANCE for name in ("right", "too-small", "too-large")]
+    scales = [
+        study.setting(CONDITIONS[name]).noise[0] / VARIANCE
+        for name in ("right", "too-small", "too-large")
+    ]
     assert scales == pytest.approx([1.0, 0.1, 10.0])
 
 
-def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(drives: StudySet) -> None:
-    right, small, large = (scores_of(STILL, drives, name) for name in ("right", "too-small", "too-large"))
+def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(
+    drives: StudySet,
+) -> None:
+    right, small, large = (
+        scores_of(STILL, drives, name) for name in ("right", "too-small", "too-large")
+    )
     assert right.log_likelihood > max(small.log_likelihood, large.log_likelihood) + 50.0
     assert right.nis == pytest.approx(1.0, abs=0.1)
     assert small.nis > 7.0
@@ -67,13 +80,19 @@ def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_on
 def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: StudySet) -> None:
     best = scores_of(STILL, drives, "right").log_likelihood
     for name in ("too-small", "too-large"):
-        lost, left = (best - scores_of(sets, drives, name).log_likelihood for sets in (STILL, Memberships()))
+        lost, left = (
+            best - scores_of(sets, drives, name).log_likelihood for sets in (STILL, Memberships())
+        )
         assert left < 0.2 * lost
 
 
-def test_a_search_is_never_worse_than_the_untuned_sets_and_the_same_every_time(drives: StudySet) -> None:
+def test_a_search_is_never_worse_than_the_untuned_sets_and_the_same_every_time(
+    drives: StudySet,
+) -> None:
     for way in study.WAYS:
-        first, again = (search(way, drives, ants=3, iterations=2, positions=7, seed=5) for _ in range(2))
+        first, again = (
+            search(way, drives, ants=3, iterations=2, positions=7, seed=5) for _ in range(2)
+        )
         assert first.value >= overall(Memberships(), drives)
         assert np.array_equal(first.best, again.best)
         assert first.history == again.history

@@ -32,7 +32,9 @@ LEVEL = 0.35
 HOUR = 3600
 
 
-def measured(*slot_mu: tuple[int, float], std: float = 0.01, span: tuple[int, int] | None = None) -> Any:  # noqa: ANN401
+def measured(
+    *slot_mu: tuple[int, float], std: float = 0.01, span: tuple[int, int] | None = None
+) -> Any:  # noqa: ANN401
     slot, mu = (np.array(column) for column in zip(*slot_mu, strict=True))
     half = np.full(len(mu), 1.645 * std)
     whole = (int(slot[0]) * SLOT_S, (int(slot[-1]) + 1) * SLOT_S)
@@ -40,7 +42,9 @@ def measured(*slot_mu: tuple[int, float], std: float = 0.01, span: tuple[int, in
 
 
 def test_a_breach_runs_from_the_first_slot_below_to_the_next_that_is_not() -> None:
-    by_mean, least, most, begin = measured((10, 0.8), (11, 0.2), (12, 0.2), (13, 0.8), (14, 0.2), (15, 0.8))
+    by_mean, least, most, begin = measured(
+        (10, 0.8), (11, 0.2), (12, 0.2), (13, 0.8), (14, 0.2), (15, 0.8)
+    )
     assert (by_mean, least, most) == (2 * SLOT_S, 2 * SLOT_S, 2 * SLOT_S)
     assert begin == 11 * SLOT_S
 
@@ -76,7 +80,9 @@ def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
     assert min(hits) > 0.88, hits
 
 
-def test_each_link_that_froze_is_told_and_no_other(asked: Ask, links: Path, rows: pd.DataFrame) -> None:
+def test_each_link_that_froze_is_told_and_no_other(
+    asked: Ask, links: Path, rows: pd.DataFrame
+) -> None:
     found = asked("contract", roads=links, level=LEVEL, within_s=1.0 * HOUR).to_pandas()
     roads = pq.read_table(links).to_pandas()
     told = rows[rows["value"]].merge(roads, on=["cell", "sector"])
@@ -91,18 +97,27 @@ def test_each_link_that_froze_is_told_and_no_other(asked: Ask, links: Path, rows
     assert not len(found[(found["verdict"] == KEPT) & (found["measured_share"] < LEAST_SHARE)])
     assert (found["least_s"] <= found["most_s"]).all()
     assert (found["breach_s"] <= found["most_s"].clip(lower=SLOT_S)).all()
-    dry = found[[worst[key] > 1.4 * LEVEL for key in zip(found["link"], found["direction"], strict=True)]]
+    dry = found[
+        [worst[key] > 1.4 * LEVEL for key in zip(found["link"], found["direction"], strict=True)]
+    ]
     assert len(dry)
     assert (dry["least_s"] == 0).all()
-    counts = told.groupby(["link", "direction"]).agg(values=("mu", "size"), vehicles=("vehicle", "nunique"))
+    counts = told.groupby(["link", "direction"]).agg(
+        values=("mu", "size"), vehicles=("vehicle", "nunique")
+    )
     for row in found.itertuples():
         assert (row.values, row.vehicles) == tuple(counts.loc[(row.link, row.direction)])
 
 
 def test_the_time_that_was_agreed_and_the_share_measured_decide(asked: Ask, links: Path) -> None:
-    short, long = (asked("contract", roads=links, level=LEVEL, within_s=s).to_pandas() for s in (600.0, 3e6))
+    short, long = (
+        asked("contract", roads=links, level=LEVEL, within_s=s).to_pandas() for s in (600.0, 3e6)
+    )
     assert (short["verdict"] == BROKEN).sum() > (long["verdict"] == BROKEN).sum() == 0
-    assert ((long["verdict"] == KEPT) == ((long["measured_share"] >= LEAST_SHARE) & (long["vehicles"] >= 2))).all()
+    assert (
+        (long["verdict"] == KEPT)
+        == ((long["measured_share"] >= LEAST_SHARE) & (long["vehicles"] >= 2))
+    ).all()
     assert not (short["verdict"] == KEPT).any(), "nobody measured every ten minutes"
     assert set(short["verdict"]) == {BROKEN, UNKNOWN}
 
@@ -126,7 +141,17 @@ def test_what_is_missing_is_said(asked: Ask, links: Path, lacks: str) -> None:
 def test_the_command_asks_it_of_an_archive(
     archive: Path, links: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["analyze", "contract", "--archive", str(archive), "--roads", str(links), "--level", ".35", "--json"]
+    words = [
+        "analyze",
+        "contract",
+        "--archive",
+        str(archive),
+        "--roads",
+        str(links),
+        "--level",
+        ".35",
+        "--json",
+    ]
 
     def verdicts(*more: str) -> list[str]:
         assert main([*words, *more]) == 0

@@ -28,7 +28,9 @@ def place(x: float, y: float) -> tuple[float, float]:
     return LATITUDE + y / METRES_PER_DEGREE, LONGITUDE + x / EAST
 
 
-def road(name: str, *points: tuple[float, float], both: bool = True, kind: str = "primary") -> list[DirectedLink]:
+def road(
+    name: str, *points: tuple[float, float], both: bool = True, kind: str = "primary"
+) -> list[DirectedLink]:
     latitude, longitude = np.array([place(*point) for point in points]).T
     there = DirectedLink(name, "forward", name, kind, latitude, longitude)
     back = DirectedLink(name, "backward", name, kind, latitude[::-1], longitude[::-1])
@@ -61,7 +63,9 @@ def test_at_a_crossing_the_heading_decides_and_beside_it_the_distance() -> None:
     assert on(frame, 0, 0, 0) == [("east", "forward")]
     assert on(frame, 0, 0, 1) == [("north", "forward")]
     assert on(frame, 0, 0, 3) == [("north", "backward")]
-    apart = frame_of(road("a", (0, 0), (500, 0), both=False), road("b", (0, 24), (500, 24), both=False))
+    apart = frame_of(
+        road("a", (0, 0), (500, 0), both=False), road("b", (0, 24), (500, 24), both=False)
+    )
     assert on(apart, 250, 0, 0) == [("a", "forward")]
     assert on(apart, 250, 24, 0) == [("b", "forward")]
     assert apart.ambiguous_m.min() < 10.0, "a cell between them is little nearer to one"
@@ -105,7 +109,9 @@ def test_it_is_right_at_any_latitude() -> None:
         assert own.length_m.iloc[0] == pytest.approx(400, rel=1e-3)
 
 
-def test_the_command_writes_what_the_question_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_what_the_question_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "roads.parquet"
     assert main(["roads", str(extract(tmp_path / "town.osm")), "--out", str(out)]) == 0
     assert "on 5 directed links" in capsys.readouterr().out
@@ -125,7 +131,10 @@ def test_id_and_name_of_lines_are_those_of_the_columns_that_are_given(tmp_path: 
     feature = {"type": "Feature", "properties": columns, "geometry": line}
     lines, out = tmp_path / "lines.geojson", tmp_path / "roads.parquet"
     lines.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    for more, link, name in (([], "1", "First"), (["--id", "nr", "--name", "street"], "E6", "Avenue")):
+    for more, link, name in (
+        ([], "1", "First"),
+        (["--id", "nr", "--name", "street"], "E6", "Avenue"),
+    ):
         assert main(["roads", str(lines), "--out", str(out), *more]) == 0
         found = pq.read_table(out)
         assert (set(found["link"].to_pylist()), set(found["name"].to_pylist())) == ({link}, {name})

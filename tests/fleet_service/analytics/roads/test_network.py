@@ -25,9 +25,14 @@ WAYS = {
 
 def extract(path: Path) -> Path:
     lines = ["<?xml version='1.0'?><osm version='0.6' generator='test'>"]
-    lines += [f"<node id='{k}' version='1' lat='{lat}' lon='{lon}'/>" for k, (lat, lon) in enumerate(NODES, 1)]
+    lines += [
+        f"<node id='{k}' version='1' lat='{lat}' lon='{lon}'/>"
+        for k, (lat, lon) in enumerate(NODES, 1)
+    ]
     for way, (nodes, tags) in WAYS.items():
-        parts = [f"<nd ref='{node}'/>" for node in nodes] + [f"<tag k='{k}' v='{v}'/>" for k, v in tags.items()]
+        parts = [f"<nd ref='{node}'/>" for node in nodes] + [
+            f"<tag k='{k}' v='{v}'/>" for k, v in tags.items()
+        ]
         lines.append(f"<way id='{way}' version='1'>{''.join(parts)}</way>")
     path.write_text("\n".join([*lines, "</osm>"]))
     return path
@@ -50,7 +55,11 @@ def test_an_extract_gives_each_direction_that_cars_may_drive(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("ending", [".gpkg", ".geojson", ".parquet"])
 def test_lines_with_ids_come_from_any_file_in_any_coordinates(tmp_path: Path, ending: str) -> None:
-    lines = [LineString([(11.97, 57.70), (11.98, 57.70)]), LineString([(11.98, 57.70), (11.98, 57.71)]), Point(0, 0)]
+    lines = [
+        LineString([(11.97, 57.70), (11.98, 57.70)]),
+        LineString([(11.98, 57.70), (11.98, 57.71)]),
+        Point(0, 0),
+    ]
     frame = geopandas.GeoDataFrame(
         {"road": ["a", "b", "c"], "called": ["E6", None, None], "oneway": ["no", "forward", "no"]},
         geometry=lines, crs=4326,
@@ -79,7 +88,9 @@ def test_lines_with_ids_come_from_any_file_in_any_coordinates(tmp_path: Path, en
         ("a.txt", b"", "extract"),
     ],
 )
-def test_what_is_no_network_is_an_error_that_names_it(name: str, content: bytes, field: str, tmp_path: Path) -> None:
+def test_what_is_no_network_is_an_error_that_names_it(
+    name: str, content: bytes, field: str, tmp_path: Path
+) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError) as error:
         read_network(tmp_path / name)

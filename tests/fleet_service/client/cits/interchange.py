@@ -24,7 +24,9 @@ class Interchange:
 
 
 class _Handler(MessagingHandler):
-    def __init__(self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector) -> None:
+    def __init__(
+        self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector
+    ) -> None:
         super().__init__(prefetch=500)
         self._there, self._offered, self._injector = there, deque(offered), injector
         self.listening = threading.Event()

@@ -38,7 +38,10 @@ PLACE = (57.7, 11.97)
 def random_denm(draw: np.random.Generator) -> Denm:
     """A DENM with everything that ours can have."""
     position = (float(draw.uniform(-80, 80)), float(draw.uniform(-179, 179)))
-    near = [(position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3))) for _ in range(40)]
+    near = [
+        (position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3)))
+        for _ in range(40)
+    ]
     endings: list[Termination | None] = [None, None, "isCancellation", "isNegation"]
     termination = endings[int(draw.integers(0, 4))]
     heading = float(draw.uniform(0, 360)) if termination is None and draw.random() < 0.5 else None
@@ -67,7 +70,10 @@ def test_second_decoder_reads_and_writes_the_same_bytes() -> None:
         read = decode(data)
         assert encode(read) == data
         if sent.termination is None:
-            assert (read.sub_cause, len(read.history)) == (sent.sub_cause, min(len(sent.history), 23))
+            assert (read.sub_cause, len(read.history)) == (
+                sent.sub_cause,
+                min(len(sent.history), 23),
+            )
 
 
 def test_a_foreign_denm_with_further_containers_is_read() -> None:
@@ -87,7 +93,9 @@ def test_bytes_that_are_no_denm_are_refused(data: bytes) -> None:
         decode(data)
 
 
-def stretch(name: str, mu: float = 0.15, place: tuple[float, float] = PLACE, cells: int = 2) -> StretchAlert:
+def stretch(
+    name: str, mu: float = 0.15, place: tuple[float, float] = PLACE, cells: int = 2
+) -> StretchAlert:
     points = tuple((place[0] + 1e-4 * k, place[1]) for k in range(cells))
     return StretchAlert(
         name, "raised", START, START, 20.0, "north-south", ("north",), *place, (0, 0, 0, 0), cells, mu, 0.1, 0.3, 0.95,
@@ -127,14 +135,20 @@ def test_an_event_keeps_its_number_over_restarts_until_it_is_cancelled(tmp_path:
     assert (changed.sequence, other.sequence) == (0, 1)
     assert changed.referenced > begun.referenced
     run.now += RENEW_NS
-    assert {one.sequence for one in run.step(stretch("a", cells=5), stretch("b", place=(57.8, 11.9)))} == {0, 1}
+    assert {
+        one.sequence for one in run.step(stretch("a", cells=5), stretch("b", place=(57.8, 11.9)))
+    } == {0, 1}
     run.start()
-    assert run.step(stretch("b", place=(57.8, 11.9)), heard=False) == [], "no service answers there: nothing ends"
+    assert run.step(stretch("b", place=(57.8, 11.9)), heard=False) == [], (
+        "no service answers there: nothing ends"
+    )
     (ended,) = run.step(stretch("b", place=(57.8, 11.9)))
     assert (ended.sequence, ended.termination) == (0, "isCancellation")
     run.start()
     assert run.step(stretch("b", place=(57.8, 11.9))) == []
-    assert [one.sequence for one in run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))] == [2], "a new event"
+    assert [one.sequence for one in run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))] == [
+        2
+    ], "a new event"
     assert begun.validity_s * NS == VALID_NS
 
 
@@ -178,7 +192,9 @@ def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_
     def keep(body: bytes, _: Mapping[str, Any]) -> None:
         came.append(body)
 
-    link = AmqpLink(url, "deliveries", "subscriptions", on_accepted=settled.append, on_message=keep).open()
+    link = AmqpLink(
+        url, "deliveries", "subscriptions", on_accepted=settled.append, on_message=keep
+    ).open()
     run = Run(tmp_path / "cits.json", settles=False)
     run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))
     for parcel in run.sent:
@@ -188,7 +204,9 @@ def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_
         link.close()
     assert sorted(settled) == sorted(parcel.name for parcel in run.sent)
     assert [body for body, _ in there.received] == [parcel.body for parcel in run.sent]
-    assert all(given["messageType"] == "DENM" and given["causeCode"] == 6 for _, given in there.received)
+    assert all(
+        given["messageType"] == "DENM" and given["causeCode"] == 6 for _, given in there.received
+    )
     assert came == [foreign]
 
 
@@ -199,8 +217,12 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
     try:
         for turn in range(10):
             now = START + 30 * turn * NS
-            batches = reports(replace(denm, referenced=now, sequence=turn), "cits-se", 5, 1 + turn, now)
-            engine.intake.ingest([Message(Kind.OBSERVATION, place, payload, JSON) for place, payload in batches], now)
+            batches = reports(
+                replace(denm, referenced=now, sequence=turn), "cits-se", 5, 1 + turn, now
+            )
+            engine.intake.ingest(
+                [Message(Kind.OBSERVATION, place, payload, JSON) for place, payload in batches], now
+            )
         assert engine.counts[Kind.OBSERVATION] == 10, dict(engine.counts)
         assert engine.alerts.all == []
     finally:
