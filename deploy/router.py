@@ -1,4 +1,4 @@
-"""Zenoh router in a process of its own: `gripmap router [--config FILE] [--listen ENDPOINT]`.
+"""`gripmap router [--config FILE] [--listen ENDPOINT]`: a Zenoh router in a process of its own.
 
 The Python package of Zenoh contains the router, so no other binary is needed. It prints `router: tcp/…` when it listens
 (with the real port if port 0 was given) and ends on SIGINT or SIGTERM.

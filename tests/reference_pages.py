@@ -159,6 +159,7 @@ def all_metrics(root: Path) -> Shown:
         unanswered_s=0.0,
         fill=0.0,
         links=1,
+        link_watches=[],
         unsettled=lambda: 0,
     )
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)

@@ -12,17 +12,17 @@
   </rules>
   <symbols>
    <symbol type="fill" name="0" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="71,21,103,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="47,0,91,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="1" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="60,80,138,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="147,19,91,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="2" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="43,117,142,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="196,69,82,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="3" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="32,158,136,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="244,122,61,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="4" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="80,195,106,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="246,178,63,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="5" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
-    <Option type="QString" name="color" value="181,221,44,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
+    <Option type="QString" name="color" value="246,236,115,255"/><Option type="QString" name="outline_style" value="no"/><Option type="QString" name="style" value="solid"/></Option></layer></symbol>
    <symbol type="fill" name="6" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">
     <Option type="QString" name="color" value="136,136,136,255"/><Option type="QString" name="outline_style" value="solid"/><Option type="QString" name="outline_color" value="136,136,136,255"/><Option type="QString" name="outline_width" value="0.1"/><Option type="QString" name="style" value="b_diagonal"/></Option></layer></symbol>
   </symbols>

@@ -107,7 +107,8 @@ def turns(made: Service) -> tuple[int, int]:
         patch.setattr(service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
         patch.setattr(service, "IDLE_S", 0.0)
         patch.setattr(made._rounds, "_clock", lambda: clock[0])
-        for owner, name in ((made.engine, "begin_flush"), (made.engine.state.map, "take_dirty")):
+        owners = ((made.engine.settlement, "begin_flush"), (made.engine.state.map, "take_dirty"))
+        for owner, name in owners:
             patch.setattr(owner, name, counted(name))
         for _ in range(10):
             clock[0] += 0.3

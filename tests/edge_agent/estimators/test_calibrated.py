@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.calibrated import LEARNED, spreads_of
 from edge_agent.estimators.friction_mixture.constants import STATES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import nominal_states
@@ -34,7 +35,7 @@ def test_each_learned_quantity_narrows_its_state_and_a_vague_one_does_not() -> N
 def test_each_filter_of_a_bank_has_the_prior_of_its_own_vehicle() -> None:
     known = CAR.model_copy(update={"calibration": Calibration(drives=3, ax=(0.2, 0.05))})
     filters = new_filters(
-        np.zeros((2, 12)), NOMINAL, NOMINAL.mean, spreads_of([CAR, known], NOMINAL.std)
+        np.zeros((2, len(Parameter))), NOMINAL, NOMINAL.mean, spreads_of([CAR, known], NOMINAL.std)
     )
     spreads = filters["nominal"]["std"]
     assert spreads.shape == (2, STATES)

@@ -341,28 +341,6 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
         assert "nobody knows" in seen.page.locator("#route-worst").inner_text()
 
 
-def test_all_of_a_map_fills_the_window_until_somebody_looks_elsewhere(
-    page: RunningPage, drive: Drive
-) -> None:
-    drive("ice", "wet")
-    with shown(page) as seen:
-        waits(seen, _FITTED)
-        assert seen.page.evaluate("map.clientHeight === map.parentElement.clientHeight"), (
-            "no strip without a map below it"
-        )
-        drive("dry", "snow")
-        waits(seen, f"document.body.dataset.kinds.split(',')[{DRY}] > 0 && ({_FITTED})")
-        zoom = seen.page.evaluate("gripmap.view.zoom")
-        seen.page.locator("#controls button").first.click()
-        drive("avenue", "passed")
-        waits(
-            seen,
-            f"gripmap.now.extent.south - gripmap.now.extent.north > 1e-5 && gripmap.view.zoom === {zoom} + 1",
-        )
-        seen.page.locator("#controls button").last.click()
-        waits(seen, _FITTED)
-
-
 _FITTED: Final = """(() => {
   const { view, now } = gripmap, extent = now.extent, held = [...now.known].every(tile => now.tiles.has(tile));
   if (!extent || !held) return false;

@@ -234,7 +234,7 @@ def test_settings_that_cannot_be_used_say_which_and_why(
         assert told.value.field == field
         assert SECRET not in str(told.value)
     monkeypatch.setitem(sys.modules, "obstore", None)
-    with pytest.raises(InputError, match="obstore, which is not installed.*gripmap\\[objects\\]"):
+    with pytest.raises(InputError, match="obstore, which is not installed.*\\[objects\\]"):
         BucketReplica(tmp_path, "s3://bucket", {})
 
 

@@ -98,14 +98,13 @@ def test_roads_that_lead_nowhere_are_refused() -> None:
 
 @EVERY
 def test_ice_appears_at_its_time_and_not_before(scenario: Scenario) -> None:
-    (event,) = scenario.events
-    x, y = np.array([event.x]), np.array([event.y])
-    before, after = (
-        scenario.friction(event.start - 0.01, x, y),
-        scenario.friction(event.start, x, y),
-    )
-    assert before[0] > 0.5
-    assert after[0] == ICE
+    assert scenario.events
+    for event in scenario.events:
+        x, y = np.array([event.x]), np.array([event.y])
+        before = scenario.friction(event.start - 0.01, x, y)
+        after = scenario.friction(event.start, x, y)
+        assert before[0] > 0.5
+        assert after[0] == ICE
 
 
 def test_the_event_of_the_demonstration_is_at_seventy_seconds() -> None:
