@@ -201,7 +201,8 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
     finally:
         router.send(signal.SIGCONT)
         router.kill()
-    assert "no session at tcp/127.0.0.1" in done.stderr
+    late = ("a session did not close", "no session at tcp/127.0.0.1")  # when Zenoh gave up
+    assert any(words in done.stderr for words in late)
     assert json.loads(done.stdout)["unsettled"] > 20
     assert done.returncode == 1
     if well:

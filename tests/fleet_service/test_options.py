@@ -120,6 +120,19 @@ SHOWN_BELOW: Final = {
         "--connect",
         "--config",
     },
+    "cits": {
+        "--connect",
+        "--config",
+        "--amqp",
+        "--to",
+        "--from",
+        "--selector",
+        "--witness",
+        "--station",
+        "--country",
+        "--publisher",
+        "--state",
+    },
     "page": {  # page/test_server.py
         "--archive",
         "--host",
@@ -155,7 +168,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "completion": ("../test_commands",), "certs": ("enrolment/test_certificates",), "run": (),
     "export": ("client/test_datex", "archive/test_iceberg"), "roads": ("analytics/roads/test_join",),
     "analyze": ("analytics/roads/test_contract",), "query": (), "watch": ("test_alerts",),
-    "page": ("page/test_server",), "hand-over": ("shards/test_moving",),
+    "page": ("page/test_server",), "cits": ("client/cits/test_command",), "hand-over": ("shards/test_moving",),
 }  # fmt: skip
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}

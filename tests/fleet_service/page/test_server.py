@@ -22,6 +22,7 @@ import pytest
 import zenoh
 
 from fleet_service.archive.format import snapshots
+from fleet_service.cli import main
 from fleet_service.fusion import Fusion
 from fleet_service.page.files import Files
 from fleet_service.page.health import values
@@ -350,3 +351,13 @@ def test_every_option_of_the_command_does_what_it_says(
         page.wait(30.0)
     finally:
         page.kill()
+
+
+def test_files_of_the_map_that_are_missing_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    none = str(tmp_path / "none")
+    base = ["--base-map", none + ".pmtiles", "--attribution", "the town"]
+    for words in (base, ["--roads", none + ".parquet"]):
+        assert main(["page", "--connect", "tcp/127.0.0.1:1", *words]) == 2
+        assert "none" in capsys.readouterr().err
