@@ -106,9 +106,10 @@ SHOWN_BELOW: Final = {
     "export": {  # client/test_datex.py, archive/test_iceberg.py
         *("--country", "--supplier", "--status", "--follow", "--connect", "--config"),
         *("--catalog", "--namespace", "--at"),
+        *("--exclude-ice", "--last", "--roads"),  # test_refused_files.py
     },
     "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
-    "analyze": {"--roads", "--level", "--within"},  # analytics/roads/test_contract.py
+    "analyze": {"--roads", "--level", "--within", "--last"},  # analytics/roads/test_contract.py
     "query": {
         "--bbox",
         "--route",
@@ -120,6 +121,7 @@ SHOWN_BELOW: Final = {
         "--connect",
         "--config",
     },
+    "router": {"--config", "--listen", "--metrics-host", "--metrics-port"},
     "cits": {
         "--connect",
         "--config",
@@ -166,8 +168,10 @@ SHOWN_BELOW: Final = {
 GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "retention": ("../test_commands",), "forget": ("../test_commands", "archive/test_retention", "app/test_copy"),
     "completion": ("../test_commands",), "certs": ("enrolment/test_certificates",), "run": (),
-    "export": ("client/test_datex", "archive/test_iceberg"), "roads": ("analytics/roads/test_join",),
-    "analyze": ("analytics/roads/test_contract",), "query": (), "watch": ("test_alerts",),
+    "export": ("client/test_datex", "archive/test_iceberg", "test_refused_files"),
+    "roads": ("analytics/roads/test_join",),
+    "analyze": ("analytics/roads/test_contract", "test_refused_files"),
+    "router": ("test_refused_files",), "query": (), "watch": ("test_alerts",),
     "page": ("page/test_server",), "cits": ("client/cits/test_command",), "hand-over": ("shards/test_moving",),
 }  # fmt: skip
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.

@@ -18,5 +18,6 @@ def test_command_without_a_direction_is_refused(capsys: pytest.CaptureFixture[st
 
 def test_missing_configuration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--amqp", "amqp://127.0.0.1:1", "--to", "ours", "--from", "theirs"]
-    assert main(["cits", *words, "--witness", "cits-se", "--config", "none.json"]) == 2
+    more = ["--witness", "cits-se", "--station", "7", *WHOSE, "--config", "none.json"]
+    assert main(["cits", *words, *more]) == 2
     assert "none.json" in capsys.readouterr().err
