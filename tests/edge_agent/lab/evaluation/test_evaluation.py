@@ -163,6 +163,7 @@ def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
     assert "DOES NOT HOLD" in text
     assert "0 of 1 bars hold" in text
     assert "0.3 ± 0.1" in text
+    assert "What the difference is made of" in text
 
 
 @pytest.mark.parametrize(
