@@ -58,7 +58,7 @@ MOVES = {
     "demand_power": Move(
         "penalty", "acceleration", 0.5
     ),  # above the threshold all is evidence, nothing is charged
-    "plausible_loss": Move("least probabilities", "constant-radius", 1.08),
+    "plausible_loss": Move("least probabilities", "constant-radius", 1.09),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
     "abrupt_share": Move("upper", "joints", 0.9, LESS),  # a bump reads as slip
@@ -145,7 +145,7 @@ MOVES = {
     "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "acceleration", 0.95),
-    "lag": Move("nis", "turn and straight", 1.01),
+    "lag": Move("nis", "pulses", 0.85),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.89),
     # wheels that tell the motion without a tyre
