@@ -84,6 +84,5 @@ class Health(IntFlag):
     OUTLIER = 64  # a reading that was refused
     SLIDING = 128  # a wheel past its peak (locked or spinning)
     RESET = 256  # the filter was started anew
-    CONTRADICTION = (
-        512  # no friction explains what is measured: friction is the prior's, and its evidence flat
-    )
+    # no friction explains what is measured: friction is the prior's, and its evidence flat
+    CONTRADICTION = 512

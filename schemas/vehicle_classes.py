@@ -18,9 +18,8 @@ FRONT_PER_LOAD: Final = 13.0  # [1/rad] cornering stiffness over load, rim angle
 REAR_PER_LOAD: Final = 20.0
 ALONG_PER_LOAD: Final = 20.0  # [1] longitudinal slip stiffness over load
 WHEEL_INERTIA: Final = 1.3  # [kg m^2]
-INERTIA_SHARE: Final = (
-    0.97  # yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
-)
+# yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
+INERTIA_SHARE: Final = 0.97
 
 
 class Size(NamedTuple):

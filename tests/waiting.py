@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 import zenoh
 
-PATIENCE_S = (
-    100.0  # a condition that holds is seen at once; this is for a machine with much else to do
-)
+# a condition that holds is seen at once; this is for a machine with much else to do
+PATIENCE_S = 100.0
 
 
 def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> None:

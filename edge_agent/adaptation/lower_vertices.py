@@ -27,9 +27,8 @@ from schemas.numeric import FloatArray
 
 SETS: Final = 5
 FEET: Final = 2 * (SETS - 1)
-LEAST_OVERLAP: Final = (
-    0.02  # share of the distance of two peaks by which their sets overlap at least
-)
+# share of the distance of two peaks by which their sets overlap at least
+LEAST_OVERLAP: Final = 0.02
 
 
 @dataclass(frozen=True)

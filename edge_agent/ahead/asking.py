@@ -17,17 +17,14 @@ from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS
 
-BESIDE_M: Final = (
-    12.0  # of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
-)
+# of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
+BESIDE_M: Final = 12.0
 AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 bytes
 LONGEST_M: Final = 300.0
-FURTHER_M: Final = (
-    300.0  # than one looks is asked for at once, or each second would ask for its own ten metres
-)
-REFRESH_S: Final = (
-    300.0  # a map is asked anew while it lies ahead; what changes at once comes as an alert
-)
+# than one looks is asked for at once, or each second would ask for its own ten metres
+FURTHER_M: Final = 300.0
+# a map is asked anew while it lies ahead; what changes at once comes as an alert
+REFRESH_S: Final = 300.0
 STEP: Final = 4  # metres between the points that are looked at
 MOST_BOXES: Final = 128
 MOST_TILES: Final = 6  # whose alerts are heard at a time

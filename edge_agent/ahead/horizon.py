@@ -18,9 +18,8 @@ from schemas.stopping import stopping_speed
 from schemas.thresholds import GRAVITY, REACTION_S
 
 MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
-COMFORT: Final = (
-    3.0  # [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
-)
+# [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
+COMFORT: Final = 3.0
 COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
 SIGHT_M: Final = 60.0  # within which one wants to be able to stop, in a town
 UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (

@@ -18,18 +18,15 @@ from schemas.wire import Alert
 
 UNKNOWN, BOUND, MEASURED, BORROWED = range(4)
 BASES: Final = ("unknown", "bound", "measured", "borrowed")
-CHANGE_S: Final = (
-    10800.0  # mean time between changes that leave nothing of what was known, as in the map
-)
-HELD_S: Final = (
-    3600.0  # what was not heard again for so long is unknown: by then 28 % of it has changed
-)
+# mean time between changes that leave nothing of what was known, as in the map
+CHANGE_S: Final = 10800.0
+# what was not heard again for so long is unknown: by then 28 % of it has changed
+HELD_S: Final = 3600.0
 ALERT_HELD_S: Final = 600.0  # alerts that stand are put again every few seconds
 MOST_CELLS: Final = 20_000  # 6 MB: fifty kilometres of road with its side streets
 MOST_ALERTS: Final = 4096
-OTHER_WAY: Final = (
-    2  # bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
-)
+# bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
+OTHER_WAY: Final = 2
 SLIPPERY_BINS: Final[FloatArray] = np.clip(
     (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
 )  # share of each bin that is slippery
@@ -98,9 +95,8 @@ class LocalMap:
         self._most = most_cells
         self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        self._all: ReceivedCells | None = (
-            NOTHING  # of all tiles, by key; None when it has to be made anew
-        )
+        # of all tiles, by key; None when it has to be made anew
+        self._all: ReceivedCells | None = NOTHING
 
     @property
     def cells(self) -> int:

@@ -22,20 +22,17 @@ from schemas.wire.ahead import Way
 
 NONE: Final = -1
 BESIDE_M: Final = 4.0  # a lane's width and a receiver's error; no other carriageway of the same direction is as near
-SMOOTH_M: Final = (
-    15  # in which a corner of a given route is driven: 9.5 m of radius at a right angle
-)
-OFF_ROUTE_M: Final = (
-    20.0  # from the line of a route: a receiver's error, a wide road, a coarse route
-)
+# in which a corner of a given route is driven: 9.5 m of radius at a right angle
+SMOOTH_M: Final = 15
+# from the line of a route: a receiver's error, a wide road, a coarse route
+OFF_ROUTE_M: Final = 20.0
 BACK_M: Final = 20.0  # a fix may jump back by so much
 ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
 # Unless the route heads like that so near, for corners are cut and turned into late; or begins so near: a navigation
 # system leaves out what has been driven, and how a route came to its beginning nobody knows.
 CORNER_M: Final = 20.0
-CORRIDOR_M: Final = (
-    150.0  # a road without bends in sight; beyond, where it leads is anybody's guess
-)
+# a road without bends in sight; beyond, where it leads is anybody's guess
+CORRIDOR_M: Final = 150.0
 CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
 

@@ -17,9 +17,8 @@ from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_p
 from schemas import grid
 from schemas.numeric import IntArray
 
-LINK_CELLS: Final = (
-    2.3  # sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
-)
+# sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
+LINK_CELLS: Final = 2.3
 BEGIN_CELLS: Final = 1.6  # from the car to the first
 TURN: Final = math.radians(95.0)  # between two links: the right angle of a junction within a cell
 LEAN: Final = math.radians(

@@ -19,9 +19,8 @@ FURTHEST_SPEED: Final = 0.15  # median of |v_x − wheels| over the wheels' spee
 LEAST_SPEED: Final = 3.0  # [m/s] below which speeds are not compared
 MOST_VIOLATION: Final = 0.05  # share of samples whose upper bound lies below the grip in use
 SLACK: Final = 0.05  # of that comparison: half a metre per second squared of a tilted mount
-SMOOTHED_S: Final = (
-    0.2  # over which the grip in use is taken, as long as a tyre takes to build its force up
-)
+# over which the grip in use is taken, as long as a tyre takes to build its force up
+SMOOTHED_S: Final = 0.2
 MOST_RESETS_PER_S: Final = 0.2
 
 

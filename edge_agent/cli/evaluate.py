@@ -23,9 +23,8 @@ PAPERS: Final = ("000", "001", "002", "003", "004")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
-APPROACHES_S: Final = (
-    300.0  # 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
-)
+# 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
+APPROACHES_S: Final = 300.0
 ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 

@@ -11,9 +11,8 @@ from edge_agent.dynamics.parameters import Body, Four
 from schemas.runtime.jit import inlined
 from schemas.thresholds import GRAVITY
 
-LEAST_LOAD_SHARE = (
-    0.02  # of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
-)
+# of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
+LEAST_LOAD_SHARE = 0.02
 
 
 @inlined

@@ -31,9 +31,8 @@ class Parameter(IntEnum):
     DRIVE_FRONT = 11  # share of the driving force on the front axle [1]; NaN where unknown
     # how stiffness depends on load and friction, as papers print it; 0, 0 and 1: not at all
     PROPORTIONAL = 12  # 1: slip stiffness is proportional to friction (000, 003, 004 as printed)
-    QUADRATIC = (
-        13  # e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
-    )
+    # e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
+    QUADRATIC = 13
     REAR_SLOPE = 14  # cornering stiffness per load of the rear tyres over that of the front ones (002, table 1)
 
 

@@ -71,13 +71,11 @@ class Setting(NamedTuple):
         1e-4,
     )  # R of ordinary sensors with some model error; the paper's is .05
     mu: float = PRIOR_MU  # at the start: unknown; the paper begins at the truth
-    straight: bool = (
-        False  # begin without acceleration and yaw rate, as the paper does, not with those measured
-    )
+    # begin without acceleration and yaw rate, as the paper does, not with those measured
+    straight: bool = False
     tyre: TyreOption = TyreOption()
-    dual_motor: bool = (
-        False  # longitudinal forces from one motor per axle, (4) to (6), instead of slip
-    )
+    # longitudinal forces from one motor per axle, (4) to (6), instead of slip
+    dual_motor: bool = False
 
 
 AT_THE_TRUTH = Setting(

@@ -137,9 +137,8 @@ def update(
         white /= work[row, row]
         log_likelihood -= math.log(work[row, row])
         square += white * white
-        work[row, points + used - 1] = (
-            white  # right of the diagonal all is zero by now: room for it
-        )
+        # right of the diagonal all is zero by now: room for it
+        work[row, points + used - 1] = white
         for i in range(n):
             mean[i] += work[used + i, row] * white
         row += 1

@@ -35,9 +35,8 @@ GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor read
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]
 REAR_STEERING: Final = per_wheel("delta")[2:]
-BLOCK_ROWS: Final = (
-    16_384  # 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
-)
+# 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
+BLOCK_ROWS: Final = 16_384
 
 
 @dataclass(frozen=True)
@@ -47,9 +46,8 @@ class SignalLog:
     t: FloatArray
     signals: FloatArray
     start_ns: int | None
-    ground: FloatArray | None = (
-        None  # speed over ground (T,) [m/s], where a receiver's was imported
-    )
+    # speed over ground (T,) [m/s], where a receiver's was imported
+    ground: FloatArray | None = None
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:

@@ -19,16 +19,13 @@ from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import S
 from schemas.thresholds import METRES_PER_DEGREE
 
-FIX_HELD_S: Final = (
-    1.0  # a 10 Hz receiver that misses ten fixes is lost; at 15 m/s the next cell has been reached
-)
-CELL_MARGIN: Final = (
-    0.1  # of a cell's side, 1 to 2 m: three standard deviations of a receiver's white noise
-)
+# a 10 Hz receiver that misses ten fixes is lost; at 15 m/s the next cell has been reached
+FIX_HELD_S: Final = 1.0
+# of a cell's side, 1 to 2 m: three standard deviations of a receiver's white noise
+CELL_MARGIN: Final = 0.1
 SECTOR_KEEP: Final = np.radians(5.0)  # beyond the sector's edge
-COURSE_BASE_M: Final = (
-    3.0  # a course is taken between fixes this far apart: some 8 degrees of noise
-)
+# a course is taken between fixes this far apart: some 8 degrees of noise
+COURSE_BASE_M: Final = 3.0
 NOWHERE: Final = -1  # cell of a vehicle without position
 
 

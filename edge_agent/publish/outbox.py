@@ -29,12 +29,10 @@ from edge_agent.publish.pacing import Pacer
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
-FIRST_RESEND_S = (
-    2.0  # a service writes a segment each second: an answer younger than this is on its way
-)
-LONGEST_RESEND_S = (
-    6.0  # for an answer of a service that does answer; see `pacing` for one that does not
-)
+# a service writes a segment each second: an answer younger than this is on its way
+FIRST_RESEND_S = 2.0
+# for an answer of a service that does answer; see `pacing` for one that does not
+LONGEST_RESEND_S = 6.0
 # A batch that no service can read is answered by none. Once so many later ones of its stream were settled, a service is
 # about to take no more (it remembers 65 536 above one that is missing), so that this one must go.
 PASSED_OVER = 50_000
@@ -73,9 +71,8 @@ class OutboxCounts:
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
     damaged: int = 0  # records that damage took, as far as it is known
-    unanswered: int = (
-        0  # records of batches that were given up since nobody answers them, only later ones
-    )
+    # records of batches that were given up since nobody answers them, only later ones
+    unanswered: int = 0
     damages: int = 0  # times that the file was found damaged
 
 

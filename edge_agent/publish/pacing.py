@@ -55,9 +55,8 @@ class Pacer:
         self._unanswered_since: float | None = None  # since when an answer is
         self._halved = -float("inf")
         self._answered = False
-        self._stale = (
-            0  # of those that fly, put before the silence: that they are lost says nothing
-        )
+        # of those that fly, put before the silence: that they are lost says nothing
+        self._stale = 0
         self._probe_at, self._probe_s, self._turn = 0.0, FIRST_PROBE_S, 0
 
     @property

@@ -35,9 +35,8 @@ WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
 RESEND_PER_VEHICLE: Final = 4  # of these on average; a link waits between two messages of one kind
 CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
-CLOSE_GRACE_S: Final = (
-    0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
-)
+# beyond the deadline, for a put or a close that hangs on a frozen router
+CLOSE_GRACE_S: Final = 0.5
 
 log = logging.getLogger(__name__)
 

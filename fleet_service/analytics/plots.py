@@ -23,9 +23,8 @@ GRIP_MAP: Final = LinearSegmentedColormap.from_list("grip", GRIP)
 MU: Final = "peak adhesion μ [1]"
 MOST_ROWS: Final = 40  # spells or vehicles of a picture that can still be read
 MOST_PANELS: Final = 6
-EDGE: Final = (
-    1.2  # points around each cell: a road of ten metres is seen on a map of ten kilometres
-)
+# points around each cell: a road of ten metres is seen on a map of ten kilometres
+EDGE: Final = 1.2
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
 PUBLISHED: Final = 0.9  # how often a published interval is to hold
 ARROWS: Final = "→↑←↓"  # of the headings

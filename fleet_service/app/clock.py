@@ -62,9 +62,8 @@ class SteadyClock:
         self._seen, self._began = seen, steady()
         self._confirmed = False
         self._sure = 0 <= wall() - seen <= OFF_NS
-        self._doubted: int | None = (
-            None  # since when the wall clock is elsewhere, by the steady one
-        )
+        # since when the wall clock is elsewhere, by the steady one
+        self._doubted: int | None = None
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:

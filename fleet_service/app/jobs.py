@@ -31,14 +31,12 @@ from schemas.wire import Kind
 log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
-FOLLOW_S: Final = (
-    30.0  # after which the archive's copy has what compaction, checkpoints and snapshots made
-)
+# after which the archive's copy has what compaction, checkpoints and snapshots made
+FOLLOW_S: Final = 30.0
 DAY_S: Final = 86_400.0
 ASKED_S: Final = 2.0  # between two looks whether an erasure, or a hand-over, is asked for
-SOON_S: Final = (
-    60.0  # after the start; the first turn of a job does not wait for its whole interval
-)
+# after the start; the first turn of a job does not wait for its whole interval
+SOON_S: Final = 60.0
 HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
 _NICE: Final = 10  # the worker goes first
 

@@ -40,13 +40,11 @@ from schemas.runtime.process import LogLine
 from schemas.wire import Alert, Kind
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
-REPEAT_S: Final = (
-    2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
-)
+# between two puts of alerts that stand: who comes back waits less than 5 s for them
+REPEAT_S: Final = 2.0
 REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
-HANGS_S: Final = (
-    60.0  # of a segment or a tile of an answer that is being made: systemd is to start anew
-)
+# of a segment or a tile of an answer that is being made: systemd is to start anew
+HANGS_S: Final = 60.0
 STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
@@ -88,9 +86,8 @@ class Service:
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
-        self.failure: BaseException | None = (
-            None  # of the worker; leaving the session after it may hang
-        )
+        # of the worker; leaving the session after it may hang
+        self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
             config.put_s,

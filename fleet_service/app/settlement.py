@@ -18,9 +18,8 @@ from fleet_service.replication.ownership import Ownership
 
 # Most rows that wait for the disk. With more, nothing is taken from the queue until a segment is written.
 WAITING_ROWS: Final = 1_000_000
-WAITING_BATCHES: Final = (
-    1_000_000  # the same for batches that are on disk and not yet in the copy: 100 MB
-)
+# the same for batches that are on disk and not yet in the copy: 100 MB
+WAITING_BATCHES: Final = 1_000_000
 T = TypeVar("T")
 
 

@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
-SWITCH_S = (
-    0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
-)
+# after which a busy worker lets an answer go first; ten times that is Python's own
+SWITCH_S = 0.0005
 LEAVE_AT_LAST_S = 2.5  # after a signal; the process is to have ended within 3 s
 FREEING_S = 0.4  # of them, for a bucket to take a word
 

@@ -23,9 +23,8 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
-KEPT_S: Final = (
-    3600  # for which an ended situation is told: who pulls every few minutes does not miss the end
-)
+# for which an ended situation is told: who pulls every few minutes does not miss the end
+KEPT_S: Final = 3600
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
 CERTAIN, PROBABLE = 0.97, 0.8  # of P(slippery), from which on it is said
 DIGITS: Final = 6  # a tenth of a metre; a cell is ten

@@ -20,9 +20,8 @@ from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 
-REFRESH_S: Final = (
-    60.0  # between two looks at all that stands, and at the most between two times of publication
-)
+# between two looks at all that stands, and at the most between two times of publication
+REFRESH_S: Final = 60.0
 
 
 class DatexFile:

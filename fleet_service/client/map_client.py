@@ -28,9 +28,8 @@ NAMED: Final = 5  # regions that a sentence names
 PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
-FALLS_S: Final = (
-    0.1  # a router ends questions to a service that was killed, and tells then that its token fell
-)
+# a router ends questions to a service that was killed, and tells then that its token fell
+FALLS_S: Final = 0.1
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
                 "observations", "age_s")  # fmt: skip
 

@@ -28,9 +28,8 @@ from schemas.thresholds import SLIPPERY_MU
 if TYPE_CHECKING:
     import httpx
 
-TIMEOUT_S: Final = (
-    5.0  # of a whole request, so that a receiver that drips bytes does not block the queue
-)
+# of a whole request, so that a receiver that drips bytes does not block the queue
+TIMEOUT_S: Final = 5.0
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 60.0
 # Answers by which a receiver refuses this message for good; repeating it would block the queue.
 REFUSALS: Final = frozenset({400, 413, 415, 422})
@@ -86,9 +85,8 @@ class Webhook:
     ) -> None:
         check_url(url)
         self._url, self._say, self._queue, self._timeout_s = url, say, queue, timeout_s
-        self._name = (
-            f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"  # a path may hold a secret
-        )
+        # a path may hold a secret
+        self._name = f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"
         self.counts: Counter[str] = Counter()
         self._failure, self._undelivered, self._is_closed = "", 0, False
         self._more, self._stop = threading.Event(), threading.Event()

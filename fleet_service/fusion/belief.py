@@ -44,12 +44,10 @@ SLIPPERY_SHARE: Final[FloatArray] = np.clip(
 )  # of each bin that lies below SLIPPERY
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
 FULL: Final = np.uint16(65535)
-REACH: Final = (
-    6  # bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
-)
-_LEAST_TAP: Final = (
-    1e-9  # single precision has numbers below 1e-38 that cost a hundred times as much to multiply
-)
+# bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
+REACH: Final = 6
+# single precision has numbers below 1e-38 that cost a hundred times as much to multiply
+_LEAST_TAP: Final = 1e-9
 PADDED: Final = _BINS + 2 * REACH
 
 

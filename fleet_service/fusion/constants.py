@@ -46,26 +46,22 @@ SHARED_MOST: Final = 0.275
 SHAPE_DOUBT: Final = 0.1
 SHAPE_PRIOR: Final = 0.15
 SHAPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons
-SHAPE_MEMORY: Final = (
-    300.0  # squares by weight beyond which old ones count half: some two hundred comparisons
-)
+# squares by weight beyond which old ones count half: some two hundred comparisons
+SHAPE_MEMORY: Final = 300.0
 SHARED_LEAST: Final = 0.25  # share of a full weight, by its root, that a gentle value has at least
-SHARED_WIDE: Final = (
-    0.1  # relative standard deviation at which a value has half the weight of a sharp one
-)
+# relative standard deviation at which a value has half the weight of a sharp one
+SHARED_WIDE: Final = 0.1
 SHARED_PART: Final = 0.1  # of the stated variance: errors that vehicles of a place have in common
-SHARED_ALWAYS: Final = (
-    0.5  # part of what is shared that other manoeuvres do not average out: correlations .6 and .4
-)
+# part of what is shared that other manoeuvres do not average out: correlations .6 and .4
+SHARED_ALWAYS: Final = 0.5
 
 # What slippery neighbours tell, see `neighbours`: P(the next cell has the same surface). Of three tuning ways the Brier
 # score of P(slippery) was .0526 with .8, .0471 with .9.
 SAME_SURFACE: Final = 0.9
 NEIGHBOURS: Final = 4  # cells before and behind that may tell
 NEIGHBOUR_GRIP: Final = 0.1  # a neighbour that is slippery with less than this ends the stretch
-DECIDED: Final = (
-    0.001  # a cell with so little doubt is not asked again: three messages are worth some thousand
-)
+# a cell with so little doubt is not asked again: three messages are worth some thousand
+DECIDED: Final = 0.001
 
 # A road changes slowly (drying, polishing): random walk of μ, standard deviation after one hour.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
@@ -114,19 +110,16 @@ VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)
 # of CONTAMINATION, and thrice the votes would say nothing more.
 SPREAD_LEAST: Final = 0.08
 SPREAD_CELLS: Final = 2  # to each side; who is further off has no position
-HERE_SHARE: Final = (
-    0.5  # more probably here than elsewhere: counts as a visit, and is held against others'
-)
+# more probably here than elsewhere: counts as a visit, and is held against others'
+HERE_SHARE: Final = 0.5
 
 # A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower bound.
 VALUE_UTILISATION: Final = EXCITED_SHARE
-UTILISED_STD: Final = (
-    0.05  # error of the grip used: accelerometer and load transfer, about 5 % of g ...
-)
+# error of the grip used: accelerometer and load transfer, about 5 % of g ...
+UTILISED_STD: Final = 0.05
 UTILISED_RELATIVE: Final = 0.05  # ... and 5 % of itself: mass over the wheels, roll, gain
-UTILISED_MOST: Final = (
-    0.9  # ... and is not believed beyond: of what was above, 29 % was too much by more than .05
-)
+# ... and is not believed beyond: of what was above, 29 % was too much by more than .05
+UTILISED_MOST: Final = 0.9
 # Share of bounds that are of another road, or are no bound: on two rough ways 2 to 6 % were too high by more than .1,
 # and where the surface changes within a cell all of them.
 BOUND_CONTAMINATION: Final = 0.3
@@ -153,20 +146,17 @@ TRUST_PRIOR: Final = 0.85
 TRUST_PRIOR_PEERS: Final = 8.0
 TRUST_NONE: Final = 0.7
 TRUST_FULL: Final = 0.9
-TRUST_HEARD_LEAST: Final = (
-    0.2  # how much a vehicle's word about others counts at least: all distrusted is no end
-)
+# how much a vehicle's word about others counts at least: all distrusted is no end
+TRUST_HEARD_LEAST: Final = 0.2
 # Once so many vehicles are known (met so many others, and are trusted), one that is not is a newcomer: it votes with
 # this weight, is no corroborating source, and shares one vote per cell with all others that are not trusted.
 ESTABLISHED_PEERS: Final = 4.0
 ESTABLISHED_VEHICLES: Final = 10
 NEWCOMER: Final = 0.4
-SOURCE_TRUST: Final = (
-    0.5  # less trusted vehicles vote, but are no corroborating sources for an alert
-)
-SOURCE_SHARE: Final = (
-    0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
-)
+# less trusted vehicles vote, but are no corroborating sources for an alert
+SOURCE_TRUST: Final = 0.5
+# P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
+SOURCE_SHARE: Final = 0.6
 # ... and its evidence for ice against grip, in nats, with the doubt about the shape of its tyres. Of the visits to ice
 # (< .25) of two tuning ways 20 % have 1.5 nats and 12 % three; of those to wet road .6 % and .2 %, to dry road .08 %
 # and .04 %. With two instead of one, alerts of three ways found .13 of the snow instead of .17, and as much ice (.80).

@@ -26,9 +26,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 _LESS: Final = 0.5 * c.UTILISED_STD
-_USED_STEP: Final = (
-    0.005  # of the grip used where its bound is looked up, rounded down: a seventh of a bin
-)
+# of the grip used where its bound is looked up, rounded down: a seventh of a bin
+_USED_STEP: Final = 0.005
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:

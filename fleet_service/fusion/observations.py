@@ -16,9 +16,8 @@ from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 
 SmallArray = NDArray[np.int8]
-ROWS_PER_SEQ: Final = (
-    64  # more than a batch has rows: seq and row become one number that keeps their order
-)
+# more than a batch has rows: seq and row become one number that keeps their order
+ROWS_PER_SEQ: Final = 64
 UNTOLD_SHARE: Final = 0.5  # of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
 USED_MOST: Final = 2.0  # of the grip, as in the contract
 _US: Final = 1000  # ns: the archive keeps whole microseconds

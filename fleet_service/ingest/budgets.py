@@ -14,9 +14,8 @@ from schemas.numeric import BoolArray, IntArray
 
 # A car on roads that are all new passes 3 cells of 10 m a second; of such a cell 1 kB is kept.
 NEW_CELLS_PER_HOUR: Final = 14_000.0
-NEW_CELLS_AT_ONCE: Final = (
-    11_000.0  # an hour on such roads, that a service was away: its backlog reaches the map
-)
+# an hour on such roads, that a service was away: its backlog reaches the map
+NEW_CELLS_AT_ONCE: Final = 11_000.0
 # Such cells are kept for a week. 1 000 km of roads that nobody else drives: 100 MB at once, and as much in a week.
 NEW_CELLS_PER_WEEK: Final = 100_000
 # A start, two kinds, and a region every quarter of an hour; after an outage a handful of starts.

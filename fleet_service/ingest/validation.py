@@ -27,9 +27,8 @@ from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
-MAX_SPAN_NS: Final = (
-    3_600_000_000_000  # of a batch; agents cut at ten minutes, and flush each second
-)
+# of a batch; agents cut at ten minutes, and flush each second
+MAX_SPAN_NS: Final = 3_600_000_000_000
 YAW_TOLERANCE: Final = np.radians(
     75.0
 )  # between yaw and the sector's axis: 45° and what a bend turns in one visit

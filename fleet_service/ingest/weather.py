@@ -36,9 +36,8 @@ from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
-WAITING: Final = (
-    10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
-)
+# reports that wait at the most: a whole continent's regions; the oldest go first
+WAITING: Final = 10_000
 AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
 _DIGITS: Final = 20  # of the time in a file's name [ns]
 _TURNS: Final = 100  # a reader that is overtaken so often has another trouble

@@ -38,9 +38,8 @@ END_TO_END: Final = (
     "fusion.whole_way",
     "fusion.resampled",
 )  # prefixes of what is measured end to end
-EXACT_SEEDS: Final = (
-    8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
-)
+# drives of 20 minutes; nothing random is averaged there, the largest difference counts
+EXACT_SEEDS: Final = 8
 
 LogLine = Callable[[str], None]
 Part = Callable[[], dict[str, float]]

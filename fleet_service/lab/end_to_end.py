@@ -29,9 +29,8 @@ from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Alert
 
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
-SEVERAL: Final = (
-    2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
-)
+# vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
+SEVERAL: Final = 2
 SAME: Final = 0.02  # of friction within a cell of one surface
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder

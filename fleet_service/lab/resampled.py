@@ -28,9 +28,8 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
 NEAREST: Final = 8  # visits, by friction, of which one is drawn
-FARTHEST: Final = (
-    0.35  # |ln c|; beyond it another vehicle's visit is drawn: surfaces of one kind lie closer
-)
+# |ln c|; beyond it another vehicle's visit is drawn: surfaces of one kind lie closer
+FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):

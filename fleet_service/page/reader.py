@@ -28,12 +28,10 @@ from schemas.wire.tile import decode_tile
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
 AGAIN_S: Final = 5.0  # between two questions to a service of which nothing is known
-REFRESH_S: Final = (
-    60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
-)
-REFRESHED: Final = (
-    20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
-)
+# a tile is put when it changes; that its intervals widen with time must be asked for
+REFRESH_S: Final = 60.0
+# tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
+REFRESHED: Final = 20
 REGIONS: Final = 256  # that are watched for a service
 
 

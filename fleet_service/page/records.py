@@ -83,9 +83,8 @@ def of_table(table: pa.Table) -> Records:
     found["basis"] = np.select(
         [basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND
     )
-    found["mu"][found["basis"] == BOUND] = (
-        NO_NUMBER  # whoever sent it: a bound has no number to colour by
-    )
+    # whoever sent it: a bound has no number to colour by
+    found["mu"][found["basis"] == BOUND] = NO_NUMBER
     found["vehicles"] = np.minimum(table["vehicles"].to_numpy(), 255)
     found["unknown"] = np.where(found["basis"] == MEASURED, 0, SHARE_STEPS)
     return found[np.argsort(found["place"], kind="stable")]

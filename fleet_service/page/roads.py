@@ -18,9 +18,8 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
-AHEAD: Final = (
-    3  # cells to the next one of a learned line: what nobody reported in between is bridged
-)
+# cells to the next one of a learned line: what nobody reported in between is bridged
+AHEAD: Final = 3
 SMOOTHED: Final = 5  # cells, centred: two lanes and a receiver's error make the raw line zigzag
 LEAST_CELLS: Final = 3  # of a learned line; fewer have no direction
 MOST_LINES: Final = 50_000

@@ -27,9 +27,8 @@ from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
-TRIES: Final = (
-    4  # a service that is killed again and again, by whatever, begins from the log at last
-)
+# a service that is killed again and again, by whatever, begins from the log at last
+TRIES: Final = 4
 _DRAFT: Final = ".draft"
 _MANIFEST: Final = "manifest.json"
 _TRIED: Final = "tried"

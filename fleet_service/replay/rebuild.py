@@ -48,17 +48,14 @@ COLUMNS: Final = [
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
-PART_ROWS: Final = (
-    4_000_000  # of a day that are held at once, 200 MB; twice, while the next are read
-)
-CHUNK_ROWS: Final = (
-    100_000  # that are fused at once: what is made of them on the way takes four times their memory
-)
+# of a day that are held at once, 200 MB; twice, while the next are read
+PART_ROWS: Final = 4_000_000
+# that are fused at once: what is made of them on the way takes four times their memory
+CHUNK_ROWS: Final = 100_000
 _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
 SEGMENT_ROW_BYTES: Final = 60  # in the inbox, at the least
-MARGIN_DEG: Final = (
-    0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
-)
+# around a box: over 100 m, more than a visit's position error moves what it tells
+MARGIN_DEG: Final = 0.002
 
 
 class Begin(NamedTuple):

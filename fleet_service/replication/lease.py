@@ -50,9 +50,8 @@ FOLDER: Final = "lease"
 HOLDER: Final = "holder.json"  # of an archive: who it is, over restarts
 TURNS: Final = 6  # in the time of a lease
 HINT: Final = 0.6  # of it, after which one whose token fell is followed: more than the half in which it acknowledges
-AHEAD_S: Final = (
-    10.0  # between two times that a standby gets what is new, so that little is left when it must
-)
+# between two times that a standby gets what is new, so that little is left when it must
+AHEAD_S: Final = 10.0
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 LOOK_S: Final = 0.25  # between two looks of who waits
 

@@ -45,9 +45,8 @@ FOLDERS: Final = (
 OWNER: Final = "service.json"
 _LAST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
 _PRIVATE: Final = ("tried",)  # notes of this disk
-QUICK_S: Final = (
-    5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
-)
+# of one request that an acknowledgement waits for; the service's worker may wait as long
+QUICK_S: Final = 5.0
 SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
 TURN_S: Final = 20.0  # of `upload_segments`, which then says that it has come so far
 BACK_OFF_S: Final = 0.5  # after the first failure; doubles

@@ -22,12 +22,10 @@ RAISE_ABOVE: Final = 0.9  # P(slippery)
 # ... and by its own reports alone no less than without any: neighbours confirm, they do not accuse.
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error
-FADE_BELOW: Final = (
-    0.5  # an alert without confirmation ends as soon as ice is less likely than grip
-)
-LEAST_SOURCES: Final = (
-    2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
-)
+# an alert without confirmation ends as soon as ice is less likely than grip
+FADE_BELOW: Final = 0.5
+# distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
+LEAST_SOURCES: Final = 2
 # ... and one more for each opposite source that is not older than they are by this: a road changes, so that earlier
 # visits do not contradict it. With one minute instead of ten, three trusted vehicles that flood a dry cell raised an
 # alert in two of six tuning towns; with ten in none.

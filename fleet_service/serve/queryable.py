@@ -42,9 +42,8 @@ LIGHT_PER_S: Final = (
     PER_S / 2
 )  # ... by Zenoh's thread, which answers one light question after the other
 WAITING: Final = 64  # questions; more are told to come again
-REST: Final = (
-    1.0  # after a tile of a heavy answer, by the time it took: light ones find the interpreter free
-)
+# after a tile of a heavy answer, by the time it took: light ones find the interpreter free
+REST: Final = 1.0
 LONGEST_REST_S: Final = 0.05
 
 

@@ -12,9 +12,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
-SHARE_S: Final = (
-    0.02  # of a turn of the worker; with what comes in meanwhile, a segment is late by as much
-)
+# of a turn of the worker; with what comes in meanwhile, a segment is late by as much
+SHARE_S: Final = 0.02
 
 
 class TileRounds:

@@ -16,9 +16,8 @@ from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import tokens, zenoh_session
 
-GONE_S: Final = (
-    5.0  # in which the token of a service that froze or lost its host falls: its lease is 3 s
-)
+# in which the token of a service that froze or lost its host falls: its lease is 3 s
+GONE_S: Final = 5.0
 LOOK_S: Final = 0.1
 _TRIES: Final = 5  # of services that start at the same moment
 

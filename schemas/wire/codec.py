@@ -33,9 +33,8 @@ MAX_ROWS: Final = 50
 MAX_STANDING_BYTES: Final = (
     8 << 20
 )  # every cell and sector of a z14 tile under an alert: 65 536 of them
-MESSAGES_PER_S: Final = (
-    100.0  # of one kind from one session over QUIC; a router drops what follows sooner
-)
+# of one kind from one session over QUIC; a router drops what follows sooner
+MESSAGES_PER_S: Final = 100.0
 MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JSON
 
 

@@ -30,9 +30,8 @@ RATES: Final = {
 }  # observations/s, and seconds of each that are measured
 ROWS: Final = 10
 TURN: Final = 512  # messages, as the service's worker takes them
-LATENESS_S: Final = (
-    4.0  # short, so that the window is full and settling is paid for from the beginning
-)
+# short, so that the window is full and settling is paid for from the beginning
+LATENESS_S: Final = 4.0
 WARM_S: Final = 4
 SECOND: Final = 10**9
 

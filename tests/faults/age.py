@@ -37,9 +37,8 @@ DAYS: Final = 6
 SINCE: Final = 20_000  # observations after the checkpoint
 SEGMENT: Final = 20_000
 OWN: Final = ("processor_s", "mb")  # what a start costs by itself
-NEAR: Final = (
-    f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"  # a quarter of a road
-)
+# a quarter of a road
+NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"
 
 
 def run(site: Site) -> list[Figure]:

@@ -19,9 +19,8 @@ from tests.faults.frame import Campaign, Site, conduct, leave
 from tests.faults.processes import Part, stage
 
 PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
-CELLS_ACROSS: Final = (
-    12  # few, so that every vehicle has soon been everywhere: a map that grows is no leak
-)
+# few, so that every vehicle has soon been everywhere: a map that grows is no leak
+CELLS_ACROSS: Final = 12
 EVERY_S: Final = 5.0
 SETTLED: Final = (
     1 / 3

@@ -31,9 +31,8 @@ from tests.fleet_service.examples import SECOND, batch, key
 
 SEGMENTS: Final = 2
 BATCHES: Final = 2  # to a segment
-WHOLE_WAY: Final = (
-    200  # every so many damages a service is started on the archive and everything is sent again
-)
+# every so many damages a service is started on the archive and everything is sent again
+WHOLE_WAY: Final = 200
 
 
 def run(site: Site) -> list[Figure]:

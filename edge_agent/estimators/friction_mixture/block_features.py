@@ -28,15 +28,13 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-SLOWEST_COMPARED_M_S = (
-    1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
-)
+# slips of two wheels are compared at this speed at least: speeds differ by noise below
+SLOWEST_COMPARED_M_S = 1.0
 NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
 ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
 STEEPEST = 0.3  # least cosine of steering
-CERTAIN = (
-    4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed,
-)
+# standard deviations of wheel-speed noise that a difference between the sides must exceed,
+CERTAIN = 4.0
 LIKELY = 2.0  # and of what is unknown of the radii
 
 

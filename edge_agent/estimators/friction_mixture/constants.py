@@ -31,9 +31,8 @@ class NodeState(IntEnum):
     LEAK_Y = 5  # share of measured lateral acceleration that is gravity felt by the rolled body
     SHAPE = 6  # shape of the tyre curve: spreads by which it is sharper than the usual one
     GAIN = 7  # error of the longitudinal force over load, relative: torque gain and mass
-    BIAS_Y = (
-        8  # of a_y, that is no force: offset, tilted mount, yaw-rate offset times speed [m/s^2]
-    )
+    # of a_y, that is no force: offset, tilted mount, yaw-rate offset times speed [m/s^2]
+    BIAS_Y = 8
     BIAS_X = 9  # the same of a_x
     RADIUS = 10  # relative error of the radius of each of four wheels
     LAG_WHEEL = 14  # of the wheel speeds behind the accelerometers [s]

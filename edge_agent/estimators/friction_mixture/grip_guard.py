@@ -15,9 +15,8 @@ HELD_S = 1.0  # the largest grip holds so long,
 FORGOTTEN = 0.5  # [1/s] and then fades: roads change
 ABOVE = 0.02  # what smoothing takes from the top of a hard stop
 LARGEST_LOSS = 3.0  # [nat] a block
-AT_PEAK = (
-    0.95  # of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
-)
+# of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
+AT_PEAK = 0.95
 
 
 @compiled

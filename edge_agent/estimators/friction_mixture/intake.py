@@ -28,9 +28,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-JUMP_M_S2 = (
-    3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
-)
+# of an accelerometer from one reading to the next; a real one is believed at the second
+JUMP_M_S2 = 3.0
 HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
 EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
 YAW_WALK = 3.0  # [rad/s/s^.5] yaw acceleration of a lively car as a random walk

@@ -32,9 +32,8 @@ LEAST_WEIGHT = 1e-9  # nor does a node of less
 SLEEPING_SHARE = 0.5  # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
 FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
 BRINK = 4  # power of doubt in that: a contradiction that merely grows forgets nothing yet
-LARGEST_DRIFT = (
-    0.5  # of a node's mass in a block: more would overshoot the balance between neighbours
-)
+# of a node's mass in a block: more would overshoot the balance between neighbours
+LARGEST_DRIFT = 0.5
 
 
 @compiled

@@ -33,9 +33,8 @@ from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Node
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-SPLIT_LIMIT = (
-    0.9  # of its friction, that the slippery side gives before the other side takes the rest
-)
+# of its friction, that the slippery side gives before the other side takes the rest
+SPLIT_LIMIT = 0.9
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
 
 

@@ -28,9 +28,8 @@ REST_M_S, REST_V_STD = (
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
-FREE_FORCE = (
-    0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
-)
+# along, over load, below which wheels that roll alike are taken for rolling freely
+FREE_FORCE = 0.05
 ALIKE = 0.03  # relative difference of their speeds
 FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
 LEAST_ROLLING_M_S = 0.5  # slower wheels may be locked
@@ -40,9 +39,8 @@ FAR_M_S, FAR_SHARE, FAR_SPREADS = (
     0.04,
     2.0,
 )  # of the speed that agreeing wheels tell: beyond, the motion is lost
-SLOWEST_M_S = (
-    1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
-)
+# below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
+SLOWEST_M_S = 1.5
 
 
 @compiled

@@ -21,9 +21,8 @@ SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like 
 APART_FOOT, APART_PEAK = 0.04, 0.08  # of the speed, between two wheels: may slide, slides
 SPIN_FOOT, SPIN_PEAK = 6.0, 12.0  # [m/s^2] of a wheel beyond the car's: may slide, slides
 SEEN = 0.3  # membership from which slip counts as having begun
-REAR_LAG_S = (
-    0.1  # [s] beside the time that the rear axle needs to reach the place of the front axle
-)
+# [s] beside the time that the rear axle needs to reach the place of the front axle
+REAR_LAG_S = 0.1
 
 
 @compiled

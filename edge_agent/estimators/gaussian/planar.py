@@ -24,9 +24,8 @@ from schemas.runtime.jit import compiled, inlined
 from schemas.signals import S
 
 LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
-CALM_M_S = (
-    2.0  # or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
-)
+# or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
+CALM_M_S = 2.0
 SHORTEST_SHARE = 0.2
 POINTS = 12  # of the cubature rule in six dimensions, side by side in a row
 ABREAST = 8  # of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing else

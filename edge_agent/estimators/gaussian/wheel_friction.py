@@ -18,12 +18,10 @@ from schemas.runtime.jit import compiled
 
 FORGET_M = 190.0  # one road change per so many metres (errata)
 INDEPENDENT_S = 0.2  # one independent measurement of the tyre per so much time (errata)
-DEMAND_HALF = (
-    0.15  # [g] of force at which half of what a sample could say of friction is believed (errata)
-)
-SIDE_CORRELATION = (
-    0.9  # roads are mostly the same under both sides; the wheels of one side see one road
-)
+# [g] of force at which half of what a sample could say of friction is believed (errata)
+DEMAND_HALF = 0.15
+# roads are mostly the same under both sides; the wheels of one side see one road
+SIDE_CORRELATION = 0.9
 
 
 def prior_root() -> FloatArray:

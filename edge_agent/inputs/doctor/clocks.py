@@ -13,9 +13,8 @@ from edge_agent.inputs.doctor.slip import measure_lags_twice
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
 
-FILTER_BEARS_S: Final = (
-    0.025  # by which devices may be apart: standard deviation of the filter's own prior
-)
+# by which devices may be apart: standard deviation of the filter's own prior
+FILTER_BEARS_S: Final = 0.025
 LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 

@@ -24,9 +24,8 @@ JOINED_S: Final = 1.5  # readings further apart are not joined
 FIX_S: Final = 1.0  # over which speed and course are taken from fixes
 LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
 UNLIKE: Final = 0.1  # share by which a wheel may be off its neighbour on the same side before it is said to slip
-LEFT: Final = (
-    0.2  # share by which the wheels' speed may leave that over ground before they are said to slip
-)
+# share by which the wheels' speed may leave that over ground before they are said to slip
+LEFT: Final = 0.2
 SLIP_S: Final = 1.0  # before and behind a moment of slip, which is left out as well
 CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever the unit
 

@@ -34,9 +34,8 @@ USUAL_BEND, BEND_SPREAD = (
     0.4,
 )  # understeer's share of the steering at the drive's fast speed: mean and std of cars
 BENDS: Final = np.linspace(-0.3, 1.8, 22)  # shares that are tried
-UNLIKE_RADII: Final = (
-    0.004  # [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
-)
+# [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
+UNLIKE_RADII: Final = 0.004
 CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 

@@ -19,9 +19,8 @@ from schemas.vehicle import Vehicle
 TURNS_M_S: Final = 5.0  # at the rim
 STANDS_M_S: Final = 0.3
 LEAST_S: Final = 5.0  # of such turning
-LEAST_SHARE: Final = (
-    0.8  # of the time in which a wheel turns: wheels that spin on ice do so for moments
-)
+# of the time in which a wheel turns: wheels that spin on ice do so for moments
+LEAST_SHARE: Final = 0.8
 RESTS_M_S2: Final = 0.3  # deviation of the accelerometers from their median
 RESTS_RAD_S: Final = 0.01
 GAINS_M_S2: Final = 0.4  # root mean square of the wheels' acceleration

@@ -13,13 +13,11 @@ from schemas.numeric import FloatArray
 from schemas.signals import S
 
 FEWEST: Final = 200  # moments, four seconds
-BETTER: Final = (
-    0.25  # by which another reading of yaw must fit the course better (mean resultant length)
-)
+# by which another reading of yaw must fit the course better (mean resultant length)
+BETTER: Final = 0.25
 SOUND: Final = 0.9  # agreement from which on another reading of yaw is the true one
-LEAST_TURN: Final = (
-    0.5  # [rad] of yaw and of the course; a car that slides turns and its course does not
-)
+# [rad] of yaw and of the course; a car that slides turns and its course does not
+LEAST_TURN: Final = 0.5
 STEADIER: Final = 0.5  # of the spread of ground speed over wheel speed, that exchanging must leave
 # what the log's yaw may be instead: how to make ours of it
 COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {

@@ -80,9 +80,8 @@ CLOCK_CENTRE_S: Final = {
     "turning": -0.06,
 }
 LATE_S: Final = 0.15  # a clock this far off is a fault; sound logs lie within .1
-CLOCK_LIKE: Final = (
-    0.8  # correlation from which on an identity's lag counts: slides move both sides apart
-)
+# correlation from which on an identity's lag counts: slides move both sides apart
+CLOCK_LIKE: Final = 0.8
 CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by chance
 
 

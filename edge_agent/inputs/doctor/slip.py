@@ -13,28 +13,24 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
 FEWEST_STEPS: Final = 5  # of a wheel away from the others, below which they are no bits
-FOREIGN_ROWS: Final = (
-    3000  # of a moving car in which a wheel must have nothing to do with the others
-)
+# of a moving car in which a wheel must have nothing to do with the others
+FOREIGN_ROWS: Final = 3000
 FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
 RADIUS_PARTS: Final = 4
 STEADY: Final = 0.4
 STEADY_SHARE: Final = 0.75
 
-AXLES_LIKE: Final = (
-    0.7  # correlation of each axle with the yaw rate, from which on their signs count
-)
+# correlation of each axle with the yaw rate, from which on their signs count
+AXLES_LIKE: Final = 0.7
 LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
 HALF_LIKE: Final = 0.7  # correlation from which on the lag of a half counts
 LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
-LEAST_CURVATURE: Final = (
-    0.004  # [1/m] root mean square, from which on an axle shows that it is locked
-)
+# [1/m] root mean square, from which on an axle shows that it is locked
+LEAST_CURVATURE: Final = 0.004
 LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
 LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's
-TURNS_LIKE: Final = (
-    0.8  # correlation of the yaw rate with steering or course, below which the car may spin
-)
+# correlation of the yaw rate with steering or course, below which the car may spin
+TURNS_LIKE: Final = 0.8
 
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:

@@ -17,12 +17,10 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
-USUAL = (
-    "mems-leak"  # accelerometers are fixed to the body, and feel gravity when it rolls and pitches
-)
-FINE_HZ = (
-    500.0  # steering is held over a sample of the simulator; a slow sensor must not see it as steps
-)
+# accelerometers are fixed to the body, and feel gravity when it rolls and pitches
+USUAL = "mems-leak"
+# steering is held over a sample of the simulator; a slow sensor must not see it as steps
+FINE_HZ = 500.0
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from schemas.runtime.jit import compiled
 
 FORCE_STD: Final = 0.02
 SPEED_STD: Final = 0.03  # [m/s] of a wheel, as a filter takes it: noise, steps and unlike radii
-STIFF: Final = (
-    20.0  # stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
-)
+# stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
+STIFF: Final = 20.0
 SLOWEST: Final = 0.5  # [m/s]
 EACH: Final = 4
 TYRES: Final = 128

@@ -23,9 +23,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
-SHOWN_S: Final = (
-    0.25  # a controller counts as active so long after it acted: its lamp blinks no faster
-)
+# a controller counts as active so long after it acted: its lamp blinks no faster
+SHOWN_S: Final = 0.25
 ABS_SLOWEST: Final = 1.5  # [m/s] below it brakes may lock the wheels
 DUMP: Final = 22.0  # [1/s] rates of ln of the brake torque, at USUAL_HZ
 BUILD_FAST: Final = 35.0
@@ -34,9 +33,8 @@ NEARLY: Final = 0.88
 USUAL_HZ: Final = 8.0
 LEAST_SHARE: Final = 0.02  # of the brake torque that was asked for
 TCS_SLOWEST: Final = 2.5  # [m/s] slip of slower cars is taken of this speed
-CUT_RATE: Final = (
-    5.0  # [1/s] of the share of the engine's torque that is taken away, and given back
-)
+# [1/s] of the share of the engine's torque that is taken away, and given back
+CUT_RATE: Final = 5.0
 GIVE_RATE: Final = 0.8
 MOST_CUT: Final = 0.95
 MUCH: Final = 2.0  # times the limit of traction control: the brake helps

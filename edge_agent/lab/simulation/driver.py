@@ -69,9 +69,8 @@ ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
 PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
-WARNED_BRAKES: Final = (
-    1.0  # [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
-)
+# [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
+WARNED_BRAKES: Final = 1.0
 # Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the pedals alone. An axle
 # that brakes alone, or its share of the brakes, meets its limit at half of what the road bears.
 CAREFUL: Final = 0.5
@@ -85,9 +84,8 @@ STOP_LENGTH_S: Final = 5.0  # braking and waiting, within an ALERT_S
 STOPPING: Final = 0.6  # share of his budget that he stops with
 RESTING: Final = 0.3  # [m/s] slower than this he stands on the brake, whatever the slope
 LEAST_BRAKING: Final = 0.35  # share of the budget that is left for the brakes in the tightest bend
-FRIGHT: Final = (
-    2.5  # [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
-)
+# [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
+FRIGHT: Final = 2.5
 TOO_FAST: Final = 1.4  # this many times the square of the speed he aims at
 PULL: Final = 0.85  # share of the grip of the driven wheels that he dares to use for driving
 WOBBLE_HZ: Final = 0.11

@@ -51,9 +51,8 @@ from schemas.runtime.jit import compiled
 TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
 WINTER_STREAM = 4
-STOPS = (
-    0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
-)
+# share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
+STOPS = 0.3
 TOLD_S = 1.5  # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 GOLDEN = (
     math.sqrt(5.0) - 1.0

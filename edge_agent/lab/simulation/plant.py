@@ -45,9 +45,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
-SOFTEST: Final = (
-    0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
-)
+# stiffness never degrades below this share of proportional, however overloaded the wheel
+SOFTEST: Final = 0.3
 FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
 STANDING: Final = 1.0  # [rad/s] below it rolling resistance fades
 DIRECT: Final = 0.2  # share of the slip that a relaxing tyre takes at once
@@ -55,12 +54,10 @@ FREE_SPIN: Final = (
     6.0,
     12.0,
 )  # [m/s] that driven wheels may be faster than the car: from there the engine gives less
-BRAKED: Final = (
-    0.1  # [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
-)
-STILL: Final = (
-    0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
-)
+# [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
+BRAKED: Final = 0.1
+# [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
+STILL: Final = 0.02
 
 
 @compiled

@@ -40,22 +40,17 @@ class TrueVehicle:
     power: float = 90e3
     curve: str = "magic-formula"  # a key of CURVES
     softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
-    stiffness: str = (
-        "similarity"  # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
-    )
-    rear_slope: float = (
-        1.0  # cornering stiffness per load of the rear tyres over that of the front ones
-    )
-    motors: Pmsm | None = (
-        None  # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
-    )
-    rear_steer: float = (
-        0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
-    )
+    # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
+    stiffness: str = "similarity"
+    # cornering stiffness per load of the rear tyres over that of the front ones
+    rear_slope: float = 1.0
+    # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
+    motors: Pmsm | None = None
+    # angle of the rear wheels over that of the front wheels; negative at low speed
+    rear_steer: float = 0.0
     relaxation: float = 0.0  # [m] in which the tyres build up slip
-    abs_hz: float = (
-        0.0  # cycles per second of anti-lock control; 0: smooth slip control that is not reported
-    )
+    # cycles per second of anti-lock control; 0: smooth slip control that is not reported
+    abs_hz: float = 0.0
     tcs: float = 0.0  # 1: traction control, of vehicles with abs_hz
     esc: float = 0.0  # 1: stability control, likewise
     regeneration: float = 0.0  # [m/s^2] of braking by engine or generator, at the driven wheels

@@ -20,9 +20,8 @@ from schemas.numeric import FloatArray, IntArray
 
 SPACING_M: Final = 1.0
 LANE_OFFSET_M: Final = 2.0  # lanes of opposite directions are 4 m apart
-SETBACK_M: Final = (
-    12.0  # where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
-)
+# where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
+SETBACK_M: Final = 12.0
 SMOOTHING_M: Final = 5.0  # a driver opens his path where arcs meet straights
 BRAKING: Final = 0.8  # share of the budget that is used to slow down
 STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] no road is straighter than this to a driver's speed

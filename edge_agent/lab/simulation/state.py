@@ -30,9 +30,8 @@ class Motion(IntEnum):
     ABS_LEFT = 30  # [s] for which the controller still counts as active
     TCS_LEFT = 31
     ESC_LEFT = 32
-    PEAK = (
-        33  # four wheels: brake torque at which ABS last let go [N·m]; negative while it gives back
-    )
+    # four wheels: brake torque at which ABS last let go [N·m]; negative while it gives back
+    PEAK = 33
 
     ASKED = 37  # [rad/s] yaw rate that steering has asked for, as far as a car follows
 

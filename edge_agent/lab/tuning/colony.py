@@ -28,9 +28,8 @@ from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Resul
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
-HIGHEST = (
-    1.0  # deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
-)
+# deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
+HIGHEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,8 @@ class Habits:
     elite: float = 0.25  # share of the ants of an iteration that deposit
     memory: float = 0.4  # share of the deposit that the best path so far receives
     retrace: float = 0.3  # chance that an ant of a converged colony walks the best path again
-    trace: Callable[[FloatArray], None] | None = (
-        None  # called with the pheromone (V, K) after each iteration
-    )
+    # called with the pheromone (V, K) after each iteration
+    trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:
         """Refuse habits for which (31) or (32) lose their meaning."""

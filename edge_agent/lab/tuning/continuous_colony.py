@@ -24,9 +24,8 @@ from edge_agent.lab.tuning.search import Iteration, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-LEAST_SPREAD: Final = (
-    1e-3  # of the range of a variable: an archive of equal vectors would draw itself for ever
-)
+# of the range of a variable: an archive of equal vectors would draw itself for ever
+LEAST_SPREAD: Final = 1e-3
 REDRAWS: Final = 32  # of a vector that is not admissible
 
 

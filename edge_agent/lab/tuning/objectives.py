@@ -41,9 +41,8 @@ SETTLED_S: Final = 1.0  # scored from here on; before, the score is that of the 
 WORST: Final = (
     -1e3
 )  # [nat] of an update whose log-likelihood is lower or no number: one broken one is not the score
-CALIBRATION: Final = (
-    50.0  # [nat/s] per squared ln of NIS over its expectation: 24 for a variance wrong by two
-)
+# [nat/s] per squared ln of NIS over its expectation: 24 for a variance wrong by two
+CALIBRATION: Final = 50.0
 LEAST_NIS: Final = 1e-3
 MISS: Final = 20.0  # 2/alpha of a 90 % interval
 
@@ -89,9 +88,8 @@ TOWNS: Final = {
     "held_out": ((901, 902), 8),
 }  # seeds of towns, and cars in each
 ROUGH_SHARE: Final = 0.5  # of these cars
-MOST_FALSE_ICE: Final = (
-    0.0012  # share of the samples on wet and dry road up to which false ice costs nothing more
-)
+# share of the samples on wet and dry road up to which false ice costs nothing more
+MOST_FALSE_ICE: Final = 0.0012
 FALSE_ICE_PRICE: Final = 60.0  # of interval score, for each share of 1 beyond it
 MISSED_ICE_PRICE: Final = 0.5  # of interval score, for a share of 1
 SURE_MARGIN: Final = 0.04  # below SLIPPERY_MU: closer to it slippery cannot be told from not

@@ -29,9 +29,8 @@ PIECE_M: Final = 50.0  # as long as what a driver slides over before the car sta
 LEAST_SHARE: Final = 0.8  # of a link's length measured, below which nobody can say that it was kept
 GAP_S: Final = 7200  # two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
-LEAST_STD: Final = (
-    0.05  # of one vehicle's error that its own interval does not know: its tyres, its calibration
-)
+# of one vehicle's error that its own interval does not know: its tyres, its calibration
+LEAST_STD: Final = 0.05
 KEPT, BROKEN, UNKNOWN = "kept", "broken", "unknown"
 _ROW: Final[dict[str, pa.DataType]] = {
     "link": pa.string(), "direction": pa.string(), "name": pa.string(), "verdict": pa.string(),

@@ -16,9 +16,8 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
-SHARE: Final = (
-    0.1  # of the values of a cell that were slippery: a stretch that froze one night in ten
-)
+# of the values of a cell that were slippery: a stretch that froze one night in ten
+SHARE: Final = 0.1
 
 
 def expression(t: Table, least_vehicles: int) -> Table:

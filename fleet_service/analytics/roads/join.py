@@ -21,9 +21,8 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
 REACH_M: Final = 25.0  # from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
-TURN_M: Final = (
-    8.0  # per radian between the road and the sector's axis: a parallel road a lane away is nearer
-)
+# per radian between the road and the sector's axis: a parallel road a lane away is nearer
+TURN_M: Final = 8.0
 MOST_TURN: Final = np.radians(
     60.0
 )  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both

@@ -34,9 +34,8 @@ from schemas.wire import Kind
 
 # A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.
 LEAST_DAYS: Final = 31
-ANONYMOUS: Final = (
-    5  # vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
-)
+# vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
+ANONYMOUS: Final = 5
 _KEYS: Final = "keys"
 
 

@@ -46,9 +46,8 @@ from schemas.runtime.records import RecordArray
 
 _NOTHING = np.zeros(0, np.int32)
 _HOUR = 3600
-_AHEAD = (
-    120  # s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
-)
+# s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
+_AHEAD = 120
 
 
 class Store:

@@ -20,9 +20,8 @@ from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 
 LEAST: Final = 1024  # places of a new table
-ROWS_MOST: Final = (
-    0.8  # share of the places that rows take: eight of them are a line, and probes cost little
-)
+# share of the places that rows take: eight of them are a line, and probes cost little
+ROWS_MOST: Final = 0.8
 PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF

@@ -15,9 +15,8 @@ FACTOR: Final = 10  # times the country that was measured: its vehicles, stream 
 USED: Final = 0.6  # of a core at the most, so that a service catches up after an outage
 DAY_S: Final = 86_400.0
 HOUR_S: Final = 3600.0  # between two times that what is forgotten is dropped
-NEW_PLACES: Final = (
-    1.0  # of the visits, those where their vehicle was not in the last hours: nobody turns round
-)
+# of the visits, those where their vehicle was not in the last hours: nobody turns round
+NEW_PLACES: Final = 1.0
 
 
 def million(found: Mapping[str, float]) -> list[Figure]:

@@ -27,9 +27,8 @@ TRIPS: Final = ("--intermediate", "3")  # places that a trip leads over: three k
 CHANGE_S: Final = ("--lanechange.duration", "3")  # not a leap to the side
 LEAP_M: Final = 20.0  # between two steps: SUMO has taken it out of a jam
 SMOOTH_M: Final = 13  # over which a driver opens his path
-USUAL_Q: Final = (
-    5.0  # [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
-)
+# [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
+USUAL_Q: Final = 5.0
 WET_AREAS, SNOW_AREAS, ICE_PATCHES = 4, 2, 24
 
 
