@@ -250,7 +250,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
     with monkeypatch.context() as killed:  # between the disk and the bucket
-        killed.setattr(one.copy, "upload_segments", lambda _: None)
+        killed.setattr(one.log, "_upload", lambda _: None)
         one.write(1)
     has_read, goes_on, place = threading.Event(), threading.Event(), compaction._place
 
