@@ -231,9 +231,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=FIGURES, help="seed")
     parser.add_argument("--vehicles", type=int, default=36)
     parser.add_argument("--duration", type=float, default=150.0, help="[s] of driving")
-    parser.add_argument(
-        "--scenario", default="hills-SEED", help="hills-SEED: drawn anew by each seed"
-    )
+    parser.add_argument("--scenario", default="hills-SEED", help="hills-SEED: drawn by each seed")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     with_: list[Drive] = []

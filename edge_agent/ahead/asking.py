@@ -23,7 +23,7 @@ AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 
 LONGEST_M: Final = 300.0
 # than one looks is asked for at once, or each second would ask for its own ten metres
 FURTHER_M: Final = 300.0
-# a map is asked anew while it lies ahead; what changes at once comes as an alert
+# a map ahead is asked for again; what changes at once comes as an alert
 REFRESH_S: Final = 300.0
 STEP: Final = 4  # metres between the points that are looked at
 MOST_BOXES: Final = 128

@@ -67,7 +67,7 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
         raise WireError("cell", "is there twice", "send each place once")
     heard = np.minimum(
         last + (age * NS).astype(np.int64), now
-    )  # when the tile was made: somebody may have kept it
+    )  # when the tile was made: a reader may have kept it
     return tile, ReceivedCells(
         place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard
     )

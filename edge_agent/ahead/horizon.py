@@ -24,7 +24,7 @@ COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
 SIGHT_M: Final = 60.0  # within which one wants to be able to stop, in a town
 UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (
     mugrid.UPPER - mugrid.LOWER
-)  # lower end of a road nobody has measured
+)  # lower end of a road that no vehicle has measured
 SHORTEST_M: Final = 150.0
 LONGEST_M: Final = 1000.0
 # Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an hour without a link.

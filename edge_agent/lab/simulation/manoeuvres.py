@@ -21,7 +21,7 @@ LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 @dataclass(frozen=True)
 class Moment:
-    """What a driver knows: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s].
+    """Knowledge of a driver: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s].
 
     Speed control by hub motors also knows `lost` [m], the integral of the error of speed, and `gain` [m/s^2], the
     acceleration.
