@@ -10,11 +10,19 @@ from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 COMMANDS: Final = (
-    Command("demo", "deploy.demo.command", "run router, service, page and a simulated fleet on this machine",
-            "gripmap demo --stay"),
-    Command("router", "deploy.router", "run a Zenoh router until a signal",
-            "gripmap router --listen tcp/0.0.0.0:7447"),
-)  # fmt: skip
+    Command(
+        "demo",
+        "deploy.demo.command",
+        "run router, service, page and a simulated fleet on this machine",
+        "gripmap demo --stay",
+    ),
+    Command(
+        "router",
+        "deploy.router",
+        "run a Zenoh router until a signal",
+        "gripmap router --listen tcp/0.0.0.0:7447",
+    ),
+)
 LINE: Final = (
     "gripmap",
     "GripMap on one machine; see also edge-agent and fleet-service.",

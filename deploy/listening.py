@@ -84,11 +84,13 @@ class ListeningTown:
         self.fusion = Fusion(LATENESS_S)
         self.alerts = Alerts(self.fusion)
         self.drivers = WarnedDrivers(self.fleet, 1.0 if listening else 0.0)
-        self.heard, self.prior = LocalMap(), MapPrior(vehicles)
+        self.heard = LocalMap()
+        self.prior = MapPrior(vehicles)
         self.active: list[tuple[Active, ...]] = [()] * vehicles
         self.drive = Drive()
         self.ice = self.fleet.scenario.events[0]
-        self._listening, self._asked = listening, -ASKED_S
+        self._listening = listening
+        self._asked = -ASKED_S
         self._lap = np.zeros(vehicles, np.int64)
         self._on = np.zeros(vehicles, np.bool_)
         self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
@@ -127,7 +129,8 @@ class ListeningTown:
 
     def _truth(self, now: float) -> None:
         """Record the cars on the new ice, and those that slide there."""
-        true, patch = self.fleet.truth, self.ice
+        true = self.fleet.truth
+        patch = self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
         places = cells * grid.SECTORS + grid.sector_of(true.yaw[-1])
         self._true |= dict(
@@ -177,7 +180,8 @@ class ListeningTown:
         seen = self.pipeline.seen
         assert seen is not None
         for k, row in enumerate(zip(*(column.tolist() for column in seen), strict=True)):
-            pose, route = Pose(*row), self.drivers.route_of(k)
+            pose = Pose(*row)
+            route = self.drivers.route_of(k)
             path = route.ahead(pose, horizon_length(pose.speed)) if route is not None else None
             if path is None:
                 continue
@@ -190,7 +194,8 @@ class ListeningTown:
         self.drivers.act()
 
     def _believe(self) -> None:
-        beliefs, seen = self.bank.beliefs(), self.pipeline.seen
+        beliefs = self.bank.beliefs()
+        seen = self.pipeline.seen
         if beliefs is None or seen is None:
             return
         key: IntArray = self.pipeline.places

@@ -19,7 +19,9 @@ class InputError(ValueError):
 
     def __init__(self, field: str, problem: str, fix: str) -> None:
         super().__init__(f"{field}: {problem}; {fix}")
-        self.field, self.problem, self.fix = field, problem, fix
+        self.field = field
+        self.problem = problem
+        self.fix = fix
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), (self.field, self.problem, self.fix)

@@ -35,9 +35,12 @@ SECTOR_MARGIN: Final = np.radians(
 
 # spreading the bits of a 32-bit number to the even places of a 64-bit one: shift, then keep
 _SPREAD: Final = (
-    (16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
-    (2, 0x3333333333333333), (1, 0x5555555555555555),
-)  # fmt: skip
+    (16, 0x0000FFFF0000FFFF),
+    (8, 0x00FF00FF00FF00FF),
+    (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333),
+    (1, 0x5555555555555555),
+)
 
 
 def _spread(v: IntArray) -> IntArray:
@@ -125,10 +128,8 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
     the sectors of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
-    x, y = (
-        np.stack([west, east, east, west], axis=-1),
-        np.stack([south, south, north, north], axis=-1),
-    )
+    x = np.stack([west, east, east, west], axis=-1)
+    y = np.stack([south, south, north, north], axis=-1)
     if sector is None:
         return x, y
     latitude, longitude = centre(cell)
@@ -155,7 +156,8 @@ def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
     x, y = deinterleave(cell)
     dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
     dy = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
-    columns, rows = (x[..., None] + dx) % n, y[..., None] + dy
+    columns = (x[..., None] + dx) % n
+    rows = y[..., None] + dy
     return np.where((rows >= 0) & (rows < n), interleave(columns, np.clip(rows, 0, n - 1)), -1)
 
 
@@ -178,10 +180,8 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else -1)."""
     angle = np.asarray(yaw, dtype=np.float64)
-    first, left, right = (
-        sector_of(angle),
-        sector_of(angle + SECTOR_MARGIN),
-        sector_of(angle - SECTOR_MARGIN),
-    )
+    first = sector_of(angle)
+    left = sector_of(angle + SECTOR_MARGIN)
+    right = sector_of(angle - SECTOR_MARGIN)
     second = np.where(left != first, left, np.where(right != first, right, -1))
     return first, second.astype(np.int8)

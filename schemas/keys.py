@@ -62,7 +62,8 @@ TOPICS: Final = {
 
 def chunks(quadint: int, zoom: int) -> str:
     """Return the quadkey digits of a region (z10) or tile (z14), separated by slashes."""
-    digits, parts = grid.quadkey(quadint, zoom), []
+    digits = grid.quadkey(quadint, zoom)
+    parts = []
     for size in _CHUNKS:
         if digits:
             parts.append(digits[:size])

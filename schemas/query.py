@@ -102,7 +102,8 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         name = str(first["loc"][0])
-        unknown, own = first["type"] == "extra_forbidden", first["type"] == "value_error"
+        unknown = first["type"] == "extra_forbidden"
+        own = first["type"] == "value_error"
         because = f" ({first['msg'].removeprefix('Value error, ')})" if own else ""
         if not unknown and "&" in parameters[name]:
             raise InputError(

@@ -33,14 +33,17 @@ NS = pa.timestamp("ns", tz="UTC")
 US = pa.timestamp("us", tz="UTC")  # what is kept on disk: Spark refuses nanoseconds in Parquet
 US_STEP: Final = 1_000  # [ns]
 LIKELIHOOD = pa.binary(mugrid.BINS)
-F32, F64, I8, I32, I64 = pa.float32(), pa.float64(), pa.int8(), pa.int32(), pa.int64()
+F32 = pa.float32()
+F64 = pa.float64()
+I8 = pa.int8()
+I32 = pa.int32()
+I64 = pa.int64()
 
-_MU_STEP, _DEGREE_STEP, _RADIAN_STEP, _SPEED_STEP = (
-    2.0**-10,
-    2.0**-23,
-    2.0**-9,
-    2.0**-6,
-)  # the second is 13 mm
+# the second is 13 mm
+_MU_STEP = 2.0**-10
+_DEGREE_STEP = 2.0**-23
+_RADIAN_STEP = 2.0**-9
+_SPEED_STEP = 2.0**-6
 _MU_RANGE: Final = (0.0, 2.0)  # beyond what a road tyre reaches on any road
 _SPEED_RANGE: Final = (-100.0, 100.0)
 _MAX_I32: Final = 2**31 - 1
@@ -71,29 +74,76 @@ OBSERVATION: Final = (
     Field("enter_time", NS, "ns since 1970, UTC", "first sample in the cell"),
     Field("leave_time", NS, "ns since 1970, UTC", "last sample in the cell"),
     Field("cell", I64, "quadint z21", "the cell"),
-    Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector", range=(0, grid.SECTORS - 1)),
+    Field(
+        "sector",
+        I8,
+        "0 east, 1 north, 2 west, 3 south",
+        "heading sector",
+        range=(0, grid.SECTORS - 1),
+    ),
     *_POSE,
     Field("yaw_std", F32, "rad", "standard deviation of yaw", 2.0**-12, (0.0, 10.0)),
     Field("speed", F32, "m/s", "mean speed over the visit", _SPEED_STEP, (0.0, 100.0)),
     *_MU,
-    Field("mu_utilised", F32, "-", "largest grip used in the visit, any wheel: mu is at least this", _MU_STEP,
-          _MU_RANGE),
-    Field("log_likelihood", LIKELIHOOD, "1/16 nat below the maximum",
-          "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has none"),
+    Field(
+        "mu_utilised",
+        F32,
+        "-",
+        "largest grip used in the visit, any wheel: mu is at least this",
+        _MU_STEP,
+        _MU_RANGE,
+    ),
+    Field(
+        "log_likelihood",
+        LIKELIHOOD,
+        "1/16 nat below the maximum",
+        "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has none",
+    ),
     Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
-    Field("tyre_season", I8, "0 unknown, 1 summer, 2 winter, 3 all-season", "tyres of the vehicle",
-          range=(0, 3)),
-    Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)),
-    Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "anti-lock braking intervened", range=(-1, 1)),
-    Field("used_longitudinal", F32, "-", "part of mu_utilised along the vehicle, driving positive; NaN where not said",
-          _MU_STEP, (-2.0, 2.0)),
-    Field("used_lateral", F32, "-", "part of mu_utilised across the vehicle, to the left; NaN where not said",
-          _MU_STEP, (-2.0, 2.0)),
-    Field("esc_active", I8, "-1 unknown, 0 no, 1 yes", "stability control intervened", range=(-1, 1)),
-    Field("tcs_active", I8, "-1 unknown, 0 no, 1 yes", "traction control intervened", range=(-1, 1)),
-    Field("wiper", F32, "0 still … 1 wiping without a pause", "front wipers, mean over the visit; NaN where not known",
-          2.0**-6, (0.0, 1.0)),
-)  # fmt: skip
+    Field(
+        "tyre_season",
+        I8,
+        "0 unknown, 1 summer, 2 winter, 3 all-season",
+        "tyres of the vehicle",
+        range=(0, 3),
+    ),
+    Field(
+        "air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)
+    ),
+    Field(
+        "abs_active", I8, "-1 unknown, 0 no, 1 yes", "anti-lock braking intervened", range=(-1, 1)
+    ),
+    Field(
+        "used_longitudinal",
+        F32,
+        "-",
+        "part of mu_utilised along the vehicle, driving positive; NaN where not said",
+        _MU_STEP,
+        (-2.0, 2.0),
+    ),
+    Field(
+        "used_lateral",
+        F32,
+        "-",
+        "part of mu_utilised across the vehicle, to the left; NaN where not said",
+        _MU_STEP,
+        (-2.0, 2.0),
+    ),
+    Field(
+        "esc_active", I8, "-1 unknown, 0 no, 1 yes", "stability control intervened", range=(-1, 1)
+    ),
+    Field(
+        "tcs_active", I8, "-1 unknown, 0 no, 1 yes", "traction control intervened", range=(-1, 1)
+    ),
+    Field(
+        "wiper",
+        F32,
+        "0 still … 1 wiping without a pause",
+        "front wipers, mean over the visit; NaN where not known",
+        2.0**-6,
+        (0.0, 1.0),
+    ),
+)
 
 # Where a vehicle was and how it moved.
 STATE: Final = (

@@ -49,7 +49,7 @@ CLASSES: Final = {
     "van": Size(2350.0, 1.50, 1.75, 1.69, 0.76, 0.340, 17.5, None),
     "pickup": Size(2250.0, 1.40, 1.80, 1.62, 0.72, 0.375, 17.5, 0.0),
     "sports-car": Size(1500.0, 1.35, 1.12, 1.57, 0.46, 0.335, 14.5, 0.0),
-}  # fmt: skip
+}
 
 
 def fields_of_class(name: str) -> dict[str, str | float | None]:

@@ -13,7 +13,8 @@ from typing import Any
 
 from tests.waiting import until
 
-BUCKET, PREFIX = "grip", "north/map"
+BUCKET = "grip"
+PREFIX = "north/map"
 SECRET = "not-to-be-read"
 
 
@@ -28,9 +29,12 @@ class BucketServer:
         self._process: subprocess.Popen[bytes] | None = None
         self.url = f"s3://{BUCKET}/{PREFIX}"
         self.store = {
-            "endpoint": f"http://127.0.0.1:{self._port}", "region": "eu-north-1", "disable_bulk_delete": "true",
-            "access_key_id": "tester", "secret_access_key": SECRET,
-        }  # fmt: skip
+            "endpoint": f"http://127.0.0.1:{self._port}",
+            "region": "eu-north-1",
+            "disable_bulk_delete": "true",
+            "access_key_id": "tester",
+            "secret_access_key": SECRET,
+        }
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -42,7 +42,9 @@ def mapped(folder: Path) -> tuple[Cells, list[str]]:
 
 def _published(system: System, log: Path) -> tuple[Cells, list[str]]:
     """The minute imported, checked, replayed and published under each name."""
-    car, out, alerts = ["--vehicle", str(VEHICLE)], str(log.with_suffix(".csv")), list[str]()
+    car = ["--vehicle", str(VEHICLE)]
+    out = str(log.with_suffix(".csv"))
+    alerts = list[str]()
     session = open_session(ZenohSettings(connect=[system.endpoint]))
     assert session is not None
     with session:

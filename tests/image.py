@@ -53,7 +53,8 @@ class Image:
     """Result of the steps, below `root`."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self.user = root, "root"
+        self.root = root
+        self.user = "root"
         self.folder = root
         kept = {name: value for name, value in os.environ.items() if name.startswith(OURS)}
         self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
@@ -116,11 +117,15 @@ def starts(image: Image) -> float:
     port = "127.0.0.1:0"
     with subprocess.Popen(
         ["python", "-m", "deploy.router", "--listen", f"tcp/{port}"],
-        cwd=image.folder, env=image.environment, stdout=subprocess.PIPE, text=True,
-    ) as router:  # fmt: skip
+        cwd=image.folder,
+        env=image.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as router:
         assert router.stdout is not None
         endpoint = router.stdout.readline().split()[1]
-        config, lines = image.folder / "service.json", image.folder / "lines"
+        config = image.folder / "service.json"
+        lines = image.folder / "lines"
         config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
         began = time.monotonic()
         with lines.open("w") as out:

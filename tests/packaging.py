@@ -126,8 +126,12 @@ def use(python: str, wheel: Path, folder: Path) -> None:
         for module in imports:
             hidden = subprocess.run(
                 [scripts / "python", "-c", f"import {module}"],
-                cwd=own.parent, capture_output=True, text=True, check=False, timeout=60,
-            )  # fmt: skip
+                cwd=own.parent,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=60,
+            )
             if (
                 hidden.returncode == 0
                 or str(own) not in hidden.stderr

@@ -22,7 +22,10 @@ from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import configuration
 from tests.waiting import until
 
-SERVICE, READER, WEATHER, VEHICLES = "shard-0", "reader-0", "weather-0", ("sim-000", "sim-001")
+SERVICE = "shard-0"
+READER = "reader-0"
+WEATHER = "weather-0"
+VEHICLES = ("sim-000", "sim-001")
 ROUTERS = ("router-a", "router-b")
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = f"{keys.ROOT}/shard/probe"

@@ -11,13 +11,28 @@ from schemas.numeric import FloatArray
 # Machado, Oliveira and Fernandes (2009), table 1, severity 1.0, for linear RGB.
 SIGHTS: Final[dict[str, FloatArray]] = {
     "normal": np.eye(3),
-    "protanopia": np.array([
-        [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]),
-    "deuteranopia": np.array([
-        [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]),
-    "tritanopia": np.array([
-        [1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]),
-}  # fmt: skip
+    "protanopia": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+    "deuteranopia": np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
+    ),
+    "tritanopia": np.array(
+        [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ]
+    ),
+}
 # sRGB to XYZ, D65 (IEC 61966-2-1), and its white.
 _XYZ: Final = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
@@ -37,22 +52,36 @@ def lab(colour: str, sight: str = "normal") -> FloatArray:
 
 def difference(first: FloatArray, second: FloatArray) -> float:
     """CIEDE2000 of two colours in CIELAB (Sharma, Wu and Dalal 2005, eqs. 2 to 22)."""
-    (l1, a1, b1), (l2, a2, b2) = first, second
+    (l1, a1, b1) = first
+    (l2, a2, b2) = second
     seven = (np.hypot(a1, b1) + np.hypot(a2, b2)) ** 7 / 2.0**7
     g = 0.5 * (1 - np.sqrt(seven / (seven + 25.0**7)))
-    a1, a2 = (1 + g) * a1, (1 + g) * a2
-    c1, c2 = np.hypot(a1, b1), np.hypot(a2, b2)
+    a1 = (1 + g) * a1
+    a2 = (1 + g) * a2
+    c1 = np.hypot(a1, b1)
+    c2 = np.hypot(a2, b2)
     h1, h2 = (np.degrees(np.arctan2(b, a)) % 360 for a, b in ((a1, b1), (a2, b2)))
     grey = c1 * c2 == 0
     turn = 0.0 if grey else (h2 - h1 + 180) % 360 - 180
-    dl, dc, dh = l2 - l1, c2 - c1, 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn / 2))
-    light, chroma = (l1 + l2) / 2, (c1 + c2) / 2
+    dl = l2 - l1
+    dc = c2 - c1
+    dh = 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn / 2))
+    light = (l1 + l2) / 2
+    chroma = (c1 + c2) / 2
     hue = h1 + h2 if grey else (h1 + turn / 2) % 360
-    t = (1 - 0.17 * np.cos(np.radians(hue - 30)) + 0.24 * np.cos(np.radians(2 * hue))
-         + 0.32 * np.cos(np.radians(3 * hue + 6)) - 0.20 * np.cos(np.radians(4 * hue - 63)))  # fmt: skip
+    t = (
+        1
+        - 0.17 * np.cos(np.radians(hue - 30))
+        + 0.24 * np.cos(np.radians(2 * hue))
+        + 0.32 * np.cos(np.radians(3 * hue + 6))
+        - 0.20 * np.cos(np.radians(4 * hue - 63))
+    )
     turned = 30 * np.exp(-(((hue - 275) / 25) ** 2))
     rotation = -2 * np.sqrt(chroma**7 / (chroma**7 + 25.0**7)) * np.sin(np.radians(2 * turned))
     sl = 1 + 0.015 * (light - 50) ** 2 / np.sqrt(20 + (light - 50) ** 2)
-    sc, sh = 1 + 0.045 * chroma, 1 + 0.015 * chroma * t
-    x, y, z = dl / sl, dc / sc, dh / sh
+    sc = 1 + 0.045 * chroma
+    sh = 1 + 0.015 * chroma * t
+    x = dl / sl
+    y = dc / sc
+    z = dh / sh
     return float(np.sqrt(x * x + y * y + z * z + rotation * y * z))

@@ -21,7 +21,8 @@ class Link:
     """A port that leads to another one of this machine; `cut`, it takes connections and passes nothing on."""
 
     def __init__(self, port: int) -> None:
-        self._to, self._open = port, threading.Event()
+        self._to = port
+        self._open = threading.Event()
         self._open.set()
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
@@ -76,17 +77,25 @@ class Host:
     """A machine with a service on it, its way to the routers and its way to the bucket."""
 
     def __init__(
-        self, folder: Path, router: str, bucket: BucketServer, module: str = "fleet_service.cli", **settings: Any  # noqa: ANN401
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        router: str,
+        bucket: BucketServer,
+        module: str = "fleet_service.cli",
+        **settings: Any,  # noqa: ANN401
+    ) -> None:
         folder.mkdir(parents=True)
         self.root = folder / "archive"
         self.to_router = Link(int(router.rpartition(":")[2]))
         self.to_bucket = Link(int(bucket.store["endpoint"].rpartition(":")[2]))
         store = {**bucket.store, "endpoint": f"http://127.0.0.1:{self.to_bucket.port}"}
         told = {
-            "zenoh": {"connect": [f"tcp/127.0.0.1:{self.to_router.port}"]}, "standby": True, "segment_s": 0.1,
-            "archive": {"path": str(self.root), "copy": bucket.url, "store": store}, **settings,
-        }  # fmt: skip
+            "zenoh": {"connect": [f"tcp/127.0.0.1:{self.to_router.port}"]},
+            "standby": True,
+            "segment_s": 0.1,
+            "archive": {"path": str(self.root), "copy": bucket.url, "store": store},
+            **settings,
+        }
         config = folder / "service.json"
         config.write_text(json.dumps(told))
         words = ["-m", module, "run", "--config", str(config)]
@@ -106,9 +115,14 @@ class Host:
 
 @contextmanager
 def hosts(
-    folder: Path, names: Sequence[str], router: str, bucket: BucketServer, *, named: bool = False,
+    folder: Path,
+    names: Sequence[str],
+    router: str,
+    bucket: BucketServer,
+    *,
+    named: bool = False,
     **settings: Any,  # noqa: ANN401
-) -> Iterator[list[Host]]:  # fmt: skip
+) -> Iterator[list[Host]]:
     """Hosts, whose services are not started, each of its own name if `named`; they are gone after the block."""
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]

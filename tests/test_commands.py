@@ -221,7 +221,8 @@ def test_an_option_that_would_be_passed_over_is_refused(
 
 
 def test_a_recording_is_never_replaced_by_its_estimates(tmp_path: Path, capsys: Capture) -> None:
-    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    log = tmp_path / "x.parquet"
+    car = tmp_path / "x.json"
     drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(car)]
     assert edge_agent.cli.main(drive) == 0
     before = log.read_bytes()

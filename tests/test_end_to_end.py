@@ -28,7 +28,8 @@ class System:
     """A router and a service in this process, and the folder with what they and the agents leave."""
 
     def __init__(self, folder: Path, endpoint: str) -> None:
-        self.folder, self.endpoint = folder, endpoint
+        self.folder = folder
+        self.endpoint = endpoint
         self.said: list[str] = []
         self.agent = folder / "agent.json"
         zenoh_settings = {"connect": [endpoint]}

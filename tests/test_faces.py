@@ -72,7 +72,8 @@ def test_a_package_of_ones_own_that_hides_ours_is_named(tmp_path: Path, face: st
 
 
 def test_a_log_is_estimated_in_three_lines_as_the_command_does(tmp_path: Path) -> None:
-    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    log = tmp_path / "x.parquet"
+    car = tmp_path / "x.json"
     assert (
         main(
             ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]
@@ -108,7 +109,8 @@ def test_memberships_that_tune_wrote_change_what_replay_says(tmp_path: Path) -> 
     document = json.loads((FOLDER / "paper-aco-fckf.json").read_text())
     document["memberships"] = edge_agent.Memberships().to_json()
     (tmp_path / "mine.json").write_text(json.dumps(document))
-    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    log = tmp_path / "x.parquet"
+    car = tmp_path / "x.json"
     assert (
         main(
             ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]
@@ -234,9 +236,10 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
         said.append(pq.read_table(out))
     assert not said[0].equals(said[1])
     for estimator, problem in (
-        ("ckf@steep", "tyre-curve: begins with slope 2"), ("ckf@no", "tyre-curve: 'no' is unknown"),
+        ("ckf@steep", "tyre-curve: begins with slope 2"),
+        ("ckf@no", "tyre-curve: 'no' is unknown"),
         ("sr-ukf@brush", "tyre-curve: sr-ukf has its own"),
-    ):  # fmt: skip
+    ):
         done = command(
             "edge_agent",
             "replay",

@@ -166,7 +166,8 @@ def test_forgetful_disk_catches_a_service_that_does_not_sync_its_keys(
 
 
 def test_link_relay_follows_loss_delay_rate_and_blocking() -> None:
-    draw, packet = random.Random(1), bytes(9) + bytes([6]) + bytes(90)
+    draw = random.Random(1)
+    packet = bytes(9) + bytes([6]) + bytes(90)
     blocked = LinkTerms(drop_udp=True)
     slow = LinkTerms(delay_s=1.0, bytes_per_s=100.0, queue_bytes=200)
     read, write = os.pipe()

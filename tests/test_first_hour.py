@@ -45,10 +45,19 @@ def test_every_estimator_is_made_by_its_name_alone() -> None:
 
 def test_before_stands_left_of_after_and_their_difference_has_its_interval() -> None:
     both = {"cells": 3, "vehicles": 4, "values": 50}
-    table = pa.Table.from_pylist([
-        {"period": "after", "mu": 0.6, "lower": 0.1, "difference": 0.2, "upper": 0.3, **both},
-        {"period": "before", "mu": 0.4, "lower": None, "difference": None, "upper": None, **both},
-    ])  # fmt: skip
+    table = pa.Table.from_pylist(
+        [
+            {"period": "after", "mu": 0.6, "lower": 0.1, "difference": 0.2, "upper": 0.3, **both},
+            {
+                "period": "before",
+                "mu": 0.4,
+                "lower": None,
+                "difference": None,
+                "upper": None,
+                **both,
+            },
+        ]
+    )
     figure = Figure()
     plots._before_after(figure, table)
     left, right = figure.axes

@@ -60,5 +60,6 @@ def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
 
 def test_the_old_scale_fails() -> None:
     """Red to green, which this replaced: dry and snow were one olive to one man in twelve."""
-    snow, dry = lab("#b8831b", "deuteranopia"), lab("#1bb83e", "deuteranopia")
+    snow = lab("#b8831b", "deuteranopia")
+    dry = lab("#1bb83e", "deuteranopia")
     assert difference(snow, dry) < LEAST

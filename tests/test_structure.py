@@ -128,22 +128,61 @@ SANS_IO = (
     ),
 )
 IMPURE = {
-    "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",
-    "secrets", "socket", "sqlite3", "subprocess", "tempfile", "threading", "time", "urllib", "zenoh",
-}  # fmt: skip
+    "asyncio",
+    "datetime",
+    "duckdb",
+    "http",
+    "logging",
+    "multiprocessing",
+    "os",
+    "pathlib",
+    "pyarrow",
+    "random",
+    "secrets",
+    "socket",
+    "sqlite3",
+    "subprocess",
+    "tempfile",
+    "threading",
+    "time",
+    "urllib",
+    "zenoh",
+}
 IMPURE_CALLS = {"open", "print", "input"}
 # What the pure core may use of the contract: numbers, names and errors, no messages, tables or transport.
 PURE_SCHEMAS = {
-    "config", "errors", "grid", "mugrid", "numeric", "runtime.jit", "runtime.records", "signals", "stopping",
-    "thresholds", "vehicle", "wire",
-}  # fmt: skip
+    "config",
+    "errors",
+    "grid",
+    "mugrid",
+    "numeric",
+    "runtime.jit",
+    "runtime.records",
+    "signals",
+    "stopping",
+    "thresholds",
+    "vehicle",
+    "wire",
+}
 
 # Top-level entries of the design, section 2; dot files and lock files may lie beside them.
 TOP_LEVEL = {
-    "pyproject.toml", "README.md", "edge_agent", "fleet_service", "schemas", "deploy", "tests",
-    "Makefile", "LICENSE", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "CITATION.cff", "constraints.txt",
+    "pyproject.toml",
+    "README.md",
+    "edge_agent",
+    "fleet_service",
+    "schemas",
+    "deploy",
+    "tests",
+    "Makefile",
+    "LICENSE",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "SECURITY.md",
+    "CITATION.cff",
+    "constraints.txt",
     "gripmap.py",  # the one import name of the four packages
-}  # fmt: skip
+}
 # What Python's own tools leave behind in a working copy; never part of a commit.
 LEFT_BEHIND = ("__pycache__", "gripmap.egg-info", "build", "dist")
 TRIED = "try"  # where the README's commands write; git ignores it

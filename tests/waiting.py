@@ -18,7 +18,8 @@ def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> No
     Raises:
         TimeoutError: it did not within `patience_s`.
     """
-    deadline, pause = time.monotonic() + patience_s, threading.Event()
+    deadline = time.monotonic() + patience_s
+    pause = threading.Event()
     while not condition():
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {patience_s} s: {condition}")

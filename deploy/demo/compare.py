@@ -169,14 +169,17 @@ def passes(rows: pa.Table) -> int:
 
 
 def figures(
-    comparison: MapComparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
-    counts: dict[str, float], archive: Path, wall_s: float,
-) -> list[Figure]:  # fmt: skip
+    comparison: MapComparison,
+    visits: pa.Table,
+    alerts: list[tuple[int, Alert]],
+    changed_ns: int,
+    counts: dict[str, float],
+    archive: Path,
+    wall_s: float,
+) -> list[Figure]:
     """Return the demo's figures with their bars."""
-    several, value = (
-        comparison.has_several_vehicles,
-        comparison.has_several_vehicles & comparison.is_measured,
-    )
+    several = comparison.has_several_vehicles
+    value = comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
     patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     rows, distinct, vehicles = archive_counts(archive)
@@ -261,7 +264,8 @@ def lost_grip(
     last: dict[str, tuple[int, int]] = {}
     order = np.argsort(enter, kind="stable")
     for k in order[on[order] & (enter[order] >= since[order])].tolist():
-        name, cell = vehicles[k], int(visits["cell"][k].as_py())
+        name = vehicles[k]
+        cell = int(visits["cell"][k].as_py())
         number, at = last.get(name, (0, -PASS_GAP_NS))
         number += enter[k] - at > PASS_GAP_NS
         last[name] = (number, int(left[k]))
@@ -284,7 +288,8 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
     Old snow that is reached late, or its border, does not count as new ice.
     """
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
-    cell, mu = visits["cell"].to_numpy(), visits["mu"].to_numpy()
+    cell = visits["cell"].to_numpy()
+    mu = visits["mu"].to_numpy()
     cells, index = np.unique(cell, return_inverse=True)
     least = np.full(len(cells), np.nan)
     np.fmin.at(least, index[enter < changed_ns], mu[enter < changed_ns])
@@ -294,12 +299,14 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
     """Return alerts of stretches per icy stretch and driving direction; NaN without ice."""
-    road, ids = Stretches(), set[str]()
+    road = Stretches()
+    ids = set[str]()
     for _, alert in alerts:
         road.take(alert)
         ids |= {one.id for one in road.changes()}
     icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
-    cell, sector = icy["cell"].to_numpy(), icy["sector"].to_numpy()
+    cell = icy["cell"].to_numpy()
+    sector = icy["sector"].to_numpy()
     stretches = sum(
         int(link_cells(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector)
     )

@@ -53,7 +53,15 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
 def _words(cell: dict[str, Any], truth: float) -> list[str]:
     mu = "not measured" if cell["mu"] is None else f"{cell['mu']:.2f}"
     return [
-        f"{truth:.2f}", mu, f"{cell['mu_lower']:.2f}", f"{cell['mu_upper']:.2f}", cell["basis"],
-        f"{cell['p_slippery']:.2f}", str(cell["vehicles"]), str(cell["observations"]), grid.HEADINGS[cell["sector"]],
-        f"{cell['latitude']:.5f}", f"{cell['longitude']:.5f}",
-    ]  # fmt: skip
+        f"{truth:.2f}",
+        mu,
+        f"{cell['mu_lower']:.2f}",
+        f"{cell['mu_upper']:.2f}",
+        cell["basis"],
+        f"{cell['p_slippery']:.2f}",
+        str(cell["vehicles"]),
+        str(cell["observations"]),
+        grid.HEADINGS[cell["sector"]],
+        f"{cell['latitude']:.5f}",
+        f"{cell['longitude']:.5f}",
+    ]

@@ -31,7 +31,8 @@ class ManagedProcess:
     """One process of the demo; its output goes to `folder/NAME.log`."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
-        self.name, self.log = name, folder / f"{name}.log"
+        self.name = name
+        self.log = folder / f"{name}.log"
         with self.log.open("w") as out:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
@@ -125,8 +126,15 @@ def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Ite
     """Run the live page on the town's streets; yield its address. The truth can be drawn over the map."""
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write(scenario_named(SCENARIO), folder)
-    options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port, "--metrics": metrics,
-               "--overlay": folder / "overlay.parquet", "--base-map": tiles, "--roads": roads}  # fmt: skip
+    options = {
+        "--connect": endpoint,
+        "--archive": folder / "archive",
+        "--port": port,
+        "--metrics": metrics,
+        "--overlay": folder / "overlay.parquet",
+        "--base-map": tiles,
+        "--roads": roads,
+    }
     words = [str(word) for option in options.items() for word in option]
     shown = ManagedProcess(
         "page", [str(Path(sys.executable).parent / "fleet-service"), "page", *words], folder

@@ -96,8 +96,10 @@ def _houses(centres: FloatArray) -> Iterable[FloatArray]:
         if not 0.5 < length < 20.0:
             continue
         angle = math.atan2(along[1], along[0])
-        wide, deep = rng.uniform(9, 20), rng.uniform(8, 13)
-        side, away = rng.choice((-1.0, 1.0)), CLEAR_M + deep / 2 + rng.choice((1.0, 3.0, 24.0))
+        wide = rng.uniform(9, 20)
+        deep = rng.uniform(8, 13)
+        side = rng.choice((-1.0, 1.0))
+        away = CLEAR_M + deep / 2 + rng.choice((1.0, 3.0, 24.0))
         x = float(centres[k, 0] - side * away * math.sin(angle))
         y = float(centres[k, 1] + side * away * math.cos(angle))
         reach = math.hypot(wide, deep) / 2
@@ -132,7 +134,8 @@ def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
 def write(scenario: Scenario, folder: Path) -> tuple[Path, Path]:
     """Write the base map (MBTiles) and the roads (GeoJSON); return their paths."""
     found = town_of(scenario)
-    tiles, roads = folder / "town.mbtiles", folder / "roads.geojson"
+    tiles = folder / "town.mbtiles"
+    roads = folder / "roads.geojson"
     roads.write_text(json.dumps(_roads(scenario, found)), encoding="utf-8")
     _write_tiles(scenario, found, tiles)
     return tiles, roads
@@ -218,7 +221,8 @@ def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> b
 
 
 def _touches(points: Sequence[tuple[int, int]]) -> bool:
-    xs, ys = [p[0] for p in points], [p[1] for p in points]
+    xs = [p[0] for p in points]
+    ys = [p[1] for p in points]
     return (
         max(xs) > -BUFFER
         and min(xs) < EXTENT + BUFFER

@@ -155,7 +155,8 @@ class Memberships:
         for k in range(1, SETS):
             inputs[k] = max(inputs[k], inputs[k - 1] + 2.0 * CLOSEST)
         outputs = np.sort(v[SETS : 2 * SETS])
-        fields, first = {"inputs": inputs, "outputs": outputs}, 0
+        fields = {"inputs": inputs, "outputs": outputs}
+        first = 0
         for name, length in LENGTHS.items():
             fields.setdefault(name, v[first : first + length])
             first += length

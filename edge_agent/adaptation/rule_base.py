@@ -23,8 +23,13 @@ from edge_agent.adaptation.memberships import Memberships
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-LOW, MIDDLE, HIGH = 0.06, 0.13, 0.3  # [1] peaks of the sets of demand, force over load
-CALM, STRAINED = 1.0, 2.5  # [1] peaks of the sets of strain, chi-square over degrees of freedom
+# [1] peaks of the sets of demand, force over load
+LOW = 0.06
+MIDDLE = 0.13
+HIGH = 0.3
+# [1] peaks of the sets of strain, chi-square over degrees of freedom
+CALM = 1.0
+STRAINED = 2.5
 WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave their gain
 
 

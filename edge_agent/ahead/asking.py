@@ -138,7 +138,8 @@ def _fits(path: Path, first: int, last: int) -> bool:
 
 
 def _around(path: Path, first: int, last: int, pose: Pose) -> Box:
-    x, y = path.x[first : last + 1], path.y[first : last + 1]
+    x = path.x[first : last + 1]
+    y = path.y[first : last + 1]
     east = np.array([x.min() - BESIDE_M, x.max() + BESIDE_M])
     north = np.array([y.min() - BESIDE_M, y.max() + BESIDE_M])
     latitude, longitude = to_degrees(east, north, pose)

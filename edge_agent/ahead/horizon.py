@@ -89,10 +89,21 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     mu, lower, upper, p, age = values
     basis = np.where(nothing, UNKNOWN, found.basis[row])
     return Horizon(
-        path, np.where(nothing, NONE, places[row]), mu, lower, upper, p, age, basis,
-        np.where(nothing, False, slippery[row]), np.where(nothing, False, found.alerted[row]),
-        safe_speed(path.curvature, np.where((basis == MEASURED) | (slippery[row] & ~nothing), lower, np.nan)),
-    )  # fmt: skip
+        path,
+        np.where(nothing, NONE, places[row]),
+        mu,
+        lower,
+        upper,
+        p,
+        age,
+        basis,
+        np.where(nothing, False, slippery[row]),
+        np.where(nothing, False, found.alerted[row]),
+        safe_speed(
+            path.curvature,
+            np.where((basis == MEASURED) | (slippery[row] & ~nothing), lower, np.nan),
+        ),
+    )
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
@@ -113,14 +124,16 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     nothing is measured (NaN) there is no advice (NaN), except before a slower place, with no more braking than an
     unknown road allows.
     """
-    measured, bend = np.isfinite(mu_lower), np.abs(np.nan_to_num(curvature))
+    measured = np.isfinite(mu_lower)
+    bend = np.abs(np.nan_to_num(curvature))
     expected = np.where(measured, mu_lower, UNKNOWN_LOWER)
     grip = GRAVITY * expected
     held = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
     squares = np.where(
         measured, np.minimum(held, stopping_speed(expected, SIGHT_M) ** 2), np.inf
     ).tolist()
-    brakes, bends = np.minimum(grip, COMFORT).tolist(), bend.tolist()
+    brakes = np.minimum(grip, COMFORT).tolist()
+    bends = bend.tolist()
     for k in range(len(squares) - 2, -1, -1):
         if squares[k + 1] < squares[k]:
             across = min(squares[k + 1] * bends[k] / brakes[k], 1.0)

@@ -73,7 +73,8 @@ def belief_of(
     out = np.empty((n, mugrid.BINS))
     for k in range(n):
         at = int(np.searchsorted(x[k], SLIPPERY_MU))
-        below, above = f[k, max(at - 1, 0)], f[k, min(at, 4)]
+        below = f[k, max(at - 1, 0)]
+        above = f[k, min(at, 4)]
         knots = np.insert(x[k], at, SLIPPERY_MU)
         shares = np.insert(f[k], at, min(max(slippery[k], below), above))
         knots += np.arange(6) * 1e-9  # strictly upward
@@ -201,10 +202,16 @@ class LocalMap:
             np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
         )
         return PlaceBelief(
-            key, np.where(basis == BOUND, np.nan, mu), lower, upper, np.where(there, faded @ SLIPPERY_BINS, np.nan),
-            np.where(there, np.maximum(now - last, 0) / NS, np.nan), np.where(there, basis, UNKNOWN),
-            np.where(there, vehicles, 0), alerted & there,
-        )  # fmt: skip
+            key,
+            np.where(basis == BOUND, np.nan, mu),
+            lower,
+            upper,
+            np.where(there, faded @ SLIPPERY_BINS, np.nan),
+            np.where(there, np.maximum(now - last, 0) / NS, np.nan),
+            np.where(there, basis, UNKNOWN),
+            np.where(there, vehicles, 0),
+            alerted & there,
+        )
 
     def belief(self, key: int, now: int) -> FloatArray | None:
         """Return the current belief about one place, (32,); None if nothing or only a bound is known."""

@@ -71,9 +71,13 @@ class LookoutCounts:
             if name.startswith("refused")
         )
         return {
-            "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
-            "heard_bytes": self.total_of("bytes"), "heard_alerts": self.total_of("alerts"), "heard_refused": refused,
-        }  # fmt: skip
+            "warnings": self.warnings,
+            "looks": self.looks,
+            "look_s": round(self.busy_s, 3),
+            "heard_bytes": self.total_of("bytes"),
+            "heard_alerts": self.total_of("alerts"),
+            "heard_refused": refused,
+        }
 
 
 class Lookout:
@@ -87,17 +91,23 @@ class Lookout:
     """
 
     def __init__(
-        self, names: Sequence[str], hear: Hear, route_of: RouteOf = lambda _: None,
+        self,
+        names: Sequence[str],
+        hear: Hear,
+        route_of: RouteOf = lambda _: None,
         listening: Callable[[int], bool] = lambda _: True,
         on_horizons: Callable[[str, list[Horizon], Pose], None] = lambda *_: None,
-    ) -> None:  # fmt: skip
-        self._hear, self._route_of, self._on_horizons = hear, route_of, on_horizons
+    ) -> None:
+        self._hear = hear
+        self._route_of = route_of
+        self._on_horizons = on_horizons
         self._watchers = {k: _Watcher(name) for k, name in enumerate(names) if listening(k)}
         self._number = {watcher.name: k for k, watcher in self._watchers.items()}
         self._poses: Sequence[Pose] = ()
         self._prior = MapPrior(len(names))
         self._here = np.full((len(names), 3), np.nan)
-        self._wake, self._stop = threading.Event(), threading.Event()
+        self._wake = threading.Event()
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
         self.counts = LookoutCounts()
 
@@ -162,7 +172,8 @@ class Lookout:
     def _run(self) -> None:
         while not self._stop.is_set():
             self._wake.clear()
-            now, began = time.monotonic(), time.thread_time()
+            now = time.monotonic()
+            began = time.thread_time()
             ready = [
                 k
                 for k, watcher in self._watchers.items()
@@ -185,7 +196,8 @@ class Lookout:
         # in turns, so that a thousand cars of one process do not look in the same moment
         first = watcher.looked < 0.0
         watcher.due = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
-        watcher.looked, watcher.urgent = now, False
+        watcher.looked = now
+        watcher.urgent = False
         poses = self._poses
         if watcher.subscriber is None or k >= len(poses):
             return
@@ -218,10 +230,13 @@ class Lookout:
             self._hear(watcher.name, warning)
         ended = tuple(warning for warning in issued if warning.state == "ended")
         watcher.outlook = Outlook(
-            watcher.name, pose.time, paths[0].kind,
-            (*(one.warning for one in watcher.active), *ended), runs(horizons[0]),
+            watcher.name,
+            pose.time,
+            paths[0].kind,
+            (*(one.warning for one in watcher.active), *ended),
+            runs(horizons[0]),
             tuple(self._here[k].tolist()),
-        )  # fmt: skip
+        )
         subscriber.follow(paths, pose, length)
         outlook = watcher.outlook
         subscriber.tell(lambda: encode_ahead(outlook))
@@ -247,7 +262,15 @@ def runs(horizon: Horizon) -> Runs:
     ends = np.append(starts[1:], len(key))
     place = np.maximum(key[starts], 0)
     return Runs(
-        starts.astype(np.float64), ends.astype(np.float64), place // grid.SECTORS, place % grid.SECTORS,
-        horizon.mu[starts], horizon.mu_lower[starts], horizon.mu_upper[starts], horizon.p_slippery[starts],
-        horizon.age_s[starts], horizon.basis[starts], np.fmin.reduceat(horizon.safe_speed, starts),
-    )  # fmt: skip
+        starts.astype(np.float64),
+        ends.astype(np.float64),
+        place // grid.SECTORS,
+        place % grid.SECTORS,
+        horizon.mu[starts],
+        horizon.mu_lower[starts],
+        horizon.mu_upper[starts],
+        horizon.p_slippery[starts],
+        horizon.age_s[starts],
+        horizon.basis[starts],
+        np.fmin.reduceat(horizon.safe_speed, starts),
+    )

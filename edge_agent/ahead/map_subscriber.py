@@ -43,18 +43,24 @@ class MapSubscriber:
     """
 
     def __init__(
-        self, vehicle: str, session: zenoh.Session, urgent: Callable[[list[int]], None],
+        self,
+        vehicle: str,
+        session: zenoh.Session,
+        urgent: Callable[[list[int]], None],
         clock: Callable[[], int] = time.time_ns,
-    ) -> None:  # fmt: skip
-        self._session, self._urgent, self._clock = session, urgent, clock
+    ) -> None:
+        self._session = session
+        self._urgent = urgent
+        self._clock = clock
         self._lock = threading.Lock()
-        self._map, self._asked, self._tiles = LocalMap(), RequestLog(), Tiles()
+        self._map = LocalMap()
+        self._asked = RequestLog()
+        self._tiles = Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
-        self._again, self._answered = (
-            list[int](),
-            False,
-        )  # [ns] when to ask once more; since the router is there
+        # [ns] when to ask once more; since the router is there
+        self._again = list[int]()
+        self._answered = False
         self._publisher = session.declare_publisher(
             keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, **quality_of(_TOPIC)
         )
@@ -85,7 +91,8 @@ class MapSubscriber:
         Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see `RequestLog.wanting`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
-        back, self._routers = bool(routers - self._routers), routers
+        back = bool(routers - self._routers)
+        self._routers = routers
         fresh, dropped = self._tiles.follow([path.near(within) for path in paths], pose)
         for tile in dropped:
             self._subscribers.pop(tile).undeclare()

@@ -103,7 +103,8 @@ def path_along(
     run = _run(line)
     count = max(int(min(run[-1], length)), 1)
     s = np.arange(1.0, count + 1.0)
-    x, y = np.interp(s, run, line[:, 0]), np.interp(s, run, line[:, 1])
+    x = np.interp(s, run, line[:, 0])
+    y = np.interp(s, run, line[:, 1])
     yaw = (
         np.unwrap(np.arctan2(np.gradient(y), np.gradient(x))) if count > 1 else np.full(1, pose.yaw)
     )
@@ -133,7 +134,8 @@ class GivenRoute:
     """
 
     def __init__(self, latitude: FloatArray, longitude: FloatArray) -> None:
-        self._latitude, self._longitude = latitude, longitude
+        self._latitude = latitude
+        self._longitude = longitude
         self._metre = 0.0
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
@@ -152,14 +154,16 @@ class GivenRoute:
 
     def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Return the metre of the route at which the car is: the next one after the last, with the same heading."""
-        step, start = np.diff(line, axis=0), line[:-1]
+        step = np.diff(line, axis=0)
+        start = line[:-1]
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
         share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
         off = np.hypot(*(start + share[:, None] * step).T)
         turned = np.abs(
             (np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi
         )
-        at, fits = run[:-1] + share * size, off <= OFF_ROUTE_M
+        at = run[:-1] + share * size
+        fits = off <= OFF_ROUTE_M
         for k in np.flatnonzero(fits & (turned > ASTRAY)).tolist():
             first, last = np.searchsorted(run, [at[k] - CORNER_M, at[k] + CORNER_M])
             fits[k] = first == 0 or turned[first - 1 : last].min() <= ASTRAY

@@ -78,7 +78,8 @@ class SteadyLimit:
             self._higher_since = now
         if now - self._higher_since < HOLD_S * NS:
             return False
-        self.value, self._higher_since = limit, None
+        self.value = limit
+        self._higher_since = None
         return True
 
 
@@ -102,7 +103,8 @@ class PlannerKey:
 
     def __init__(self, domain: int = 0, type_hash: str = ANY_HASH) -> None:
         self.key = f"{domain}/{TOPIC}/{TYPE}/{type_hash}"
-        self._number, self._identity = 0, secrets.token_bytes(_GID_BYTES)
+        self._number = 0
+        self._identity = secrets.token_bytes(_GID_BYTES)
 
     def attachment(self, now: int) -> bytes:
         """Return the attachment of the next message."""

@@ -31,7 +31,8 @@ class PlannerLink:
 
     def __init__(self, endpoint: str, type_hash: str, domain: int = 0) -> None:
         self._settings = ZenohSettings(connect=[endpoint])
-        self._key, self._limit = PlannerKey(domain, type_hash), SteadyLimit()
+        self._key = PlannerKey(domain, type_hash)
+        self._limit = SteadyLimit()
         self._session: zenoh.Session | None = None
         self._sent = 0
         threading.Thread(target=self._connect, name="planner", daemon=True).start()
@@ -47,8 +48,11 @@ class PlannerLink:
         self._sent = pose.time
         try:
             self._session.put(
-                self._key.key, encode_limit(self._limit.value, pose.time),
-                attachment=self._key.attachment(pose.time), priority=zenoh.Priority.REAL_TIME, express=True,
-            )  # fmt: skip
+                self._key.key,
+                encode_limit(self._limit.value, pose.time),
+                attachment=self._key.attachment(pose.time),
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
         except zenoh.ZError as error:
             log.warning("the planner cannot be reached: %s", error)

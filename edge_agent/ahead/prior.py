@@ -76,7 +76,8 @@ class MapPrior:
         for k in [k for k, known in enumerate(self._map) if known is not None]:
             likelihood = np.exp(visit[k])
             informed = self._entry[k] * likelihood
-            right, wrong = informed.sum(), (self._border[k] * likelihood).sum()
+            right = informed.sum()
+            wrong = (self._border[k] * likelihood).sum()
             share = (
                 self._wrong[k] * wrong / (self._wrong[k] * wrong + (1.0 - self._wrong[k]) * right)
             )

@@ -70,25 +70,28 @@ class _Neighbours:
         by_cell: dict[tuple[int, int], list[int]],
         side: float,
     ) -> None:
-        self.places, self._by_cell, self.side = places, by_cell, side
+        self.places = places
+        self._by_cell = by_cell
+        self.side = side
 
     def onward(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
         """Return places that may come next, the likeliest first; one per road."""
-        reach, found = cells * self.side, []
-        column, row = math.floor(here[0] / self.side), math.floor(here[1] / self.side)
+        reach = cells * self.side
+        found = []
+        column = math.floor(here[0] / self.side)
+        row = math.floor(here[1] / self.side)
         wide = math.ceil(cells)
         for i in range(column - wide, column + wide + 1):
             for j in range(row - wide, row + wide + 1):
                 for key in self._by_cell.get((i, j), ()):
-                    dx, dy = self.places[key][0] - here[0], self.places[key][1] - here[1]
+                    dx = self.places[key][0] - here[0]
+                    dy = self.places[key][1] - here[1]
                     distance = math.hypot(dx, dy)
                     if not 0.3 * self.side < distance <= reach:
                         continue
                     link = math.atan2(dy, dx)
-                    turn, turned = (
-                        _apart(link, heading),
-                        _apart(link, (key % grid.SECTORS) * math.pi / 2.0),
-                    )
+                    turn = _apart(link, heading)
+                    turned = _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
                     if turn <= TURN and turned <= LEAN:
                         found.append((distance * (1.0 + 2.0 * turn + 0.5 * turned), key, link))
         chosen: list[tuple[int, float]] = []
@@ -102,7 +105,8 @@ def _follow_way(
     graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]
 ) -> list[int]:
     """Follow a way to its end; put branches on `forks`."""
-    run, passed = 0.0, set(way)
+    run = 0.0
+    passed = set(way)
     for _ in range(MOST_STEPS):
         here = graph.places[way[-1]]
         heading = _heading(way, graph.places, pose)
@@ -120,7 +124,8 @@ def _follow_way(
 def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
     """Return the heading of the last three links, because the cell centres of a slanting road zigzag."""
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
-    dx, dy = last[-1][0] - last[0][0], last[-1][1] - last[0][1]
+    dx = last[-1][0] - last[0][0]
+    dy = last[-1][1] - last[0][1]
     return math.atan2(dy, dx) if math.hypot(dx, dy) > 1.0 else pose.yaw
 
 
@@ -137,7 +142,8 @@ def _as_path(
     smooth[1:-1] = (line[:-2] + line[1:-1] + line[2:]) / 3.0
     known = np.array([way[0], *way])
     if beyond:
-        heading, metres = _heading(way, places, pose), np.arange(STEP_M, CORRIDOR_M + 1.0, STEP_M)
+        heading = _heading(way, places, pose)
+        metres = np.arange(STEP_M, CORRIDOR_M + 1.0, STEP_M)
         straight = smooth[-1] + metres[:, None] * [math.cos(heading), math.sin(heading)]
         smooth = np.concatenate([smooth, straight])
         known = np.concatenate([known, np.full(len(straight), NONE)])

@@ -81,7 +81,8 @@ def update_warnings(
             here.add(name)
             continue
         here.add(before.warning.id)
-        name, one = before.warning.id, _warning(before.warning.id, "updated", nearest, pose, sure)
+        name = before.warning.id
+        one = _warning(before.warning.id, "updated", nearest, pose, sure)
         grown = len(places - before.places) >= CHANGED_PLACES
         if grown or abs(one.mu - before.warning.mu) >= CHANGED_MU:
             issued.append(one)
@@ -147,8 +148,10 @@ def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Str
 def _warning(
     name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool
 ) -> GripWarning:
-    horizon, k = stretch.horizon, stretch.worst
-    first, last = int(stretch.start), int(stretch.end)
+    horizon = stretch.horizon
+    k = stretch.worst
+    first = int(stretch.start)
+    last = int(stretch.end)
     age = float(np.nanmin(horizon.age_s[first:last]))
     alerted = horizon.alerted[first:last]
     own = (alerted & (horizon.basis[first:last] == MEASURED)).any()
@@ -160,12 +163,21 @@ def _warning(
         else "the map says so"
     )
     return GripWarning(
-        id=name, state=state, time=pose.time, distance_m=stretch.start, length_m=stretch.end - stretch.start,
+        id=name,
+        state=state,
+        time=pose.time,
+        distance_m=stretch.start,
+        length_m=stretch.end - stretch.start,
         time_s=stretch.start / pose.speed if pose.speed > SLOWEST else math.inf,
-        mu=float(horizon.mu[k]), mu_lower=float(horizon.mu_lower[k]), p_slippery=float(horizon.p_slippery[k]),
-        age_s=age, safe_speed=float(np.nanmin(horizon.safe_speed[first:last])), way=horizon.path.kind, sure=sure,
+        mu=float(horizon.mu[k]),
+        mu_lower=float(horizon.mu_lower[k]),
+        p_slippery=float(horizon.p_slippery[k]),
+        age_s=age,
+        safe_speed=float(np.nanmin(horizon.safe_speed[first:last])),
+        way=horizon.path.kind,
+        sure=sure,
         reason=reason,
-    )  # fmt: skip
+    )
 
 
 def _ended(one: Active, pose: Pose, *, stands: bool) -> GripWarning:

@@ -86,7 +86,7 @@ def backfill(
 
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
-) -> Iterator[Outcome]:  # fmt: skip
+) -> Iterator[Outcome]:
     """Estimate like `backfill`, on the machines of Spark, all of which see the same files; outcomes in the tasks'
     order.
 

@@ -26,10 +26,13 @@ from schemas.runtime.palette import GRIP_RANGE, line_of, shade
 from schemas.signals import Health, S
 from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
-PAGE, IMAGES = ".html", (".png", ".svg", ".pdf")
+PAGE = ".html"
+IMAGES = (".png", ".svg", ".pdf")
 ENDINGS: Final = (PAGE, *IMAGES)
 MOST_POINTS: Final = 1500  # of a curve on the page; more are thinned, extremes of the band kept
-WIDTH, HEIGHT, LEFT = 900, 150, 56
+WIDTH = 900
+HEIGHT = 150
+LEFT = 56
 _TEMPLATE: Final = Path(__file__).with_name("drive.html")
 _DEGREES: Final = 180.0 / math.pi
 
@@ -98,9 +101,11 @@ def curve_of(
         low, high = (table[name].to_numpy().astype(np.float64) for name in panel.band)
     elif panel.band:
         spread = Z_95 * table[panel.band[0]].to_numpy().astype(np.float64)
-        low, high = value - spread, value + spread
+        low = value - spread
+        high = value + spread
     else:
-        low, high = np.full_like(value, np.nan), np.full_like(value, np.nan)
+        low = np.full_like(value, np.nan)
+        high = np.full_like(value, np.nan)
     return t, value * panel.scale, low * panel.scale, high * panel.scale
 
 
@@ -132,7 +137,9 @@ def page_of(drive: RecordedDrive) -> str:
 
 
 def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
-    curves, low_end, high_end = [], math.inf, -math.inf
+    curves = []
+    low_end = math.inf
+    high_end = -math.inf
     for name, table in drive.estimates.items():
         t, value, low, high = curve_of(table, panel)
         parts = thin_parts(len(t))
@@ -144,7 +151,8 @@ def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
         }
         known = value[np.isfinite(value)]
         if len(known):
-            low_end, high_end = min(low_end, float(known.min())), max(high_end, float(known.max()))
+            low_end = min(low_end, float(known.min()))
+            high_end = max(high_end, float(known.max()))
         curves.append({"estimator": name, "colour": line_of(name).colour, **points})
     margin = 0.08 * max(high_end - low_end, 1e-3)
     ends = panel.fixed or (low_end - margin, high_end + margin)
@@ -156,7 +164,8 @@ def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
 def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
     """Return the spans in which the first estimator reported a limit, by flag."""
     table = next(iter(drive.estimates.values()))
-    t, flags = table["t"].to_numpy(), table["health"].to_numpy()
+    t = table["t"].to_numpy()
+    flags = table["health"].to_numpy()
     found = []
     for flag in Health:
         on = (flags & flag.value) > 0 if flag.value else np.zeros(len(flags), np.bool_)

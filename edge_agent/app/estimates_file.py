@@ -73,10 +73,8 @@ def write_table(field: str, path: Path, table: pa.Table) -> None:
 
 def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a class of Arrow
     if path.suffix not in ENDINGS:
-        problem, fix = (
-            f"{path.name} has no known ending",
-            f"use one of {', '.join(name for name in ENDINGS if name)}",
-        )
+        problem = f"{path.name} has no known ending"
+        fix = f"use one of {', '.join(name for name in ENDINGS if name)}"
         raise InputError(field, problem, fix)
     return ENDINGS[path.suffix]
 

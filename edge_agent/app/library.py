@@ -115,7 +115,8 @@ def plot(
             truth["t"], np.mean(wheels, axis=0), color="k", label="true, mean of the wheels"
         )
     for name, found in estimates.items():
-        style, t = line_of(name), found["t"].to_numpy()
+        style = line_of(name)
+        t = found["t"].to_numpy()
         speed.plot(t, found["vx"].to_numpy(), color=style.colour, linestyle=style.dash, label=name)
         friction.plot(
             t,

@@ -59,7 +59,8 @@ def drive(
     `progress` is updated while it runs, and returned. Records of blocks that are not `admitted` are held back and
     counted. `after` is called after each block.
     """
-    progress, status_at = progress or Progress(), STATUS_EVERY_S
+    progress = progress or Progress()
+    status_at = STATUS_EVERY_S
     doubted: set[tuple[int, str]] = set()
     started = first = float("nan")
     for block in blocks:
@@ -68,16 +69,16 @@ def drive(
         after()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
-            started, first = (
-                clock(),
-                float(block.t.min()),
-            )  # the first block may have had to load kernels
+            # the first block may have had to load kernels
+            started = clock()
+            first = float(block.t.min())
         length = float(block.t.max()) - first - progress.signals_s
         progress.signals_s += length
         progress.blocks += 1
         lag = clock() - started - progress.signals_s
         progress.behind += lag > length
-        progress.lag_s, progress.now_s = max(progress.lag_s, lag), max(lag, 0.0)
+        progress.lag_s = max(progress.lag_s, lag)
+        progress.now_s = max(lag, 0.0)
         if stop.wait(max(0.0, -lag)) or clock() - started >= duration_s:
             break
         if clock() - started >= status_at:
@@ -113,7 +114,8 @@ def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: R
 def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
     """Return the final counts of records, all kinds together and observations alone, and lags and blocks of the
     loop."""
-    counts, seen = publisher.counts, Kind.OBSERVATION
+    counts = publisher.counts
+    seen = Kind.OBSERVATION
     return {
         "published": sum(counts.published.values()),
         "acknowledged": sum(counts.acknowledged.values()),

@@ -35,7 +35,8 @@ class McapTableWriter:
             raise InputError(
                 "out", "the package mcap is missing", "pip install 'gripmap[mcap]'"
             ) from error
-        self._writer, self._count = Writer(file), 0
+        self._writer = Writer(file)
+        self._count = 0
         self._writer.start(library="gripmap")
         fields = {field.name: {"type": _JSON[str(field.type)]} for field in schema}
         described = json.dumps(

@@ -21,32 +21,75 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     """Return all current values; records are counted by kind."""
     counts = publisher.counts
     return [
-        Metric("published_records", "counter", "put on disk and sent", _named(counts.published), "kind"),
-        Metric("acknowledged_records", "counter", "held by a service", _named(counts.acknowledged), "kind"),
-        Metric("rejected_records", "counter", "rejected by a service", _named(counts.rejected), "kind"),
-        Metric("dropped_records", "counter", "dropped for lack of room", {"": publisher.dropped}),
-        Metric("late_batches", "counter", "batches that arrived after the "
-                                          "map had moved on", _named(counts.late), "kind"),
         Metric(
-            "unanswered_records", "counter", "given up because only later batches were answered",
+            "published_records", "counter", "put on disk and sent", _named(counts.published), "kind"
+        ),
+        Metric(
+            "acknowledged_records",
+            "counter",
+            "held by a service",
+            _named(counts.acknowledged),
+            "kind",
+        ),
+        Metric(
+            "rejected_records", "counter", "rejected by a service", _named(counts.rejected), "kind"
+        ),
+        Metric("dropped_records", "counter", "dropped for lack of room", {"": publisher.dropped}),
+        Metric(
+            "late_batches",
+            "counter",
+            "batches that arrived after the map had moved on",
+            _named(counts.late),
+            "kind",
+        ),
+        Metric(
+            "unanswered_records",
+            "counter",
+            "given up because only later batches were answered",
             {"": publisher.unanswered},
         ),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
-        Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
-        Metric("damaged_spools", "counter", "times that the outbox was found damaged", {"": publisher.damage[0]}),
-        Metric("damaged_records", "counter", "lost by damage of the outbox", {"": publisher.damage[1]}),
-        Metric("sender_failures", "counter", "failed rounds of the sending thread", {"": counts.failures}),
+        Metric(
+            "bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}
+        ),
+        Metric(
+            "damaged_spools",
+            "counter",
+            "times that the outbox was found damaged",
+            {"": publisher.damage[0]},
+        ),
+        Metric(
+            "damaged_records", "counter", "lost by damage of the outbox", {"": publisher.damage[1]}
+        ),
+        Metric(
+            "sender_failures",
+            "counter",
+            "failed rounds of the sending thread",
+            {"": counts.failures},
+        ),
         gauge("stranded_records", "records in the outbox under a former name", publisher.stranded),
-        gauge("unanswered_seconds", "time for which sent batches have not been answered", publisher.unanswered_s),
-        gauge("clock_behind_seconds", "lag of the vehicle's clock behind the service's", publisher.clock_behind_s),
+        gauge(
+            "unanswered_seconds",
+            "time for which sent batches have not been answered",
+            publisher.unanswered_s,
+        ),
+        gauge(
+            "clock_behind_seconds",
+            "lag of the vehicle's clock behind the service's",
+            publisher.clock_behind_s,
+        ),
         gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
-        gauge("unsettled_records", "records neither acknowledged nor rejected yet", publisher.unsettled()),
+        gauge(
+            "unsettled_records",
+            "records neither acknowledged nor rejected yet",
+            publisher.unsettled(),
+        ),
         gauge("sessions", "open sessions", publisher.links),
         *link_metrics(publisher.link_watches),
         gauge("blocks_behind", "blocks that were processed too late", progress.behind),
         gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
         gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
-    ]  # fmt: skip
+    ]
 
 
 def health_problems(publisher: Publisher, progress: Progress) -> list[str]:

@@ -61,7 +61,9 @@ class Plausibility:
         health = np.asarray(estimates.health[:, 0], dtype=np.int64)
         self.sliding += int(np.sum(health & Health.SLIDING != 0))
         self.resets += int(np.sum(health & Health.RESET != 0))
-        upper, used, mu = estimates.mu_upper[:, 0], estimates.mu_utilised[:, 0], estimates.mu[:, 0]
+        upper = estimates.mu_upper[:, 0]
+        used = estimates.mu_utilised[:, 0]
+        mu = estimates.mu[:, 0]
         self.violations += int(np.sum(upper < in_use(t[:, 0], signals[:, 0]) - SLACK))
         self.excited += int(np.sum(used > EXCITED_SHARE * mu))
         self.samples += len(health)

@@ -66,7 +66,8 @@ class SignalWatch:
 
     def add(self, block: Block) -> None:
         """Record the contents of a block."""
-        signals, now = block.signals, self._clock()
+        signals = block.signals
+        now = self._clock()
         if not self._seen:
             self.began = now
             self._seen = dict.fromkeys(("position", "wheels", "turning"), now)
@@ -138,7 +139,9 @@ class ReasonReporter:
         say: Callable[[str], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._find, self._say, self._clock = find, say, clock
+        self._find = find
+        self._say = say
+        self._clock = clock
         self._due: float | None = None
         self._told: list[str] = []
 

@@ -65,7 +65,8 @@ class Trip:
         self, vehicle: Vehicle, profile: Profile, path: Path, *, trusted: bool = False
     ) -> None:
         self._plain = vehicle.model_copy(update={"calibration": None})
-        self._path, self._trusted = path, trusted
+        self._path = path
+        self._trusted = trusted
         self._known = _read(path, _identity(self._plain, profile))
         learned = weighed(self._known.drives, self._plain)
         self.vehicle = vehicle.model_copy(

@@ -77,7 +77,9 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
             "give two drives or a longer one",
         )
     before = [judge(vehicle, held) for held in judged]
-    best, kept, refused = before, list[str](), list[str]()
+    best = before
+    kept = list[str]()
+    refused = list[str]()
     for group, names in GROUPS.items():
         if not any(getattr(whole, name) is not None for name in names):
             continue

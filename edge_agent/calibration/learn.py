@@ -43,14 +43,42 @@ PULLED: Final = 0.5  # [m/s^2] from which on torque tells its gain
 STRAIGHT: Final = 1.0  # [m/s^2] of v·r
 LEAST_S: Final = 10.0  # of moments that count
 # spread among drives that is always allowed for; what drives have in common; and spread among cars
-FLOOR: Final = {"radius": 0.0004, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "steer_offset": 0.0006,
-                "steer_gain": 0.02, "force_gain": 0.02, "understeer": 0.0005, "wheel_lag": 0.012,
-                "steer_lag": 0.012}  # fmt: skip
-BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0004,
-               "steer_gain": 0.015, "force_gain": 0.002, "understeer": 0.0002, "wheel_lag": 0.009,
-               "steer_lag": 0.009}  # fmt: skip
-USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
-                "force_gain": 0.08, "understeer": 0.001, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
+FLOOR: Final = {
+    "radius": 0.0004,
+    "ax": 0.10,
+    "ay": 0.05,
+    "yaw_rate": 0.0015,
+    "steer_offset": 0.0006,
+    "steer_gain": 0.02,
+    "force_gain": 0.02,
+    "understeer": 0.0005,
+    "wheel_lag": 0.012,
+    "steer_lag": 0.012,
+}
+BIAS: Final = {
+    "radius": 0.0001,
+    "ax": 0.02,
+    "ay": 0.25,
+    "yaw_rate": 0.0005,
+    "steer_offset": 0.0004,
+    "steer_gain": 0.015,
+    "force_gain": 0.002,
+    "understeer": 0.0002,
+    "wheel_lag": 0.009,
+    "steer_lag": 0.009,
+}
+USUAL: Final = {
+    "radius": 0.006,
+    "ax": 0.4,
+    "ay": 0.2,
+    "yaw_rate": 0.004,
+    "steer_offset": 0.005,
+    "steer_gain": 0.04,
+    "force_gain": 0.08,
+    "understeer": 0.001,
+    "wheel_lag": 0.04,
+    "steer_lag": 0.04,
+}
 SOUND: Final = {
     "steer_gain": 1.0,
     "force_gain": 1.0,
@@ -111,10 +139,11 @@ def surer(one: Calibration | None, other: Calibration | None) -> Calibration | N
     if one is None or other is None:
         return one or other
     better = {
-        name: mine for name in Calibration.model_fields
+        name: mine
+        for name in Calibration.model_fields
         if isinstance(mine := getattr(one, name), tuple)
         and ((its := getattr(other, name)) is None or mine[1] < its[1])
-    }  # fmt: skip
+    }
     return other.model_copy(update={**better, "drives": max(one.drives, other.drives)})
 
 
@@ -142,7 +171,8 @@ def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEsti
 
 
 def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    moving, axle = drive.moving > 0, fits(drive)["axle"]
+    moving = drive.moving > 0
+    axle = fits(drive)["axle"]
     quantities: DriveEstimates = {}
     if axle.known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain

@@ -21,27 +21,67 @@ BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "fleet")  # commands that drive for hours
 
 COMMANDS: Final = (
-    Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth",
-            "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet --vehicle-out drive.json"),
-    Command("import", "edge_agent.cli.import_", "convert a car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
-            "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out drive.parquet"),
-    Command("check", "edge_agent.cli.check", "run the signal doctor: units, signs, clocks, offsets, by physics",
-            "edge-agent check drive.parquet --vehicle car.json --out check.html"),
-    Command("calibrate", "edge_agent.cli.calibrate", "learn a vehicle file from a car's own drives",
-            "edge-agent calibrate monday.parquet tuesday.parquet --vehicle car.json --out better.json"),
-    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive; publish it with --publish",
-            "edge-agent replay drive.parquet --vehicle car.json --out estimates.parquet"),
-    Command("run", "edge_agent.cli.run", "run one vehicle live, in real time",
-            "edge-agent run --source simulated --name car-one --config agent.json"),
-    Command("fleet", "edge_agent.cli.fleet", "run many simulated vehicles in real time, each with its own session",
-            "edge-agent fleet --vehicles 36 --duration 150 --config agent.json"),
-    Command("tune", "edge_agent.cli.tune", "search the fuzzy memberships by ant colony and by random search",
-            "edge-agent tune --seed 1 --out memberships.json"),
-    Command("evaluate", "edge_agent.cli.evaluate", "run every estimator on the papers' manoeuvres, with figures",
-            "edge-agent evaluate --quick --out evaluation"),
-    Command("completion", "edge_agent.cli.completion", "print the completion script for a shell",
-            "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent"),
-)  # fmt: skip
+    Command(
+        "simulate",
+        "edge_agent.cli.simulate",
+        "write the signal log of a manoeuvre, with truth",
+        "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet --vehicle-out drive.json",
+    ),
+    Command(
+        "import",
+        "edge_agent.cli.import_",
+        "convert a car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
+        "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out drive.parquet",
+    ),
+    Command(
+        "check",
+        "edge_agent.cli.check",
+        "run the signal doctor: units, signs, clocks, offsets, by physics",
+        "edge-agent check drive.parquet --vehicle car.json --out check.html",
+    ),
+    Command(
+        "calibrate",
+        "edge_agent.cli.calibrate",
+        "learn a vehicle file from a car's own drives",
+        "edge-agent calibrate monday.parquet tuesday.parquet --vehicle car.json --out better.json",
+    ),
+    Command(
+        "replay",
+        "edge_agent.cli.replay",
+        "estimate a recorded drive; publish it with --publish",
+        "edge-agent replay drive.parquet --vehicle car.json --out estimates.parquet",
+    ),
+    Command(
+        "run",
+        "edge_agent.cli.run",
+        "run one vehicle live, in real time",
+        "edge-agent run --source simulated --name car-one --config agent.json",
+    ),
+    Command(
+        "fleet",
+        "edge_agent.cli.fleet",
+        "run many simulated vehicles in real time, each with its own session",
+        "edge-agent fleet --vehicles 36 --duration 150 --config agent.json",
+    ),
+    Command(
+        "tune",
+        "edge_agent.cli.tune",
+        "search the fuzzy memberships by ant colony and by random search",
+        "edge-agent tune --seed 1 --out memberships.json",
+    ),
+    Command(
+        "evaluate",
+        "edge_agent.cli.evaluate",
+        "run every estimator on the papers' manoeuvres, with figures",
+        "edge-agent evaluate --quick --out evaluation",
+    ),
+    Command(
+        "completion",
+        "edge_agent.cli.completion",
+        "print the completion script for a shell",
+        "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent",
+    ),
+)
 LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.", COMMANDS)
 
 

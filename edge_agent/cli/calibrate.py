@@ -12,9 +12,14 @@ if TYPE_CHECKING:
 
 ESTIMATOR: Final = "aco-fckf"
 UNITS: Final = {
-    "ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s", "steer_offset": "rad", "wheel_lag": "s", "steer_lag": "s",
+    "ax": "m/s^2",
+    "ay": "m/s^2",
+    "yaw_rate": "rad/s",
+    "steer_offset": "rad",
+    "wheel_lag": "s",
+    "steer_lag": "s",
     "understeer": "rad per m/s^2",
-}  # fmt: skip
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +97,8 @@ def report_lines(found: HeldOut) -> list[str]:
     lines += [
         f"not written: {group}: it makes a held-out drive no better" for group in found.refused
     ]
-    before, after = found.before, found.after
+    before = found.before
+    after = found.after
     lines.append(
         f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} -> "
         f"{after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> {after.contradicted:.3f}"

@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     from schemas.vehicle import load_vehicle
 
     file = args.vehicle or vehicle_file_of(args.log)
-    vehicle, log = load_vehicle(file), read_log(args.log)
+    vehicle = load_vehicle(file)
+    log = read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     doubts = _doubted(log)
     if args.json:
@@ -85,7 +86,8 @@ def _doubted(log: SignalLog) -> dict[str, str]:
     """Controller flags of a log that carry no weight at some time, and why."""
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 
-    flags, found = new_flag_records(1), dict[str, str]()
+    flags = new_flag_records(1)
+    found = dict[str, str]()
     for block in log.blocks(0, rows=FLAG_ROWS):
         if block.context is not None:
             flags, _ = trusted_context(flags, block.t, block.signals, block.context)

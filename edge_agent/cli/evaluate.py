@@ -115,11 +115,15 @@ def run(args: argparse.Namespace) -> int:
         return _real(args)
     if args.only:
         return _inputs(args)
-    began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
+    began = time.monotonic()
+    seeds = range(FIGURES, FIGURES + count)
     results = campaign(
-        seeds, quick=args.quick,
-        log_line=lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
-    )  # fmt: skip
+        seeds,
+        quick=args.quick,
+        log_line=lambda line: print(
+            f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True
+        ),
+    )
     figures = figures_of(results, quick=args.quick)
     name = "edge-agent evaluate" + (" --quick" if args.quick else "")
     write(args.out / "figures.json", name, list(seeds), figures)
@@ -203,7 +207,8 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown, write
 
-    seeds, quick = range(FIGURES, FIGURES + count), args.quick
+    seeds = range(FIGURES, FIGURES + count)
+    quick = args.quick
     rows: list[Callable[[], list[Figure]]] = [
         lambda: cost.figures(FIGURES, 2e3 if quick else 20e3),
         lambda: latency.figures(FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES),
@@ -236,7 +241,8 @@ def _detection(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write
 
-    began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
+    began = time.monotonic()
+    seeds = range(FIGURES, FIGURES + count)
     results = campaign(
         seeds,
         lambda line: print(

@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth else None
     source = blocks(fleet, args.rate, recorder)
     at_end = partial(recorder.write, args.truth) if recorder is not None else lambda: None
-    drivers, lookout = WarnedDrivers(fleet, args.warned), None
+    drivers = WarnedDrivers(fleet, args.warned)
+    lookout = None
     if drivers.warned.any():
         show = warning_lines(config)
 

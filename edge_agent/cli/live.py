@@ -35,7 +35,8 @@ def _warm_up(
     estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None
 ) -> None:
     """Load or compile the kernels before the clock runs, on a temporary vehicle."""
-    t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
+    t = np.zeros((1, 1))
+    time = np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
     with progress_messages.show_status("starting the estimator"):
         Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(
@@ -75,7 +76,8 @@ def drive_live(
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
     _warm_up(chosen, vehicles[0], config, memberships)
-    progress, running = Progress(), list[Publisher]()
+    progress = Progress()
+    running = list[Publisher]()
     with (
         stop_on_signal() as stop,
         serve_metrics(

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 NOW = "now"
 REPORTS = (".html", ".png", ".svg", ".pdf")
-LOCAL, SPARK = "local", "spark"
+LOCAL = "local"
+SPARK = "spark"
 OLD_NS = (
     29 * 86_400 * NS
 )  # a service takes nothing of more than thirty days ago, unless it is told otherwise
@@ -190,7 +191,10 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     """Print progress on stderr; return 2 if a log could not be read, else 0."""
-    bad, samples, began, last = 0, 0, time.monotonic(), 0.0
+    bad = 0
+    samples = 0
+    began = time.monotonic()
+    last = 0.0
     for done, outcome in enumerate(outcomes, 1):
         samples += outcome.samples
         if outcome.error is not None:
@@ -198,7 +202,8 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
             print(f"error: {outcome.task.log}: {outcome.error}", file=sys.stderr, flush=True)
         spent = time.monotonic() - began
         if spent - last >= PROGRESS_S or done == count:
-            last, rate = spent, samples / max(spent, 1e-9)
+            last = spent
+            rate = samples / max(spent, 1e-9)
             print(
                 f"{done} of {count} logs, {samples} samples, {rate:.0f}/s",
                 file=sys.stderr,

@@ -26,10 +26,11 @@ LIVE_ROWS = 10  # of a replayed log per block: a tenth of a second at 100 Hz
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--source", action="append",
+        "--source",
+        action="append",
         help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
         "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--profile", help="profile that maps live signals to channels: a file, or a shipped one"
     )
@@ -104,10 +105,8 @@ def run(args: argparse.Namespace) -> int:
     others = plugins.entry_points_of(plugins.SOURCES)
     if kind in others:
         vehicle = load_vehicle(_vehicle_file(args))
-        name, blocks = (
-            args.name or vehicle.name,
-            plugins.load_entry_point(plugins.SOURCES, kind)(address),
-        )
+        name = args.name or vehicle.name
+        blocks = plugins.load_entry_point(plugins.SOURCES, kind)(address)
     elif kind != SIMULATED and not Path(sources[0]).exists():
         known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
         raise InputError(
@@ -120,9 +119,16 @@ def run(args: argparse.Namespace) -> int:
             _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))
         )
     return drive_live(
-        [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
-        lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
-    )  # fmt: skip
+        [vehicle],
+        [checked_name(name)],
+        blocks,
+        config,
+        args.estimator,
+        args.duration,
+        lookout=_lookout(args, name, config),
+        vss=_vss(args, name, config),
+        memberships=memberships_of(args),
+    )
 
 
 def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:
@@ -169,10 +175,19 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
     blocks = trip.blocks(rows.blocks(), lambda: rows.ground)
     try:
         return drive_live(
-            [trip.vehicle], [name], blocks, config, args.estimator, args.duration, trip.end,
-            admitted=trip.admitted, troubled=lambda: [*rows.troubles(), *trip.troubles()],
-            lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
-        )  # fmt: skip
+            [trip.vehicle],
+            [name],
+            blocks,
+            config,
+            args.estimator,
+            args.duration,
+            trip.end,
+            admitted=trip.admitted,
+            troubled=lambda: [*rows.troubles(), *trip.troubles()],
+            lookout=_lookout(args, name, config),
+            vss=_vss(args, name, config),
+            memberships=memberships_of(args),
+        )
     finally:
         blocks.close()
         trip.close()

@@ -50,10 +50,16 @@ from schemas.runtime import figures
 from schemas.vehicle import load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
-ANTS, ITERATIONS, DURATION_S = 12, 8, 30.0
-QUICK_ANTS, QUICK_ITERATIONS, QUICK_DURATION_S = 3, 2, 2.0
+ANTS = 12
+ITERATIONS = 8
+DURATION_S = 30.0
+QUICK_ANTS = 3
+QUICK_ITERATIONS = 2
+QUICK_DURATION_S = 2.0
 STUDY_DURATION_S: Final = 6.0
-REPEATS, QUICK_REPEATS = 8, 2  # searches each way of the study
+# searches each way of the study
+REPEATS = 8
+QUICK_REPEATS = 2
 POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 
@@ -86,9 +92,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s"
     )
     parser.add_argument(
-        "--study", type=Path, metavar="DIR",
+        "--study",
+        type=Path,
+        metavar="DIR",
         help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--quick", action="store_true", help="a few ants on short drives, to check that it runs"
     )
@@ -148,9 +156,13 @@ def run(args: argparse.Namespace) -> int:
         f" --objective {chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
     )
     document = _document(
-        found[winner], chosen, scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        command, args.seed,
-    )  # fmt: skip
+        found[winner],
+        chosen,
+        scores,
+        Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        command,
+        args.seed,
+    )
     candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
     save(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
     print(f"wrote {args.out}: what {winner} found")
@@ -203,10 +215,13 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         ) from error
     seeds = range(args.seed, args.seed + (QUICK_REPEATS if args.quick else REPEATS))
     done = study_report.run(
-        ants=ants, iterations=iterations, positions=POSITIONS, seeds=seeds,
+        ants=ants,
+        iterations=iterations,
+        positions=POSITIONS,
+        seeds=seeds,
         duration_s=QUICK_DURATION_S if args.quick else STUDY_DURATION_S,
         reporter=lambda way: reporter(way, iterations, time.monotonic, print_line),
-    )  # fmt: skip
+    )
     listed = study_report.figures(done)
     title = "edge-agent tune --study" + " --quick" * args.quick
     figures.write(args.study / "figures.json", title, list(seeds), listed)
@@ -222,9 +237,14 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     )
     document = _document(
-        done.best("colony"), "innovation", scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        command + " --quick" * args.quick, args.seed, "paper-aco-fckf",
-    )  # fmt: skip
+        done.best("colony"),
+        "innovation",
+        scores,
+        Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        command + " --quick" * args.quick,
+        args.seed,
+        "paper-aco-fckf",
+    )
     save(args.study / "paper-aco-fckf.json", document)
     print_line(text)
     return 0
@@ -278,9 +298,14 @@ def _score(memberships: Memberships, drives: TuningSet) -> Score:
 
 
 def _document(
-    memberships: Memberships, objective: str, scores: dict[str, SplitScores], budget: Budget, command: str, seed: int,
+    memberships: Memberships,
+    objective: str,
+    scores: dict[str, SplitScores],
+    budget: Budget,
+    command: str,
+    seed: int,
     estimator: str = ESTIMATOR,
-) -> Document:  # fmt: skip
+) -> Document:
     header = figures.header("tune", [seed])
     provenance = Provenance.model_validate(
         {name: header[name] for name in ("date", "commit", "machine", "versions")}

@@ -23,7 +23,8 @@ def accelerations(
     """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad] of shape (4,)."""
     total_x = total_y = moment = 0.0
     for wheel in range(4):
-        cos, sin = math.cos(delta[wheel]), math.sin(delta[wheel])
+        cos = math.cos(delta[wheel])
+        sin = math.sin(delta[wheel])
         ahead = cos * force_x[wheel] - sin * force_y[wheel]
         left = sin * force_x[wheel] + cos * force_y[wheel]
         x, y = wheel_position(row, wheel)
@@ -61,11 +62,14 @@ def advance_velocity(
     Heun's rule is its second-order part; Euler's rule costs a factor of four in v_y (errata).
     """
     angle = yaw_rate * step
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     if abs(angle) < 1e-6:
-        along, across = step, 0.5 * angle * step
+        along = step
+        across = 0.5 * angle * step
     else:
-        along, across = sin / yaw_rate, (1.0 - cos) / yaw_rate
+        along = sin / yaw_rate
+        across = (1.0 - cos) / yaw_rate
     return (
         cos * vx + sin * vy + along * ax + across * ay,
         cos * vy - sin * vx + along * ay - across * ax,

@@ -36,7 +36,8 @@ def _slips(
     radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
 ) -> tuple[float, float]:
     """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta), sin(delta)."""
-    along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
+    along = cos * ahead + sin * aside
+    across = cos * aside - sin * ahead
     slip_x, slip_y = slips(radius, omega, along, across)
     return (0.0 if math.isnan(omega) else slip_x), slip_y
 
@@ -72,7 +73,8 @@ def tyre_forces(
     loads = wheel_loads(parameters, motion[3], motion[4])
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
-        ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
+        ahead = motion[0] - y * motion[2]
+        aside = motion[1] + x * motion[2]
         slip = _slips(
             row[Parameter.RADIUS],
             ahead,
@@ -118,7 +120,10 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
     vx, vy, rate, ax, ay = motion
     cos, sin, omega, force_x, mu = wheels
     fl, fr, rl, rr = wheel_loads(body, ax, ay)
-    a, b, front, rear = body.to_front, body.to_rear, 0.5 * body.track_front, 0.5 * body.track_rear
+    a = body.to_front
+    b = body.to_rear
+    front = 0.5 * body.track_front
+    rear = 0.5 * body.track_rear
     aside = vy + a * rate
     x_fl, y_fl = _pull(
         body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]), False
@@ -134,7 +139,8 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
         body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]), True
     )
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
-    per_mass, per_inertia = 1.0 / body.mass, 1.0 / body.yaw_inertia
+    per_mass = 1.0 / body.mass
+    per_inertia = 1.0 / body.yaw_inertia
     return (
         (x_fl + x_fr + x_rl + x_rr) * per_mass,
         (y_fl + y_fr + y_rl + y_rr) * per_mass,

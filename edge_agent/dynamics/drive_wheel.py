@@ -20,7 +20,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 ELECTRIC_S = 0.125 / 0.688  # T_e, paper 002, table 1
-SLIDING_GAIN, SLIDING_RATE = 2000.0, 10.0  # k1, k2; not given
+# k1, k2; not given
+SLIDING_GAIN = 2000.0
+SLIDING_RATE = 10.0
 SOFT_N_S = 500.0  # the sign is smoothed over so much
 
 

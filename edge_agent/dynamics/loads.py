@@ -21,7 +21,8 @@ def wheel_loads(body: Body, ax: float, ay: float) -> Four:
 
     The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness per load).
     """
-    mass, height = body.mass, body.cg_height
+    mass = body.mass
+    height = body.cg_height
     # what does not depend on ax and ay stands in brackets: many states share it
     per_base = 1.0 / (body.to_front + body.to_rear)
     pitch = ax * (mass * height * per_base)

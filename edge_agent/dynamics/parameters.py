@@ -100,10 +100,20 @@ def body(row: FloatArray) -> Body:
     """The body of a row (15,)."""
     p = Parameter
     return Body(
-        row[p.MASS], row[p.YAW_INERTIA], row[p.TO_FRONT], row[p.TO_REAR], row[p.TRACK_FRONT], row[p.TRACK_REAR],
-        row[p.CG_HEIGHT], row[p.RADIUS], row[p.SLOPE_X], row[p.SLOPE_Y],
-        row[p.PROPORTIONAL], row[p.QUADRATIC], row[p.REAR_SLOPE],
-    )  # fmt: skip
+        row[p.MASS],
+        row[p.YAW_INERTIA],
+        row[p.TO_FRONT],
+        row[p.TO_REAR],
+        row[p.TRACK_FRONT],
+        row[p.TRACK_REAR],
+        row[p.CG_HEIGHT],
+        row[p.RADIUS],
+        row[p.SLOPE_X],
+        row[p.SLOPE_Y],
+        row[p.PROPORTIONAL],
+        row[p.QUADRATIC],
+        row[p.REAR_SLOPE],
+    )
 
 
 Four: TypeAlias = tuple[float, float, float, float]

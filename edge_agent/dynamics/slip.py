@@ -32,7 +32,8 @@ def wheel_velocity(
     x, y = wheel_position(row, wheel)
     ahead = vx - y * yaw_rate
     left = vy + x * yaw_rate
-    cos, sin = math.cos(delta), math.sin(delta)
+    cos = math.cos(delta)
+    sin = math.sin(delta)
     return cos * ahead + sin * left, cos * left - sin * ahead
 
 

@@ -86,7 +86,8 @@ def combined_dugoff(
     The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it has no falling branch.
     """
     grip = max(mu * load, 0.0)
-    free_x, free_y = stiffness[0] * slip[0], stiffness[1] * slip[1]
+    free_x = stiffness[0] * slip[0]
+    free_y = stiffness[1] * slip[1]
     free = math.sqrt(free_x * free_x + free_y * free_y)
     share = grip / free  # 1/theta
     gain = 1.0 if 2.0 * free <= grip else share * (1.0 - 0.25 * share)

@@ -127,7 +127,8 @@ def _adapt(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
     keep = 0.5 ** (dt / WINDOW_S)
     raw = np.ones(2)
     for sub in range(2):
-        mismatch, count = 0.0, 0
+        mismatch = 0.0
+        count = 0
         for r in range(ROWS):
             error = motion.innovation[sub, r]
             if math.isnan(error):

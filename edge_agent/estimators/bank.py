@@ -44,13 +44,12 @@ class EstimatorBank:
         beliefs: Kernel | None = None,
     ) -> None:
         self._beliefs = beliefs
-        self._filters, self._contexts, self._kernel, self._columns = (
-            filters,
-            context,
-            kernel,
-            columns,
-        )
-        self._entered, count = kernel, len(filters)
+        self._filters = filters
+        self._contexts = context
+        self._kernel = kernel
+        self._columns = columns
+        self._entered = kernel
+        count = len(filters)
         self._nowhere = (
             ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
         )
@@ -79,7 +78,9 @@ class EstimatorBank:
         """
         count = len(self._filters)
         t, signals = checked(t, signals, closes, count)
-        samples, visits, evidence = t.shape[0], self._nowhere, None
+        samples = t.shape[0]
+        visits = self._nowhere
+        evidence = None
         values = np.empty((samples, count, self._columns))
         if visits and closes is not None:
             evidence = np.full((samples, count, BINS), np.nan)

@@ -47,12 +47,18 @@ from schemas.runtime.records import records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-A_STATES, A_ROWS, B_STATES = 19, 9, 3
-A_XI, A_WEIGHT = cubature(A_STATES).xi, cubature(A_STATES).w_cov
-B_XI, B_WEIGHT = cubature(B_STATES).xi, cubature(B_STATES).w_cov
+A_STATES = 19
+A_ROWS = 9
+B_STATES = 3
+A_XI = cubature(A_STATES).xi
+A_WEIGHT = cubature(A_STATES).w_cov
+B_XI = cubature(B_STATES).xi
+B_WEIGHT = cubature(B_STATES).w_cov
 SHAPE = 1.4  # c of the Magic Formula (12): between the usual lateral 1.3 and longitudinal 1.65
 WINDOW = 25  # samples; the paper's N is not given
-LEAST, LARGEST = 0.5, 20.0  # of the nominal R
+# of the nominal R
+LEAST = 0.5
+LARGEST = 20.0
 # process standard deviations per s^.5: offsets of the accelerometers, yaw model error, then torque, speed, force
 A_PROCESS = np.array([0.05, 0.05, 0.2, *[20.0] * 4, *[0.5] * 4, *[100.0] * 4, *[2e4] * 4])
 A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of r, tau, omega
@@ -103,7 +109,10 @@ def bank(
 
 @compiled
 def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001 the context is the step's
-    row, mean, root, use = memory.row, memory.mean, memory.root, memory.track.inputs
+    row = memory.row
+    mean = memory.mean
+    root = memory.root
+    use = memory.track.inputs
     X = DriveWheelState
     speed = rolling_speed(row, memory.track.now)
     known = not math.isnan(speed)
@@ -138,13 +147,20 @@ def _step(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
 
 @compiled
 def _forces(
-    row: FloatArray, x: FloatArray, use: FloatArray, mu: FloatArray, observed: FloatArray, force_x: FloatArray,
+    row: FloatArray,
+    x: FloatArray,
+    use: FloatArray,
+    mu: FloatArray,
+    observed: FloatArray,
+    force_x: FloatArray,
     force_y: FloatArray,
-) -> None:  # fmt: skip
+) -> None:
     """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces `observed` by A."""
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
-    delta, omega, share = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4], np.empty(4)
+    delta = use[S.DELTA : S.DELTA + 4]
+    omega = use[S.OMEGA : S.OMEGA + 4]
+    share = np.empty(4)
     tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, force_x, force_y)
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
@@ -160,22 +176,26 @@ def _forces(
 @compiled
 def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """WCKF-A: lateral forces come from the tyre model in B's last motion."""
-    row, mean, root, points, work = (
-        memory.row,
-        memory.mean,
-        memory.root,
-        context.points,
-        context.work,
-    )
-    use, now, X = memory.track.inputs_before, memory.track.now, DriveWheelState
-    force_x, force_y, noise = np.empty(4), np.empty(4), np.zeros((A_STATES, A_STATES))
+    row = memory.row
+    mean = memory.mean
+    root = memory.root
+    points = context.points
+    work = context.work
+    use = memory.track.inputs_before
+    now = memory.track.now
+    X = DriveWheelState
+    force_x = np.empty(4)
+    force_y = np.empty(4)
+    noise = np.zeros((A_STATES, A_STATES))
     _forces(row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
     delta = use[S.DELTA : S.DELTA + 4]
     sigma_points(mean, root, A_XI, points)
     for p in range(points.shape[0]):
         x = points[p]
         _, _, turn = accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
-        vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
+        vx = x[X.VX]
+        vy = x[X.VY]
+        rate = x[X.YAW_RATE]
         x[X.VX], x[X.VY] = vx + dt * (use[S.AX] + rate * vy), vy + dt * (use[S.AY] - rate * vx)
         x[X.YAW_RATE] = rate + dt * turn
         for w in range(4):
@@ -187,7 +207,9 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(dt)
     predict(points, A_WEIGHT, A_WEIGHT, noise, mean, root, work)
-    innovation, std, rows = np.empty(A_ROWS), np.empty(A_ROWS), np.empty((A_ROWS, A_STATES))
+    innovation = np.empty(A_ROWS)
+    std = np.empty(A_ROWS)
+    rows = np.empty((A_ROWS, A_STATES))
     for r in range(A_ROWS):
         place = X.YAW_RATE + r
         reading = (
@@ -206,17 +228,25 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
 @compiled
 def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """WCKF-B: motion by the compensated forces."""
-    row, track, mean, root = memory.row, memory.track, memory.fused, memory.fused_root
-    use, now, X = track.inputs, track.now, DriveWheelState
-    observed, count = memory.mean[X.FORCE : X.FORCE + 4], 2 * B_STATES
-    points, outcomes, predicted = (
-        np.empty((count, B_STATES)),
-        np.empty((count, B_STATES)),
-        np.empty(B_STATES),
-    )
-    state, measured = np.empty((B_STATES, count)), np.empty((B_STATES, count))
-    innovation, std, noise = np.empty(B_STATES), np.empty(B_STATES), np.zeros((B_STATES, B_STATES))
-    force_x, force_y = np.empty(4), np.empty(4)
+    row = memory.row
+    track = memory.track
+    mean = memory.fused
+    root = memory.fused_root
+    use = track.inputs
+    now = track.now
+    X = DriveWheelState
+    observed = memory.mean[X.FORCE : X.FORCE + 4]
+    count = 2 * B_STATES
+    points = np.empty((count, B_STATES))
+    outcomes = np.empty((count, B_STATES))
+    predicted = np.empty(B_STATES)
+    state = np.empty((B_STATES, count))
+    measured = np.empty((B_STATES, count))
+    innovation = np.empty(B_STATES)
+    std = np.empty(B_STATES)
+    noise = np.zeros((B_STATES, B_STATES))
+    force_x = np.empty(4)
+    force_y = np.empty(4)
     delta = use[S.DELTA : S.DELTA + 4]
     for act in range(2):
         sigma_points(mean, root, B_XI, points)
@@ -233,7 +263,9 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
             )
             ax, ay, turn = accelerations(row, force_x, force_y, delta)
             if act == 0:
-                vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
+                vx = x[X.VX]
+                vy = x[X.VY]
+                rate = x[X.YAW_RATE]
                 x[X.VX], x[X.VY] = vx + dt * (ax + rate * vy), vy + dt * (ay - rate * vx)
                 x[X.YAW_RATE] = rate + dt * turn
             else:
@@ -260,11 +292,9 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
         mean, root, state, measured, innovation, std, context.work
     )
     _forces(row, mean, use, context.friction, observed, memory.compensated, force_y)
-    memory.nis, memory.log_likelihood, memory.adaptation = (
-        square / max(used, 1),
-        log_likelihood,
-        largest,
-    )
+    memory.nis = square / max(used, 1)
+    memory.log_likelihood = log_likelihood
+    memory.adaptation = largest
 
 
 @compiled

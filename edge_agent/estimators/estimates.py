@@ -36,10 +36,9 @@ class Column(IntEnum):
 
 
 COLUMNS = tuple(column.name.lower() for column in Column if column < Column.WHEELS)
-ONE_FRICTION, FOUR_FRICTIONS = (
-    int(Column.WHEELS),
-    int(Column.WHEELS) + 12,
-)  # how many numbers an estimator reports
+# how many numbers an estimator reports
+ONE_FRICTION = int(Column.WHEELS)
+FOUR_FRICTIONS = int(Column.WHEELS) + 12
 
 
 class _View:

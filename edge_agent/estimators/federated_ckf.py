@@ -64,9 +64,11 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-WHEELS, ROWS = 4, 3
+WHEELS = 4
+ROWS = 3
 RULE = cubature(WHEELS)
-XI, WEIGHT = RULE.xi, RULE.w_cov
+XI = RULE.xi
+WEIGHT = RULE.w_cov
 NOISE_STD = np.array(
     [0.15, 0.15, 0.004]
 )  # of a_x, a_y, r against the tyre model, for one independent measurement
@@ -121,9 +123,12 @@ def share_by_information(first: float, second: float) -> float:
 def _step_friction(memory: JointMemory, dt: float) -> None:
     x = memory.motion.mean
     metres = abs(x[PlanarState.VX]) * dt
-    mean, root = np.empty(WHEELS), np.empty((WHEELS, WHEELS))
-    first_mean, first_root = np.empty(WHEELS), np.empty((WHEELS, WHEELS))
-    work, sizes = np.empty((2 * WHEELS, 4 * WHEELS)), np.ones(2)
+    mean = np.empty(WHEELS)
+    root = np.empty((WHEELS, WHEELS))
+    first_mean = np.empty(WHEELS)
+    first_root = np.empty((WHEELS, WHEELS))
+    work = np.empty((2 * WHEELS, 4 * WHEELS))
+    sizes = np.ones(2)
     return_to_prior(memory.mean, memory.root, metres, work)
     for sub in range(2):
         share(memory.root, memory.beta if sub == 0 else 1.0 - memory.beta, root)
@@ -144,28 +149,34 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
 @compiled
 def _measure(
     memory: JointMemory, sub: int, dt: float, mean: FloatArray, root: FloatArray, work: FloatArray
-) -> None:  # fmt: skip
-    row, track, x = memory.row, memory.track, memory.motion.mean
-    now, use = track.now, track.inputs
-    points, outcomes, predicted = (
-        np.empty((2 * WHEELS, WHEELS)),
-        np.empty((2 * WHEELS, ROWS)),
-        np.empty(ROWS),
-    )
-    state, measured = np.empty((WHEELS, 2 * WHEELS)), np.empty((ROWS, 2 * WHEELS))
-    force_x, mu = np.empty(4), np.empty(4)
-    innovation, std = np.empty(ROWS), np.empty(ROWS)
+) -> None:
+    row = memory.row
+    track = memory.track
+    x = memory.motion.mean
+    now = track.now
+    use = track.inputs
+    points = np.empty((2 * WHEELS, WHEELS))
+    outcomes = np.empty((2 * WHEELS, ROWS))
+    predicted = np.empty(ROWS)
+    state = np.empty((WHEELS, 2 * WHEELS))
+    measured = np.empty((ROWS, 2 * WHEELS))
+    force_x = np.empty(4)
+    mu = np.empty(4)
+    innovation = np.empty(ROWS)
+    std = np.empty(ROWS)
     for wheel in range(4):
         force_x[wheel] = wheel_force(row, track, wheel, dt)
     axis_points(mean, root, XI, points)
-    cos, sin, omega = (
-        four(track.steering[0]),
-        four(track.steering[1]),
-        four(use[S.OMEGA : S.TORQUE]),
-    )
+    cos = four(track.steering[0])
+    sin = four(track.steering[1])
+    omega = four(use[S.OMEGA : S.TORQUE])
     motion = PlanarMotion(
-        x[PlanarState.VX], x[PlanarState.VY], x[PlanarState.YAW_RATE], x[PlanarState.AX], x[PlanarState.AY]
-    )  # fmt: skip
+        x[PlanarState.VX],
+        x[PlanarState.VY],
+        x[PlanarState.YAW_RATE],
+        x[PlanarState.AX],
+        x[PlanarState.AY],
+    )
     for p in range(points.shape[0]):
         for wheel in range(4):
             mu[wheel] = min(max(points[p, wheel], LOWER), UPPER)

@@ -46,11 +46,14 @@ from schemas.runtime.records import records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-STATES, ROWS = 6, 3
+STATES = 6
+ROWS = 3
 STEP_S = 0.02  # the paper's sampling; Q and the fuzzy steps are per so much time
 KNOTS = 48  # of the fuzzy inference as a table: five sets need five, lower vertices more
 WINDOW_S = 0.5  # of the innovation variances
-LEAST_FACTOR, LARGEST_FACTOR = 0.1, 20.0  # of R over its setting: table 2 varies it by 5
+# of R over its setting: table 2 varies it by 5
+LEAST_FACTOR = 0.1
+LARGEST_FACTOR = 20.0
 
 
 class Setting(NamedTuple):
@@ -143,7 +146,9 @@ def bank(
 @compiled
 def _begin(memory: FuzzyMemory, context: FuzzyContext) -> None:
     """Begin at the speed of the wheels, straight on."""
-    mean, root, use = memory.mean, memory.root, memory.track.inputs
+    mean = memory.mean
+    root = memory.root
+    use = memory.track.inputs
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
     mean[PlanarState.VX], mean[PlanarState.VY] = speed if known else 0.0, 0.0
@@ -161,19 +166,26 @@ def _begin(memory: FuzzyMemory, context: FuzzyContext) -> None:
 
 @compiled
 def _step(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
-    mean, root, points, noise = memory.mean, memory.root, context.points, context.adapted
+    mean = memory.mean
+    root = memory.root
+    points = context.points
+    noise = context.adapted
     pace = dt / STEP_S
     spread(mean, root, points)
     carry(memory.row, points, memory.factor, memory.track, dt, False, context.dual_motor)
     gather(points, context.process, math.sqrt(pace), mean, root)
     _adapt(memory, context, pace, math.exp(-math.log(2.0) * dt / WINDOW_S))
-    used, square, determinant = 0, 0.0, 1.0
+    used = 0
+    square = 0.0
+    determinant = 1.0
     for r in range(ROWS):
         # the measurement is linear, a state itself
         reading = memory.track.now[r]
         if not math.isnan(reading):
             far, expected = carlson(mean, root, PlanarState.AX + r, reading, noise[r], context.gain)
-            used, square, determinant = used + 1, square + far, determinant * expected
+            used = used + 1
+            square = square + far
+            determinant = determinant * expected
     memory.nis = square / max(used, 1)
     memory.log_likelihood = -0.5 * (used * LOG_TWO_PI + math.log(determinant) + square)
     limit_friction(mean, root, PlanarState.MU, PRIOR_MU_STD)
@@ -191,15 +203,21 @@ def _adapt(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float)
             memory.actual[r] = keep * memory.actual[r] + (1.0 - keep) * innovation * innovation
             memory.theoretical[r] = keep * memory.theoretical[r] + (1.0 - keep) * theoretical
             memory.factor[r] = adapted_within(
-                memory.factor[r], memory.actual[r], memory.theoretical[r], context.fuzzy_inputs, context.fuzzy_outputs,
-                pace, (LEAST_FACTOR, LARGEST_FACTOR),
-            )  # fmt: skip
+                memory.factor[r],
+                memory.actual[r],
+                memory.theoretical[r],
+                context.fuzzy_inputs,
+                context.fuzzy_outputs,
+                pace,
+                (LEAST_FACTOR, LARGEST_FACTOR),
+            )
     memory.adaptation = max(memory.factor[0], memory.factor[1], memory.factor[2])
 
 
 @compiled
 def _report(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> float:  # noqa: ARG001 as of all filters
-    mean, root = memory.mean, memory.root
+    mean = memory.mean
+    root = memory.root
     write_states(output, mean, root, PlanarState.YAW_RATE)
     write_friction(
         output, Column.MU, mean[PlanarState.MU], math.sqrt(variance(root, PlanarState.MU))

@@ -102,8 +102,6 @@ def create(
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
     design = design_of(memberships, adaptive=name != "ckf", curve=curve)
-    spreads, means = (
-        spreads_of(vehicles, design.nominal.std),
-        means_of(vehicles, design.nominal.mean),
-    )
+    spreads = spreads_of(vehicles, design.nominal.std)
+    means = means_of(vehicles, design.nominal.mean)
     return mixture_bank(parameter_table(vehicles), design, spreads, means)

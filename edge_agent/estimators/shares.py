@@ -26,7 +26,8 @@ def checked(
     Raises:
         InputError: shapes do not agree with the bank or with each other.
     """
-    t, signals = np.ascontiguousarray(t, DOUBLE), np.ascontiguousarray(signals, DOUBLE)
+    t = np.ascontiguousarray(t, DOUBLE)
+    signals = np.ascontiguousarray(signals, DOUBLE)
     shape = t.shape
     if len(shape) != 2 or shape[1] != count:
         raise InputError("t", f"shape {shape} for a bank of {count}", "give (T, N)")

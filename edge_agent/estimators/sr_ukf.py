@@ -73,27 +73,28 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-STATES, ROWS = 7, 7  # rows: speed of the wheels, r, a_y, four longitudinal forces
+# rows: speed of the wheels, r, a_y, four longitudinal forces
+STATES = 7
+ROWS = 7
 RULE = unscented(STATES, 1.0, 2.0, 0.0)
-XI, W_MEAN, W_COV = RULE.xi, RULE.w_mean, RULE.w_cov
+XI = RULE.xi
+W_MEAN = RULE.w_mean
+W_COV = RULE.w_cov
 DRIFT = np.array(
     [0.05, 0.05, 0.1]
 )  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
 FIRST_RATE_STD = 0.1  # [rad/s] of the yaw rate at the first sample
 RATE_STD = 0.003  # [rad/s]
 SLOWEST_SLIP_M_S = 1.0  # noise of the wheel speeds is slip at this speed at least
-AY_STD, AY_SHARE = (
-    0.15,
-    0.05,
-)  # [m/s^2], and of a_y, that the tyre model may miss, per independent measurement
-FORCE_STD, FORCE_SHARE = (
-    0.01,
-    0.15,
-)  # of the load: rolling resistance; of the force: torque gain and stiffness
-SLIP_STD, OMEGA_STD = (
-    0.001,
-    0.03,
-)  # [1] radius differences, [rad/s] noise: through the slip stiffness
+# [m/s^2], and of a_y, that the tyre model may miss, per independent measurement
+AY_STD = 0.15
+AY_SHARE = 0.05
+# of the load: rolling resistance; of the force: torque gain and stiffness
+FORCE_STD = 0.01
+FORCE_SHARE = 0.15
+# [1] radius differences, [rad/s] noise: through the slip stiffness
+SLIP_STD = 0.001
+OMEGA_STD = 0.03
 
 
 class WheelFrictionState(IntEnum):
@@ -125,7 +126,9 @@ def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Estimat
 
 @compiled
 def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
-    mean, root, X = memory.mean, memory.root, WheelFrictionState
+    mean = memory.mean
+    root = memory.root
+    X = WheelFrictionState
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
     mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = (
@@ -152,25 +155,31 @@ def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> 
 @compiled
 def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> tuple[float, float]:
     """(a_y, yaw acceleration) of the tyres at x (7,)."""
-    use, unknown = track.inputs, (math.nan, math.nan, math.nan, math.nan)
+    use = track.inputs
+    unknown = (math.nan, math.nan, math.nan, math.nan)
     motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
-    cos, sin, omega = (
-        four(track.steering[0]),
-        four(track.steering[1]),
-        four(use[S.OMEGA : S.TORQUE]),
-    )
+    cos = four(track.steering[0])
+    sin = four(track.steering[1])
+    omega = four(use[S.OMEGA : S.TORQUE])
     _, ay, turn = response(body(row), motion, WheelInputs(cos, sin, omega, unknown, four(mu)))
     return ay, turn
 
 
 @compiled
 def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
-    row, track, mean, root = memory.row, memory.track, memory.mean, memory.root
-    use, first = track.inputs, WheelFrictionState.MU
+    row = memory.row
+    track = memory.track
+    mean = memory.mean
+    root = memory.root
+    use = track.inputs
+    first = WheelFrictionState.MU
     count = XI.shape[0]
-    points, work = np.empty((count, STATES)), np.empty((ROWS + STATES, count + 2 * STATES))
-    noise, mu = np.zeros((STATES, STATES)), np.empty(4)
-    middle, share = mean.copy(), visible_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
+    points = np.empty((count, STATES))
+    work = np.empty((ROWS + STATES, count + 2 * STATES))
+    noise = np.zeros((STATES, STATES))
+    mu = np.empty(4)
+    middle = mean.copy()
+    share = visible_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
     keep = math.exp(-abs(mean[0]) * dt / FORGET_M)
     sigma_points(mean, root, XI, points)
     for p in range(count):
@@ -197,13 +206,22 @@ def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # 
 def _measure(
     memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray
 ) -> None:
-    row, track, mean, root = memory.row, memory.track, memory.mean, memory.root
-    now, use = track.now, track.inputs
+    row = memory.row
+    track = memory.track
+    mean = memory.mean
+    root = memory.root
+    now = track.now
+    use = track.inputs
     count = points.shape[0]
-    outcomes, predicted = np.empty((count, ROWS)), np.empty(ROWS)
-    state, measured = np.empty((STATES, count)), np.empty((ROWS, count))
-    innovation, std = np.empty(ROWS), np.empty(ROWS)
-    middle, mu, force_y = mean.copy(), np.empty(4), np.empty(4)
+    outcomes = np.empty((count, ROWS))
+    predicted = np.empty(ROWS)
+    state = np.empty((STATES, count))
+    measured = np.empty((ROWS, count))
+    innovation = np.empty(ROWS)
+    std = np.empty(ROWS)
+    middle = mean.copy()
+    mu = np.empty(4)
+    force_y = np.empty(4)
     wheels = wheel_inputs(use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4])
     motion = np.array([0.0, 0.0, 0.0, use[S.AX], use[S.AY]])
     rate = WheelFrictionState.YAW_RATE
@@ -241,13 +259,16 @@ def _measure(
     used, log_likelihood, square, refused = update_by_downdate(
         mean, root, state, measured, innovation, std, work
     )
-    memory.nis, memory.log_likelihood = square / max(used, 1), log_likelihood
+    memory.nis = square / max(used, 1)
+    memory.log_likelihood = log_likelihood
     memory.refused += 1.0 if refused else 0.0
 
 
 @compiled
 def _report(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
-    mean, root, first = memory.mean, memory.root, WheelFrictionState.MU
+    mean = memory.mean
+    root = memory.root
+    first = WheelFrictionState.MU
     write_states(output, mean, root, WheelFrictionState.YAW_RATE)
     for wheel in range(4):
         std = math.sqrt(variance(root, first + wheel))

@@ -36,7 +36,8 @@ def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> boo
         white[i] = 0.0
     for j in range(n - 1, -1, -1):
         norm = math.hypot(rest, carried[j])
-        cos, sin = rest / norm, carried[j] / norm
+        cos = rest / norm
+        sin = carried[j] / norm
         rest = norm
         for i in range(j, n):
             spare = white[i]
@@ -62,7 +63,8 @@ def update_by_downdate(
     """
     n, points = state_deviations.shape
     rows = innovation.shape[0]
-    place, used = np.empty(rows, np.int64), 0
+    place = np.empty(rows, np.int64)
+    used = 0
     for k in range(rows):
         if not math.isnan(innovation[k]):
             place[used] = k
@@ -75,9 +77,12 @@ def update_by_downdate(
             work[a, p] = measured_deviations[place[a], p] if p < points else 0.0
         work[a, points + a] = noise_std[place[a]]
     triangularize(work, used, size)
-    kept, start, white = sqrt_cov.copy(), mean.copy(), np.empty(n)
+    kept = sqrt_cov.copy()
+    start = mean.copy()
+    white = np.empty(n)
     gain = np.zeros((used, n))
-    log_likelihood, square = -0.5 * used * LOG_TWO_PI, 0.0
+    log_likelihood = -0.5 * used * LOG_TWO_PI
+    square = 0.0
     whitened = np.empty(used)
     for a in range(used):
         whitened[a] = innovation[place[a]]

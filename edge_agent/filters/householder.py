@@ -127,7 +127,9 @@ def update(
         for j in range(used):
             work[used + i, points + j] = 0.0
     triangularize(work, used + n, points + used)
-    log_likelihood, square, row = -0.5 * used * LOG_TWO_PI, 0.0, 0
+    log_likelihood = -0.5 * used * LOG_TWO_PI
+    square = 0.0
+    row = 0
     for k in range(innovation.shape[0]):
         if math.isnan(innovation[k]):
             continue

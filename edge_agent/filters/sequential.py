@@ -60,10 +60,12 @@ def carlson(
         gain[k] = 0.0
     after = variance
     for j in range(i, -1, -1):
-        part, before = sqrt_cov[i, j], after
+        part = sqrt_cov[i, j]
+        before = after
         after = before + part * part
         per = 1.0 / math.sqrt(before * after)
-        keep, lose = before * per, part * per
+        keep = before * per
+        lose = part * per
         for k in range(j, n):
             old = sqrt_cov[k, j]
             sqrt_cov[k, j] = keep * old - lose * gain[k]

@@ -140,9 +140,11 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
         )  # as dated ones read: one drive is one log in all formats
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
     provenance: Mapping[str, object] = {
-        "profile": json.loads(profile.text()), "sources": list(sources),
-        "channels": merged.origins, "notes": merged.notes,
-    }  # fmt: skip
+        "profile": json.loads(profile.text()),
+        "sources": list(sources),
+        "channels": merged.origins,
+        "notes": merged.notes,
+    }
     table = pa.table(columns).replace_schema_metadata({PROVENANCE: json.dumps(provenance).encode()})
     try:
         pq.write_table(table, path, compression="zstd")

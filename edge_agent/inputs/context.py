@@ -75,7 +75,7 @@ def context_signals(profile: Profile) -> set[str]:
 
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """A block's context (T, N, len(CONTEXT)) from what a source knows; the rest is unknown.
 
     The way in for a source that has no profile, a simulation for one:

@@ -13,7 +13,9 @@ from schemas.signals import CHANNELS, WHEELS, S
 from schemas.vehicle import Calibration, Vehicle
 
 # first channel of a device, and the first behind it
-INERTIAL, STEERING, TURNING = (S.AX, S.YAW_RATE + 1), (S.DELTA, S.DELTA + 4), (S.OMEGA, S.OMEGA + 4)
+INERTIAL = (S.AX, S.YAW_RATE + 1)
+STEERING = (S.DELTA, S.DELTA + 4)
+TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
@@ -27,7 +29,8 @@ class Corrector:
         self._vehicle = vehicle
         self._known = vehicle.calibration
         self._waits = _waits(self._known)
-        self._t, self._rows = np.empty(0), np.empty((0, len(CHANNELS)))
+        self._t = np.empty(0)
+        self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
         """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is known."""
@@ -42,7 +45,8 @@ class Corrector:
 
     def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
         """Return signals of one moment each: devices that speak early wait for the latest."""
-        times, rows = np.concatenate([self._t, t]), np.concatenate([self._rows, signals])
+        times = np.concatenate([self._t, t])
+        rows = np.concatenate([self._rows, signals])
         together = signals.copy()
         for channels, wait in self._waits.items():
             at = t - wait
@@ -58,7 +62,8 @@ class Corrector:
             if len(times)
             else 0
         )
-        self._t, self._rows = times[kept:], rows[kept:]
+        self._t = times[kept:]
+        self._rows = rows[kept:]
         return together
 
 

@@ -26,15 +26,19 @@ from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
 GNSS: Final = {  # channels that a receiver's recording fills by itself
-    "latitude": Channel(signal="latitude"), "longitude": Channel(signal="longitude"),
-    "yaw": Channel(signal="course", unit="deg", course=True), GROUND: Channel(signal="speed"),
-}  # fmt: skip
+    "latitude": Channel(signal="latitude"),
+    "longitude": Channel(signal="longitude"),
+    "yaw": Channel(signal="course", unit="deg", course=True),
+    GROUND: Channel(signal="speed"),
+}
 RECEIVED: Final = {"latitude", "longitude", "speed", "course"}  # signals of a receiver's recording
 SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
 COURSE_SPEED: Final = 3.0  # [m/s] below it a receiver's course is noise
 RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
 FEWEST: Final = 20  # readings from which on a period means something
-GAP_PERIODS, GAP_S = 3.0, 0.1  # readings further apart than the larger of the two are not joined
+# readings further apart than the larger of the two are not joined
+GAP_PERIODS = 3.0
+GAP_S = 0.1
 ZONE_S: Final = 900.0
 LARGEST_ZONE: Final = 56  # quarters of an hour
 SMOOTH: Final = 50  # readings to either side over which bursts of arrival are straightened
@@ -73,7 +77,8 @@ def merge(
     Raises:
         InputError: no signal of the profile is there, dates do not meet, or a radius or ratio is missing.
     """
-    radius, ratio = wheel_radius or profile.wheel_radius, steering_ratio or profile.steering_ratio
+    radius = wheel_radius or profile.wheel_radius
+    ratio = steering_ratio or profile.steering_ratio
     notes = [note for recording in recordings for note in recording.notes]
     found = found_in(recordings, profile)
     if not found:
@@ -115,7 +120,8 @@ def merge(
     shift = merged.t[0]
     merged.t = merged.t - shift
     merged.start_ns = None if start_ns is None else start_ns + round(shift * NS)
-    merged.notes, merged.origins = notes, origins
+    merged.notes = notes
+    merged.origins = origins
     return merged
 
 
@@ -149,7 +155,8 @@ def _clocks(
     dated = next(
         (r.start_ns for r in recordings if {"latitude", "course"} <= r.signals.keys()), None
     )
-    offsets, start_ns = [], base
+    offsets = []
+    start_ns = base
     for place, recording in enumerate(recordings):
         shift = shifts.get(recording.name, 0.0)
         if place == reference or base is None or recording.start_ns is None:
@@ -171,9 +178,10 @@ def _clocks(
         ]
         if not meets:
             raise InputError(
-                recording.name, f"its clock is {lead:.0f} s from that of {recordings[reference].name}",
+                recording.name,
+                f"its clock is {lead:.0f} s from that of {recordings[reference].name}",
                 f"give --clock {recording.name}=SECONDS, what to add to it",
-            )  # fmt: skip
+            )
         if meets[0]:
             hours = meets[0] * ZONE_S / 3600.0
             notes.append(
@@ -289,7 +297,8 @@ def steady(t: FloatArray) -> tuple[FloatArray, float]:
 def _still_courses(series: dict[str, Series]) -> None:
     """A receiver's course at walking speed is none."""
     if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
-        yaw, speed = series["yaw"], series[GROUND].values
+        yaw = series["yaw"]
+        speed = series[GROUND].values
         series["yaw"] = Series(yaw.t, np.where(speed > COURSE_SPEED, yaw.values, np.nan))
 
 
@@ -314,7 +323,8 @@ def _rows(
         raise InputError(
             "source", "no channel has two readings", "record longer, or choose another profile"
         )
-    first, last = max(one.t[0] for one in dense.values()), min(one.t[-1] for one in dense.values())
+    first = max(one.t[0] for one in dense.values())
+    last = min(one.t[-1] for one in dense.values())
     rate = profile.rate_hz or _rate(dense)
     if not last - first > 1.0 / rate:
         raise InputError(
@@ -335,7 +345,8 @@ def _rate(dense: Mapping[str, Series]) -> float:
 def sampled(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
     """The series at the rows' times; NaN where no reading is near enough."""
     good = np.isfinite(series.values)
-    known, values = series.t[good], series.values[good]
+    known = series.t[good]
+    values = series.values[good]
     out = np.full(len(t), np.nan)
     if not len(known):
         return out
@@ -345,7 +356,8 @@ def sampled(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
         out[row[inside]] = values[inside]
         return out
     place = np.searchsorted(known, t)
-    before, after = known[np.clip(place - 1, 0, None)], known[np.clip(place, None, len(known) - 1)]
+    before = known[np.clip(place - 1, 0, None)]
+    after = known[np.clip(place, None, len(known) - 1)]
     period = float(np.median(np.diff(series.t))) if len(series.t) > 1 else 0.0
     near = (after - before <= max(GAP_PERIODS * period, GAP_S)) & (known[0] <= t) & (t <= known[-1])
     out[near] = np.interp(t[near], known, values)

@@ -16,9 +16,11 @@ from schemas.signals import WHEELS
 
 _WORDS: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 PLACES: Final = {
-    "fl": ("fl", "lf", "vl", "frontleft", "leftfront", "front left"), "fr": ("fr", "rf", "vr", "front right"),
-    "rl": ("rl", "lr", "hl", "bl", "rear left"), "rr": ("rr", "hr", "br", "rear right"),
-}  # fmt: skip
+    "fl": ("fl", "lf", "vl", "frontleft", "leftfront", "front left"),
+    "fr": ("fr", "rf", "vr", "front right"),
+    "rl": ("rl", "lr", "hl", "bl", "rear left"),
+    "rr": ("rr", "hr", "br", "rear right"),
+}
 # channel -> what its name must contain (any of), and must not (any of); the first that fits is taken
 # a name fits when the first is found in it and the second is not; the first channel that fits is taken
 Rule: TypeAlias = tuple[str, str]

@@ -134,7 +134,8 @@ def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
             "t", "the log has neither t nor timestamp", "add the time of each sample, t in seconds"
         )
     if name == "t":
-        t, start_ns = _numbers(table, name), None
+        t = _numbers(table, name)
+        start_ns = None
     else:
         t, start_ns = _timestamps(table[name])
     bad = np.flatnonzero(~np.isfinite(t))

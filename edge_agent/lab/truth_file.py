@@ -54,8 +54,10 @@ class TruthRecorder:
         used: FloatArray,
     ) -> None:
         """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share per wheel (T, N, 4)."""
-        cells, sectors = grid.cell_of(*position), grid.sector_of(yaw)
-        mean, largest = mu.mean(axis=-1), used.max(axis=-1)
+        cells = grid.cell_of(*position)
+        sectors = grid.sector_of(yaw)
+        mean = mu.mean(axis=-1)
+        largest = used.max(axis=-1)
         changes = (np.diff(cells, axis=0) != 0) | (np.diff(sectors, axis=0) != 0)
         for n in range(len(self.names)):
             edges = [0, *(np.flatnonzero(changes[:, n]) + 1).tolist(), len(time)]

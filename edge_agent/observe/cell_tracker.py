@@ -107,10 +107,15 @@ def locate(
         after["fix_time"] = np.nan
     shape = t.shape
     located = Located(
-        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_),
-        np.full(shape, NOWHERE), np.full(shape, NOWHERE),
-        np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
-    )  # fmt: skip
+        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
+        np.full(shape, NOWHERE),
+        np.full(shape, NOWHERE),
+        np.full(shape, np.nan),
+        np.full(shape, np.nan),
+        np.full(shape, np.nan),
+    )
     _follow(t, _fixes(signals), after, located)
     return after, located
 
@@ -118,7 +123,8 @@ def locate(
 def _fixes(signals: FloatArray) -> RecordArray:
     """The receiver's part of signals (T, N, channels), as records (T, N)."""
     fixes = records(ReceiverSample, *signals.shape[:-1])
-    latitude, longitude = signals[..., S.LATITUDE], signals[..., S.LONGITUDE]
+    latitude = signals[..., S.LATITUDE]
+    longitude = signals[..., S.LONGITUDE]
     fixes["latitude"], fixes["longitude"], fixes["yaw"] = latitude, longitude, signals[..., S.YAW]
     there = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
     fixes["cell"] = NOWHERE
@@ -137,7 +143,8 @@ def _course(track: CellTrack, latitude: float, longitude: float) -> None:
     if distance >= COURSE_BASE_M:
         track.course = np.arctan2(north, east)
     if not distance < COURSE_BASE_M:
-        track.course_latitude, track.course_longitude = latitude, longitude
+        track.course_latitude = latitude
+        track.course_longitude = longitude
 
 
 @compiled
@@ -157,9 +164,12 @@ def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 def _receive(track: CellTrack, fix: ReceiverSample, now: float) -> None:
     """Remember what a sample brings."""
     if np.isfinite(fix.yaw):
-        track.yaw_time, track.yaw = now, fix.yaw
+        track.yaw_time = now
+        track.yaw = fix.yaw
     if fix.cell != NOWHERE:
-        track.fix_time, track.latitude, track.longitude = now, fix.latitude, fix.longitude
+        track.fix_time = now
+        track.latitude = fix.latitude
+        track.longitude = fix.longitude
         _course(track, fix.latitude, fix.longitude)
 
 
@@ -168,7 +178,10 @@ def _begin(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
     """Begin a visit of the fix's cell."""
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
-    track.west, track.south, track.east, track.north = fix.west, fix.south, fix.east, fix.north
+    track.west = fix.west
+    track.south = fix.south
+    track.east = fix.east
+    track.north = fix.north
 
 
 @compiled
@@ -178,7 +191,9 @@ def _follow(
     """Sequential core of `locate`; moves the tracks on and fills `located`."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
-            track, fix, now = tracks[n], fixes[k, n], t[k, n]
+            track = tracks[n]
+            fix = fixes[k, n]
+            now = t[k, n]
             _receive(track, fix, now)
             heading = track.yaw if now - track.yaw_time <= FIX_HELD_S else track.course
             held = now - track.fix_time <= FIX_HELD_S
@@ -186,7 +201,8 @@ def _follow(
                 located.latitude[k, n], located.longitude[k, n] = track.latitude, track.longitude
                 located.yaw[k, n] = heading
             if not held and track.cell != NOWHERE:
-                track.cell, track.sector = NOWHERE, NOWHERE
+                track.cell = NOWHERE
+                track.sector = NOWHERE
                 located.closes[k, n] = True
             elif (
                 fix.cell != NOWHERE

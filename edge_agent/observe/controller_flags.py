@@ -30,10 +30,15 @@ MEMORY_S: Final = 600.0  # over which the share is taken, with exponential forge
 MOST_STEP_S: Final = 0.5  # longer gaps count as this much
 STANDING_RATE: Final = 1.0  # [rad/s] of the fastest wheel: .3 m/s
 
-NEVER_OFF, STANDING, TOO_OFTEN = 1, 2, 4  # why a flag is doubted; these add up
+# why a flag is doubted; these add up
+NEVER_OFF = 1
+STANDING = 2
+TOO_OFTEN = 4
 REASONS: Final = {
-    NEVER_OFF: "has been on since the start", STANDING: "is on while the vehicle stands", TOO_OFTEN: "is on too often",
-}  # fmt: skip
+    NEVER_OFF: "has been on since the start",
+    STANDING: "is on while the vehicle stands",
+    TOO_OFTEN: "is on too often",
+}
 
 
 class FlagRecord:
@@ -69,7 +74,8 @@ def trusted_context(
     Returns:
         the records to carry on, and the context with NaN in the place of flags that are doubted.
     """
-    after, checked = before.copy(), context.copy()
+    after = before.copy()
+    checked = context.copy()
     wheels = np.abs(signals[..., S.OMEGA : S.OMEGA + 4])
     with np.errstate(invalid="ignore"):
         standing = np.where(

@@ -121,9 +121,14 @@ class OpenVisits:
 
 
 def observe(
-    before: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig,
-    signals: FloatArray | None = None, context: FloatArray | None = None,
-) -> tuple[OpenVisits, RecordBlock, RecordBlock]:  # fmt: skip
+    before: OpenVisits,
+    time: IntArray,
+    located: Located,
+    estimates: Estimates,
+    config: AgentConfig,
+    signals: FloatArray | None = None,
+    context: FloatArray | None = None,
+) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
     """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states.
 
     Without `signals` (T, N, channels) observations do not tell how the grip was used, and without `context`
@@ -178,9 +183,14 @@ def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
 
 @compiled
 def _visit(
-    time: IntArray, located: Located, samples: Records[Sample], notes: SampleNotes, visits: Records[Visit],
-    ended: Records[Visit], position_std: float,
-) -> int:  # fmt: skip
+    time: IntArray,
+    located: Located,
+    samples: Records[Sample],
+    notes: SampleNotes,
+    visits: Records[Visit],
+    ended: Records[Visit],
+    position_std: float,
+) -> int:
     """Sequential core: add each sample to its visit, write out a visit when the next begins; returns how many."""
     count = 0
     for k in range(time.shape[0]):
@@ -188,7 +198,8 @@ def _visit(
             visit = visits[n]
             if located.closes[k, n]:
                 if visit.cell != NOWHERE:
-                    visit.sample, visit.vehicle = k, n
+                    visit.sample = k
+                    visit.vehicle = n
                     ended[count] = visit
                     count += 1
                 _begin(visit, time[k, n], located.cell[k, n], located.sector[k, n])
@@ -201,10 +212,8 @@ def _visit(
                 if k < len(notes.context):
                     _add_context(visit, notes.context[k, n])
                 if located.inside[k, n]:
-                    visit.latitude, visit.longitude = (
-                        located.latitude[k, n],
-                        located.longitude[k, n],
-                    )
+                    visit.latitude = located.latitude[k, n]
+                    visit.longitude = located.longitude[k, n]
                     visit.yaw = located.yaw[k, n]
                 if notes.row[k, n] >= 0:
                     _begin_part(visit, time[k, n], notes.told[notes.row[k, n]])
@@ -214,17 +223,25 @@ def _visit(
 @compiled
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     """A record becomes a visit without a sample."""
-    visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = (
-        time,
-        cell,
-        sector,
-        0,
-        0,
-    )
-    visit.driving, visit.braking, visit.left, visit.right, visit.felt = 0.0, 0.0, 0.0, 0.0, np.inf
-    visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
-    visit.travelled, visit.from_fix = 0.0, 0.0
-    visit.part_time, visit.parts, visit.earlier_used = time, 0, np.inf
+    visit.enter_time = time
+    visit.cell = cell
+    visit.sector = sector
+    visit.samples = 0
+    visit.health = 0
+    visit.driving = 0.0
+    visit.braking = 0.0
+    visit.left = 0.0
+    visit.right = 0.0
+    visit.felt = np.inf
+    visit.speed_sum = 0.0
+    visit.latitude = 0.0
+    visit.longitude = 0.0
+    visit.yaw = 0.0
+    visit.travelled = 0.0
+    visit.from_fix = 0.0
+    visit.part_time = time
+    visit.parts = 0
+    visit.earlier_used = np.inf
     for i in range(len(visit.known)):
         visit.known[i] = 0.0
         visit.told[i] = 0.0
@@ -242,7 +259,9 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
     for i in range(mugrid.BINS):
         visit.earlier[i] = told[i] if visit.parts == 0 else max(visit.earlier[i], told[i])
     visit.parts += 1
-    visit.part_time, visit.mu_utilised, visit.felt = time, 0.0, np.inf
+    visit.part_time = time
+    visit.mu_utilised = 0.0
+    visit.felt = np.inf
 
 
 @compiled
@@ -260,7 +279,9 @@ def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
         visit.right += max(-sample.ay, 0.0) ** 2
     grown = visit.leave_time - visit.part_time > WINDOW_NS
     visit.mu_utilised = max(visit.mu_utilised, sample.mu_utilised) if grown else sample.mu_utilised
-    visit.mu, visit.mu_lower, visit.mu_upper = sample.mu, sample.mu_lower, sample.mu_upper
+    visit.mu = sample.mu
+    visit.mu_lower = sample.mu_lower
+    visit.mu_upper = sample.mu_upper
 
 
 @compiled
@@ -299,7 +320,8 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
 
     The sign is that of the direction with more of it: a visit that braked and then drove is one of braking or driving.
     """
-    along, across = ended["driving"] + ended["braking"], ended["left"] + ended["right"]
+    along = ended["driving"] + ended["braking"]
+    across = ended["left"] + ended["right"]
     whole = np.where(along + across > 0.0, along + across, np.nan)
     used = _used(ended)
     return {
@@ -322,7 +344,8 @@ def _observations(
     ended: RecordArray, evidence: FloatArray | None, config: AgentConfig
 ) -> RecordBlock:
     n = len(ended)
-    mu, upper = ended["mu"], ended["mu_upper"]
+    mu = ended["mu"]
+    upper = ended["mu_upper"]
     used = _used(ended)
     carried = (
         "enter_time",
@@ -357,7 +380,8 @@ def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 
     A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of them, else unknown.
     """
-    known, told = ended["known"], ended["told"]
+    known = ended["known"]
+    told = ended["told"]
     enough = known[:, : len(FLAGS)] >= KNOWN_SHARE * np.maximum(ended["samples"], 1)[:, None]
     flags = np.where(told[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, FLAG_UNKNOWN))
     mean = np.where(known > 0.0, told / np.maximum(known, 1.0), np.nan)

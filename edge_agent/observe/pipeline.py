@@ -49,8 +49,10 @@ class Pipeline:
     """A bank of N vehicles with its open visits. Use `step` for each block in order, then `finish` once."""
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
-        self._bank, self._config = bank, config
-        self._tracks, self._open = new_tracks(vehicles), OpenVisits.start(vehicles)
+        self._bank = bank
+        self._config = config
+        self._tracks = new_tracks(vehicles)
+        self._open = OpenVisits.start(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
         self._flags = new_flag_records(vehicles)
@@ -83,7 +85,8 @@ class Pipeline:
             estimates.mu_utilised[-1],
             block.time[-1],
         )
-        cell, sector = located.cell[-1], located.sector[-1]
+        cell = located.cell[-1]
+        sector = located.sector[-1]
         self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)
         self._ends.drive(block.time, estimates.vx)
         return estimates, self._ends.cut(observations), self._ends.cut(states)
@@ -104,7 +107,8 @@ class Pipeline:
         """
         if self._last is None:
             return None
-        t, time = self._last.t[-1:] + FINAL_STEP_S, self._last.time[-1:] + round(FINAL_STEP_S * NS)
+        t = self._last.t[-1:] + FINAL_STEP_S
+        time = self._last.time[-1:] + round(FINAL_STEP_S * NS)
         empty = np.full((1, *self._last.signals.shape[1:]), np.nan)
         tracks, located = locate(self._tracks, t, empty, lost=True)
         estimates = self._bank.advance(t, empty, located.closes)

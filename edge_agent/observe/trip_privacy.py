@@ -26,7 +26,8 @@ class TripEnds:
     """
 
     def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
-        self._metres, self._ns = metres, round(seconds * NS)
+        self._metres = metres
+        self._ns = round(seconds * NS)
         self._driven: FloatArray = np.zeros(vehicles)  # [m] until the last sample
         self._times: list[IntArray] = []
         self._odometers: list[FloatArray] = []
@@ -77,7 +78,8 @@ class TripEnds:
 
     def _odometer(self, time: IntArray, vehicle: IntArray) -> FloatArray:
         """How far each vehicle had driven at a time, (n,), between the ends of blocks."""
-        times, odometers = np.vstack(self._times), np.vstack(self._odometers)
+        times = np.vstack(self._times)
+        odometers = np.vstack(self._odometers)
         out = np.empty(len(time))
         for n in np.unique(vehicle).tolist():
             rows = vehicle == n

@@ -54,8 +54,11 @@ class Batcher:
     def __init__(
         self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int
     ) -> None:
-        self._names, self._boot, self._estimator = tuple(names), boot, estimator
-        self._flush_s, self._rows = flush_s, rows
+        self._names = tuple(names)
+        self._boot = boot
+        self._estimator = estimator
+        self._flush_s = flush_s
+        self._rows = rows
         self._groups: dict[_Place, _Group] = {}
 
     @property

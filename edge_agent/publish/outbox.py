@@ -161,8 +161,13 @@ class Outbox:
         }
         for sequence in own.values():
             sequence.held.clear()
-        self._entries, self._oldest, self._streams = {}, {kind: deque() for kind in Kind}, own
-        self._pacers, self._later, self._deletable, self._bytes = {}, [], [], 0
+        self._entries = {}
+        self._oldest = {kind: deque() for kind in Kind}
+        self._streams = own
+        self._pacers = {}
+        self._later = []
+        self._deletable = []
+        self._bytes = 0
         self._restore()
         self.counts.damaged += max(
             before - sum(entry.records for entry in self._entries.values()), 0
@@ -289,7 +294,8 @@ class Outbox:
         for _, key in self._later:
             entry = self._entries.get(key)
             if entry is not None and entry.stream.vehicle == vehicle and entry.due is not None:
-                entry.due, entry.attempts = None, 0
+                entry.due = None
+                entry.attempts = 0
                 self._pacer(entry).wait(key)
 
     def _evict(self) -> None:

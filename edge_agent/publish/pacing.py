@@ -46,18 +46,23 @@ class Pacer:
         "_window",
         "flying",
         "silent",
-    )  # fmt: skip
+    )
 
     def __init__(self) -> None:
-        self.flying, self.silent = 0, False
+        self.flying = 0
+        self.silent = False
         self._waiting: list[int] = []  # heap of keys, and of such as are gone
-        self._window, self._sure = FIRST_WINDOW, LARGEST_WINDOW  # up to `sure` it grows fast
+        # up to `sure` it grows fast
+        self._window = FIRST_WINDOW
+        self._sure = LARGEST_WINDOW
         self._unanswered_since: float | None = None  # since when an answer is
         self._halved = -float("inf")
         self._answered = False
         # of those that fly, put before the silence: that they are lost says nothing
         self._stale = 0
-        self._probe_at, self._probe_s, self._turn = 0.0, FIRST_PROBE_S, 0
+        self._probe_at = 0.0
+        self._probe_s = FIRST_PROBE_S
+        self._turn = 0
 
     @property
     def idle(self) -> bool:
@@ -89,7 +94,9 @@ class Pacer:
         """Record that any acknowledgement arrived."""
         self._answered = True
         if self.silent:
-            self.silent, self._window, self._sure = False, FIRST_WINDOW, LARGEST_WINDOW
+            self.silent = False
+            self._window = FIRST_WINDOW
+            self._sure = LARGEST_WINDOW
             self._stale = self.flying
 
     def record_timeout(self, now: float, jitter: float) -> None:
@@ -102,7 +109,8 @@ class Pacer:
             and self._unanswered_since is not None
             and now - self._unanswered_since >= SILENT_S
         ):
-            self.silent, self._probe_s = True, FIRST_PROBE_S
+            self.silent = True
+            self._probe_s = FIRST_PROBE_S
             self._probe_at = now + jitter * self._probe_s
         elif self._stale > 0:
             self._stale -= 1
@@ -112,13 +120,16 @@ class Pacer:
 
     def record_reconnect(self, now: float) -> None:
         """Record that a router is available again: batches in flight are lost, and a silent route is probed at once."""
-        self.flying, self._unanswered_since = 0, None
-        self._probe_at, self._probe_s = now, FIRST_PROBE_S
+        self.flying = 0
+        self._unanswered_since = None
+        self._probe_at = now
+        self._probe_s = FIRST_PROBE_S
 
     def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
         """Return the keys of at most `most` batches to send now, oldest first; keys that are not `held` are dropped."""
         if self._answered:
-            self._answered, self._unanswered_since = False, now if self.flying else None
+            self._answered = False
+            self._unanswered_since = now if self.flying else None
         if self.silent:
             return self._probe(now, jitter, held)
         out: list[int] = []

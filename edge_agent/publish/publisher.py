@@ -76,8 +76,11 @@ class Publisher:
     ) -> None:
         self._on_open = on_open
         self._names = dict.fromkeys(names)
-        self._outbox, self._config, self._clock = outbox, config, clock
-        self._wall, self.clock_behind_s = wall, 0.0
+        self._outbox = outbox
+        self._config = config
+        self._clock = clock
+        self._wall = wall
+        self.clock_behind_s = 0.0
         self._batcher = Batcher(
             names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows
         )
@@ -87,7 +90,8 @@ class Publisher:
         self._connected: dict[str, bool] = {}
         self._epochs: dict[str, int] = {}
         self._waiting: list[Draft] = []
-        self._closing, self._stopped = threading.Event(), threading.Event()
+        self._closing = threading.Event()
+        self._stopped = threading.Event()
         self._deadline = float("inf")
         self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
         self._connector = threading.Thread(target=self._connect, name="connector", daemon=True)
@@ -149,7 +153,8 @@ class Publisher:
 
     def unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of unsettled records: in the outbox, also of an earlier start, or on their way to it."""
-        counts, kinds = self.counts, Kind if kind is None else (kind,)
+        counts = self.counts
+        kinds = Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
         return coming + self._outbox.records(self._names, kind)
 
@@ -285,7 +290,8 @@ class Publisher:
 
     def _drop_unwritable(self) -> None:
         """Drop only the drafts that protobuf refuses."""
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         for draft in waiting:
             try:
                 draft.encode(1, 1)

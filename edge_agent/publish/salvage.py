@@ -60,13 +60,15 @@ def _cell(page: bytes, at: int, pages: dict[int, bytes]) -> tuple[int, list[Valu
     following = int.from_bytes(page[at + local : at + local + 4], "big") if local < size else 0
     while len(record) < size:
         more = pages[following]
-        following, record = int.from_bytes(more[:4], "big"), record + more[4:]
+        following = int.from_bytes(more[:4], "big")
+        record = record + more[4:]
     return key, _record(record[:size])
 
 
 def _record(record: bytes) -> list[Value]:
     end, at = _varint(record, 0)
-    types, values = [], []
+    types = []
+    values = []
     while at < end:
         kind, at = _varint(record, at)
         types.append(kind)

@@ -157,7 +157,9 @@ def _readable(path: Path) -> list[Row]:
             isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)
         ):
             continue
-        name, payload, given = tuple(values[1:7]), values[7], values[8]
+        name = tuple(values[1:7])
+        payload = values[7]
+        given = values[8]
         assert isinstance(payload, bytes)
         if given is None or given == checksum(name, payload):
             found.setdefault(key, (key, *values[1:]))

@@ -36,8 +36,11 @@ def road_friction(
         mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
         mu_utilised: largest grip used in the last second, any wheel.
     """
-    signals = {"MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan, "LowerBound": mu_lower,
-            "UpperBound": mu_upper}  # fmt: skip
+    signals = {
+        "MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan,
+        "LowerBound": mu_lower,
+        "UpperBound": mu_upper,
+    }
     return {
         f"{BRANCH}.{name}": round(min(FULL * value, FULL), DIGITS)
         for name, value in signals.items()
@@ -55,7 +58,9 @@ class RoadFrictionOutput:
     """
 
     def __init__(self, names: Sequence[str], say: Callable[[str], None], rate_hz: float) -> None:
-        self._names, self._say, self._step_ns = names, say, round(NS / rate_hz)
+        self._names = names
+        self._say = say
+        self._step_ns = round(NS / rate_hz)
         self.publishers: dict[str, Any] = {}
         self._due = 0
 

@@ -42,7 +42,8 @@ class Link:
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self.session = session
-        self._clock, self._pause = clock, pause
+        self._clock = clock
+        self._pause = pause
         self._free_at = dict.fromkeys(Kind, 0.0)  # when the next message of a kind may be sent
 
         def heard(sample: zenoh.Sample) -> None:

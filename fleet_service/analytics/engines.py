@@ -67,7 +67,8 @@ class QueryEngine:
     def files(self, table: str) -> list[Path]:
         """Return the files of a table that may hold rows of the part; a snapshot counts until the day after its own."""
         before = 1 if table == "map" else 0
-        first, last = self.part.since // layout.DAY_NS - before, self.part.until // layout.DAY_NS
+        first = self.part.since // layout.DAY_NS - before
+        last = self.part.until // layout.DAY_NS
         pattern = "*.parquet" if table == "map" else "*/*.parquet"
         return [
             path

@@ -38,8 +38,12 @@ def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
     middle = (engine.part.since + engine.part.until) // 2
     answers = {}
     for name, ending in (
-        ("grip", "html"), ("worst", "html"), ("spells", "png"), ("before-after", "png"), ("vehicles", "png")
-    ):  # fmt: skip
+        ("grip", "html"),
+        ("worst", "html"),
+        ("spells", "png"),
+        ("before-after", "png"),
+        ("vehicles", "png"),
+    ):
         question = QUESTIONS[name]
         answers[name] = question.ask(engine, Options(at=middle))
         output.write(answers[name], question, folder / f"{name}.{ending}")

@@ -23,9 +23,15 @@ def _part(since: str | None, until: str | None, bbox: Box | None) -> Extract:
 
 
 def ask_archive(
-    archive: Path | str, question: str, *, since: str | None = None, until: str | None = None, bbox: Box | None = None,
-    options: Options | None = None, engine: str = "duckdb",
-) -> pa.Table:  # fmt: skip
+    archive: Path | str,
+    question: str,
+    *,
+    since: str | None = None,
+    until: str | None = None,
+    bbox: Box | None = None,
+    options: Options | None = None,
+    engine: str = "duckdb",
+) -> pa.Table:
     """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO 8601, UTC.
 
     Raises:

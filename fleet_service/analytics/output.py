@@ -61,8 +61,10 @@ def text(table: pa.Table, question: Question) -> str:
 
 def lines(table: pa.Table, question: Question) -> str:
     """Return all rows in the question's order as JSON lines; times are ISO 8601, UTC."""
-    return "\n".join(json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
-                     for row in add_places(order_rows(table, question)).to_pylist())  # fmt: skip
+    return "\n".join(
+        json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
+        for row in add_places(order_rows(table, question)).to_pylist()
+    )
 
 
 def _json(name: str, value: object) -> object:
@@ -185,7 +187,8 @@ def page(table: pa.Table, question: Question) -> str:
         raise InputError(
             "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
         )
-    rest, table = max(table.num_rows - MAP_CELLS, 0), table.slice(0, MAP_CELLS)
+    rest = max(table.num_rows - MAP_CELLS, 0)
+    table = table.slice(0, MAP_CELLS)
     part = None
     cells = table["cell"].to_numpy()
     if PARTS in table.schema.names:

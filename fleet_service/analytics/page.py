@@ -38,9 +38,10 @@ class Scale:
 
 
 GRIP_SCALE: Final = Scale(
-    "peak adhesion mu [1], the darker the more slippery", *GRIP_RANGE,
+    "peak adhesion mu [1], the darker the more slippery",
+    *GRIP_RANGE,
     [(mu, f"{mu:g} {name}") for name, mu in SURFACES.items()],
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -78,16 +79,27 @@ def render(
 ) -> str:
     """Return the page. `table` holds the lines of a table below the map, the first its heads."""
     data: dict[str, Any] = {
-        "title": title, "about": about, "table": table,
+        "title": title,
+        "about": about,
+        "table": table,
         "scale": {
-            "label": scale.label, "low": scale.low, "high": scale.high, "ticks": list(scale.ticks),
-            "stops": GRIP[::-1] if scale.dark_is_high else GRIP, "unknown": scale.unknown,
+            "label": scale.label,
+            "low": scale.low,
+            "high": scale.high,
+            "ticks": list(scale.ticks),
+            "stops": GRIP[::-1] if scale.dark_is_high else GRIP,
+            "unknown": scale.unknown,
         },
-        "boxes": cells.boxes, "part": cells.part, "sector": cells.sector,
+        "boxes": cells.boxes,
+        "part": cells.part,
+        "sector": cells.sector,
         "panels": [{"name": name, "values": values} for name, values in cells.panels.items()],
-        "names": cells.names, "rows": cells.rows, "frames": cells.frames,
-        "frame": cells.frame if cells.frame is not None else [0] * len(cells.sector), "lasting": cells.lasting,
-    }  # fmt: skip
+        "names": cells.names,
+        "rows": cells.rows,
+        "frames": cells.frames,
+        "frame": cells.frame if cells.frame is not None else [0] * len(cells.sector),
+        "lasting": cells.lasting,
+    }
     text = json.dumps(data, allow_nan=False).replace(
         "<", "\\u003c"
     )  # no value can end or open a tag

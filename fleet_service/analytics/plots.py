@@ -28,7 +28,9 @@ EDGE: Final = 1.2
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
 PUBLISHED: Final = 0.9  # how often a published interval is to hold
 ARROWS: Final = "→↑←↓"  # of the headings
-_DARK, _LIGHT, _MARK = GRIP[2], GRIP[8], "#d0006f"
+_DARK = GRIP[2]
+_LIGHT = GRIP[8]
+_MARK = "#d0006f"
 
 
 def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
@@ -61,9 +63,15 @@ def paint(
     known = np.isfinite(values)
     if not known.all():
         axes.add_collection(
-            PolyCollection(list(shapes[~known]), facecolors="white", edgecolors="0.55", hatch=HATCH, linewidths=0.2,
-                           label=UNKNOWN)
-        )  # fmt: skip
+            PolyCollection(
+                list(shapes[~known]),
+                facecolors="white",
+                edgecolors="0.55",
+                hatch=HATCH,
+                linewidths=0.2,
+                label=UNKNOWN,
+            )
+        )
     patches = PolyCollection(
         list(shapes[known]), array=values[known], cmap=GRIP_MAP, norm=Normalize(*limits)
     )
@@ -120,15 +128,17 @@ def _worst(figure: Figure, table: pa.Table) -> None:
         )  # whole: all head the same way
         axes.set_title(
             f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} {ARROWS[one['sector']]}\n"
-            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} values", fontsize=9,
-        )  # fmt: skip
+            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} values",
+            fontsize=9,
+        )
         axes.margins(0.1)
     figure.colorbar(patches, ax=panels, label=f"mean {MU} where slippery", shrink=0.8)
 
 
 def _panels(figure: Figure, count: int) -> list[Axes]:
     """Return `count` axes, three per row."""
-    columns, rows = min(count, 3) or 1, -(-count // 3) or 1
+    columns = min(count, 3) or 1
+    rows = -(-count // 3) or 1
     if count > 1:
         figure.set_size_inches(4.2 * columns, 3.8 * rows)
     panels: list[Axes] = (
@@ -168,7 +178,8 @@ def _spells(figure: Figure, table: pa.Table) -> None:
 
 def _before_after(figure: Figure, table: pa.Table) -> None:
     rows = {row["period"]: row for row in table.to_pylist()}
-    before, after = rows["before"], rows["after"]
+    before = rows["before"]
+    after = rows["after"]
     left, right = figure.subplots(1, 2, width_ratios=[2, 1])
     left.plot(
         [0, 1], [before["mu"], after["mu"]], "o-", color=_DARK, label="mean of the same cells"
@@ -202,8 +213,16 @@ def _vehicles(figure: Figure, table: pa.Table) -> None:
     axes = figure.subplots()
     at = np.arange(len(rows))
     spread = [Z_95 * (row["bias_std"] or 0.0) for row in rows]
-    axes.errorbar([row["bias"] for row in rows], at, xerr=spread, fmt="o", markersize=3, capsize=2, color=_DARK,
-                  label="bias against others, 95 %")  # fmt: skip
+    axes.errorbar(
+        [row["bias"] for row in rows],
+        at,
+        xerr=spread,
+        fmt="o",
+        markersize=3,
+        capsize=2,
+        color=_DARK,
+        label="bias against others, 95 %",
+    )
     axes.axvline(0.0, color=_MARK, linewidth=1)
     axes.set_yticks(at, [str(row["vehicle"])[:8] for row in rows], fontsize=6)
     axes.invert_yaxis()
@@ -226,8 +245,14 @@ def _calibration(figure: Figure, table: pa.Table) -> None:
         own = table.filter(pa.array(basis == name)).sort_by("age_h")
         if own.num_rows:
             for column, line in (("held", "-"), ("compatible", ":")):
-                axes.plot(_floats(own, "age_h"), _floats(own, column), line, marker=marker, color=colour,
-                          label=f"{name}: {column}")  # fmt: skip
+                axes.plot(
+                    _floats(own, "age_h"),
+                    _floats(own, column),
+                    line,
+                    marker=marker,
+                    color=colour,
+                    label=f"{name}: {column}",
+                )
     axes.axhline(PUBLISHED, color="0.4", linewidth=1, label=f"published: {PUBLISHED:.0%}")
     axes.set(
         xlabel="hours between map and value",
@@ -277,9 +302,15 @@ def _first_two(figure: Figure, table: pa.Table) -> None:
 
 
 _DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {
-    "grip": _grip, "worst": _worst, "spells": _spells, "before-after": _before_after, "vehicles": _vehicles,
-    "calibration": _calibration, "weather": _weather, "replay": _replay,
-}  # fmt: skip
+    "grip": _grip,
+    "worst": _worst,
+    "spells": _spells,
+    "before-after": _before_after,
+    "vehicles": _vehicles,
+    "calibration": _calibration,
+    "weather": _weather,
+    "replay": _replay,
+}
 
 
 def _floats(table: pa.Table, name: str) -> FloatArray:

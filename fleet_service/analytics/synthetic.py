@@ -21,9 +21,11 @@ from schemas.wire import Kind
 
 START_NS: Final = 1_769_472_000 * NS  # 2026-01-27 00:00 UTC
 DAY_S: Final = 86_400
-LATITUDE, LONGITUDE = 57.70, 11.97
+LATITUDE = 57.70
+LONGITUDE = 11.97
 CELL_S: Final = 0.7  # in a cell, at 15 m/s
-ICE, DRY = 0.22, 0.85
+ICE = 0.22
+DRY = 0.85
 _EXCITED: Final = 0.35  # share of visits that tell a value
 _STD: Final = 0.05
 
@@ -74,7 +76,8 @@ def _chunk(
     rows: int,
 ) -> Rows:
     trips = -(-rows // world.length)
-    road, who = rng.integers(0, world.roads, trips), rng.integers(0, world.vehicles, trips)
+    road = rng.integers(0, world.roads, trips)
+    who = rng.integers(0, world.vehicles, trips)
     begin = since_s + rng.random(trips) * (span_s - world.length * CELL_S)
     along = np.tile(np.arange(world.length), trips)[:rows]
     trip = np.repeat(np.arange(trips), world.length)[:rows]
@@ -104,27 +107,47 @@ def _chunk(
     )
     leave = START_NS + (seconds * NS).astype(np.int64)
     found: Rows = {
-        "enter_time": leave - int(CELL_S * NS) - rng.integers(0, 10**7, rows), "leave_time": leave, "cell": cell,
-        "sector": grid.sector_of(yaw), "latitude": latitude, "longitude": longitude,
-        "position_std": np.full(rows, 1.5, np.float32), "yaw": yaw.astype(np.float32),
-        "yaw_std": np.full(rows, 0.02, np.float32), "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),
-        "mu": mu.astype(np.float32), "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
-        "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32), "mu_utilised": used.astype(np.float32),
-        "log_likelihood": _likelihoods(rng, mu, used, excited), "with_likelihood": np.ones(rows, bool),
-        "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32), "tyre_season": zeros.astype(np.int8),
+        "enter_time": leave - int(CELL_S * NS) - rng.integers(0, 10**7, rows),
+        "leave_time": leave,
+        "cell": cell,
+        "sector": grid.sector_of(yaw),
+        "latitude": latitude,
+        "longitude": longitude,
+        "position_std": np.full(rows, 1.5, np.float32),
+        "yaw": yaw.astype(np.float32),
+        "yaw_std": np.full(rows, 0.02, np.float32),
+        "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),
+        "mu": mu.astype(np.float32),
+        "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
+        "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32),
+        "mu_utilised": used.astype(np.float32),
+        "log_likelihood": _likelihoods(rng, mu, used, excited),
+        "with_likelihood": np.ones(rows, bool),
+        "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32),
+        "tyre_season": zeros.astype(np.int8),
         "air_temperature": (5.0 - 8.0 * night(seconds) + rng.normal(0, 1, rows)).astype(np.float32),
-        "abs_active": np.full(rows, -1, np.int8), "used_longitudinal": np.full(rows, np.nan, np.float32),
-        "used_lateral": np.full(rows, np.nan, np.float32), "esc_active": np.full(rows, -1, np.int8),
-        "tcs_active": np.full(rows, -1, np.int8), "wiper": np.full(rows, np.nan, np.float32),
+        "abs_active": np.full(rows, -1, np.int8),
+        "used_longitudinal": np.full(rows, np.nan, np.float32),
+        "used_lateral": np.full(rows, np.nan, np.float32),
+        "esc_active": np.full(rows, -1, np.int8),
+        "tcs_active": np.full(rows, -1, np.int8),
+        "wiper": np.full(rows, np.nan, np.float32),
         "vehicle": names[who[trip]],
         "boot": (who[trip] + 1) * 7919 + since_s,
-        "region": grid.region_of(cell), "seq": trip * 64 + along // 10 + 1, "row": (along % 10).astype(np.int32),
-        "first_held": trip * 64 + np.maximum(along // 10 - 1, 0) + 1, "estimator": np.full(rows, "aco-fckf"),
+        "region": grid.region_of(cell),
+        "seq": trip * 64 + along // 10 + 1,
+        "row": (along % 10).astype(np.int32),
+        "first_held": trip * 64 + np.maximum(along // 10 - 1, 0) + 1,
+        "estimator": np.full(rows, "aco-fckf"),
         "received_at": (leave // 50_000_000 + 20) * 50_000_000 + leave // 50_000_000 % 997 * 1000,
-        "late": zeros.astype(bool), "weight": np.full(rows, 0.75, np.float32), "late_by": zeros,
-        "bias": 0.0 * zeros.astype(np.float32), "bias_std": np.full(rows, 0.05, np.float32),
-        "spread": np.ones(rows, np.float32), "slope": np.full(rows, 0.4, np.float32),
-    }  # fmt: skip
+        "late": zeros.astype(bool),
+        "weight": np.full(rows, 0.75, np.float32),
+        "late_by": zeros,
+        "bias": 0.0 * zeros.astype(np.float32),
+        "bias_std": np.full(rows, 0.05, np.float32),
+        "spread": np.ones(rows, np.float32),
+        "slope": np.full(rows, 0.4, np.float32),
+    }
     order = np.argsort(leave, kind="stable")
     return {name: column[order] for name, column in round_to_steps(found).items()}
 
@@ -135,7 +158,8 @@ def _places(
     """Return position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
-    row, column = road // 2 % 20, road // 40
+    row = road // 2 % 20
+    column = road // 40
     x = np.where(north, row * 260 + 130, along + column * 260) * step
     y = np.where(north, along + column * 260, row * 260 + 130) * step * np.cos(np.radians(LATITUDE))
     noise = 0.3 * step * rng.normal(size=(2, len(road)))

@@ -57,9 +57,11 @@ class SteadyClock:
         wall: Callable[[], int] = time.time_ns,
         steady: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._wall, self._steady = wall, steady
+        self._wall = wall
+        self._steady = steady
         self._zero = wall() - steady()
-        self._seen, self._began = seen, steady()
+        self._seen = seen
+        self._began = steady()
         self._confirmed = False
         self._sure = 0 <= wall() - seen <= OFF_NS
         # since when the wall clock is elsewhere, by the steady one
@@ -68,7 +70,8 @@ class SteadyClock:
 
     def now(self) -> int:
         """Return the time. It follows small forward steps of the wall clock, and larger ones when reports agree."""
-        even, wall = self._zero + self._steady(), self._wall()
+        even = self._zero + self._steady()
+        wall = self._wall()
         if abs(wall - even) <= JUMP_NS:
             self._doubted = None
             self._votes.clear()
@@ -80,7 +83,9 @@ class SteadyClock:
 
     def moment(self) -> TimeNow:
         """Return the time and its certainty."""
-        now, wall, seen = self.now(), self._wall(), self._seen + self._steady() - self._began
+        now = self.now()
+        wall = self._wall()
+        seen = self._seen + self._steady() - self._began
         slack = max(0, seen - now) if self._seen else 0
         if self._confirmed:
             return TimeNow(now, slack, max(0, wall - now - slack), min(now, wall))
@@ -88,7 +93,8 @@ class SteadyClock:
 
     def record_reports(self, times: Mapping[str, int]) -> None:
         """Record the times [ns] that vehicles just reported."""
-        now, wall = self.now(), self._wall()
+        now = self.now()
+        wall = self._wall()
         if self._doubted is None:
             self._confirmed = self._confirmed or any(
                 abs(reported - now) <= NEAR_NS for reported in times.values()
@@ -102,7 +108,8 @@ class SteadyClock:
         if self._steady() - self._doubted >= VOTE_NS and 2 * sum(self._votes.values()) > len(
             self._votes
         ):
-            self._zero, self._confirmed = wall - self._steady(), True
+            self._zero = wall - self._steady()
+            self._confirmed = True
 
     def lag(self) -> int:
         """Return how far the wall clock is behind [ns], or ahead if negative: the size of a jump that is not

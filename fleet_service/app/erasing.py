@@ -54,7 +54,8 @@ def handle_requests(
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
         erasure_requests.settle(question, outcome)
-        rows, answered = rows + outcome["rows"], answered + 1
+        rows = rows + outcome["rows"]
+        answered = answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
 
 
@@ -69,7 +70,7 @@ def _erase_in_copy(copy: BucketReplica) -> str | None:
 
 def _erase(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
-) -> dict[str, Any] | None:  # fmt: skip
+) -> dict[str, Any] | None:
     """Return the result; None if the service stops before the end.
 
     Raises:

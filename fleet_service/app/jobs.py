@@ -154,7 +154,8 @@ class BackgroundJobs:
         self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]
     ) -> None:
         self._jobs = [job for job in jobs if job.every_s]
-        self._counts, self._log_line = counts, log_line
+        self._counts = counts
+        self._log_line = log_line
         self.failed: dict[str, int] = {}
         self._stop = threading.Event()
         self._busy: tuple[str, float] | None = None
@@ -212,7 +213,8 @@ class BackgroundJobs:
         except Exception as error:
             self._counts[f"{job.name}_failures"] += 1
             self.failed[job.name] = self.failed.get(job.name, 0) + 1
-            line, well = f"{job.name} failed: {error}", False
+            line = f"{job.name} failed: {error}"
+            well = False
             if not isinstance(error, (OSError, InputError)):
                 log.exception("%s failed", job.name)
         self._busy = None

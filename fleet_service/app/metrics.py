@@ -62,29 +62,59 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
         Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()
     ]
     kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
-    failures, runs = _ending(counts, "_failures"), _ending(counts, "_runs")
+    failures = _ending(counts, "_failures")
+    runs = _ending(counts, "_runs")
     return [
         *found,
         Metric("rows", "counter", "rows admitted", kinds, "kind"),
         Metric("failures", "counter", "failed work, which is tried again", failures, "work"),
         Metric("runs", "counter", "runs of background jobs", runs, "work"),
-        Metric("segments", "gauge", "segments waiting for compaction", _per_kind(root, segments.paths), "kind"),
+        Metric(
+            "segments",
+            "gauge",
+            "segments waiting for compaction",
+            _per_kind(root, segments.paths),
+            "kind",
+        ),
         gauge("queue_messages", "waiting messages", pulse.queued),
         gauge("queue_capacity", "capacity of the queue", config.queue_batches),
         gauge("routers", "routers to which the session is connected", pulse.routers),
         gauge("worker_turn_age_seconds", "time since the worker's last turn", pulse.turn_age_s),
         gauge("clock_lag_seconds", "lag of the system clock", pulse.clock_lag_s),
-        gauge("report_lag_seconds", "time between the end of the newest visit and its arrival", report_lag_s),
-        gauge("unsettled_batches", "admitted batches that are not on disk yet", engine.settlement.unsettled),
-        gauge("copy_away_seconds", "time for which the archive's copy has not accepted segments", away_s),
-        gauge("lease_left_seconds", "time for which the service may acknowledge without renewing its "
-                                    "lease", engine.holding.left_s),
+        gauge(
+            "report_lag_seconds",
+            "time between the end of the newest visit and its arrival",
+            report_lag_s,
+        ),
+        gauge(
+            "unsettled_batches",
+            "admitted batches that are not on disk yet",
+            engine.settlement.unsettled,
+        ),
+        gauge(
+            "copy_away_seconds",
+            "time for which the archive's copy has not accepted segments",
+            away_s,
+        ),
+        gauge(
+            "lease_left_seconds",
+            "time for which the service may acknowledge without renewing its lease",
+            engine.holding.left_s,
+        ),
         _serves(config, 1.0),
         gauge("cells", "cells and sectors with a belief", engine.state.fusion.size),
-        gauge("window_observations", "observations younger than the checkpoint", engine.state.fusion.waiting),
+        gauge(
+            "window_observations",
+            "observations younger than the checkpoint",
+            engine.state.fusion.waiting,
+        ),
         gauge("alerts", "cells under an alert", engine.alerts.count),
-        gauge("damaged_files", "damaged files set aside, at the last count", counts.get("files_set_aside", 0)),
-    ]  # fmt: skip
+        gauge(
+            "damaged_files",
+            "damaged files set aside, at the last count",
+            counts.get("files_set_aside", 0),
+        ),
+    ]
 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:

@@ -34,7 +34,8 @@ LOOKED_ROWS: Final = 20_000_000  # of row groups near the box, by the files' foo
 IDLE_S: Final = 60.0  # for which a process waits for the next question
 ANSWERS: Final = 100  # after which it leaves: what it holds back of memory goes with it
 _HEAD: Final = struct.Struct("<qQ")
-_ERROR, _END = -1, -2
+_ERROR = -1
+_END = -2
 
 
 class PastQuery(NamedTuple):
@@ -123,7 +124,8 @@ class _Process:
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self._child.stdin
         assert self._child.stdout
-        self._in, self.out = self._child.stdin, self._child.stdout
+        self._in = self._child.stdin
+        self.out = self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
         """Ask; return the head of the first reply."""

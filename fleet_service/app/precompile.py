@@ -62,11 +62,23 @@ def live() -> None:
 
 def _visits(time: int, cells: int) -> Observations:
     """Return one visit to each of `cells` cells, each by a vehicle of its own."""
-    one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
+    one = np.ones(cells, np.int64)
+    number = np.arange(cells)
+    sector = np.zeros(cells, np.int8)
     flat = as_reported(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))))
     return Observations(
-        time=time * one, cell=number, sector=sector, second=(sector - 1).astype(np.int8),
-        vehicle=number, boot=one, region=one, sequence=number, evidence=flat.steps, reported=flat.reported,
-        used=np.full(cells, 0.9, np.float32), manoeuvre=np.full(cells, -1, np.int8),
-        other=np.full((cells, 1), -1), other_share=np.zeros((cells, 1), np.float32),
-    )  # fmt: skip
+        time=time * one,
+        cell=number,
+        sector=sector,
+        second=(sector - 1).astype(np.int8),
+        vehicle=number,
+        boot=one,
+        region=one,
+        sequence=number,
+        evidence=flat.steps,
+        reported=flat.reported,
+        used=np.full(cells, 0.9, np.float32),
+        manoeuvre=np.full(cells, -1, np.int8),
+        other=np.full((cells, 1), -1),
+        other_share=np.zeros((cells, 1), np.float32),
+    )

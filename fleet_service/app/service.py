@@ -73,7 +73,9 @@ class Service:
         log_line: Callable[[str], None],
         holding: Ownership | None = None,
     ) -> None:
-        self._config, self._root, self._log_line = config, root, log_line
+        self._config = config
+        self._root = root
+        self._log_line = log_line
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
@@ -99,7 +101,9 @@ class Service:
         self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = (
             time.monotonic()
         )
-        self._reported, self._began, self._survived = 0, self._stepped_at, False
+        self._reported = 0
+        self._began = self._stepped_at
+        self._survived = False
         self._followed = False  # by a service that has the lease now
 
     def run(self, stop: threading.Event) -> None:
@@ -169,25 +173,30 @@ class Service:
 
     def _works(self) -> bool:
         """Return True if this service can do for its regions what a successor could do."""
-        session, turn_age_s = self._session, time.monotonic() - self._stepped_at
+        session = self._session
+        turn_age_s = time.monotonic() - self._stepped_at
         return (
             session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
         )
 
     def _monitored(self) -> AbstractContextManager[str | None]:
         """Serve metrics and health if the settings ask for it."""
-        config, engine, root = self._config, self.engine, self._root
+        config = self._config
+        engine = self.engine
+        root = self._root
 
         def pulse() -> Pulse:
             routers = len(list(self._session.info.routers_zid())) if self._session else 0
-            lag_s, turn_s = self._clock.lag() * 1e-9, time.monotonic() - self._stepped_at
+            lag_s = self._clock.lag() * 1e-9
+            turn_s = time.monotonic() - self._stepped_at
             return Pulse(turn_s, len(self.inbox), routers, lag_s, self._replies.hangs_s)
 
         return serve_metrics(
-            config.metrics_host, config.metrics_port,
+            config.metrics_host,
+            config.metrics_port,
             lambda: metrics(engine, pulse(), config, root),
             lambda: health_problems(engine, pulse(), config) + self._upkeep.health_problems(),
-        )  # fmt: skip
+        )
 
     @contextmanager
     def _declared(self, session: zenoh.Session) -> Iterator[None]:
@@ -326,7 +335,8 @@ class Service:
     def _status(self, now: float) -> None:
         counts = self.engine.counts
         rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
-        self._reported_at, self._reported = now, counts[Kind.OBSERVATION]
+        self._reported_at = now
+        self._reported = counts[Kind.OBSERVATION]
         behind = self._clock.lag() * 1e-9
         rest = ", ".join(
             f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)

@@ -124,14 +124,16 @@ def load_state(
         OSError: it cannot be read.
     """
     begin = load_restart(root, config.lateness_s, (VISITORS,))
-    fusion, streams = begin.fusion, begin.streams
+    fusion = begin.fusion
+    streams = begin.streams
     visitors = None
     if (
         config.public_vehicles > 1
     ):  # after a checkpoint that does not have them nothing is shown until so many came
         kept = begin.beside.get(VISITORS)
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
-    shown, alerts = MapState(fusion), Alerts(fusion, IdleRoads())
+    shown = MapState(fusion)
+    alerts = Alerts(fusion, IdleRoads())
     alerts.resume(begin.standing)
     used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
     fusion.update_weather(

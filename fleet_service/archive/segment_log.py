@@ -68,7 +68,8 @@ class SegmentLog(Generic[Batch]):
     def __init__(
         self, root: Path, shard: str, upload: Upload | None = None, epoch: int = 0
     ) -> None:
-        self._writer, self._upload = Writer(root, shard, epoch), upload
+        self._writer = Writer(root, shard, epoch)
+        self._upload = upload
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
@@ -125,9 +126,11 @@ class SegmentLog(Generic[Batch]):
         """
         if self._written is None:
             return []
-        written, self._written = self._written, None
+        written = self._written
+        self._written = None
         written.result()
-        durable, self._load = self._load.batches, _Load()
+        durable = self._load.batches
+        self._load = _Load()
         return durable
 
     def flush(self) -> list[Batch]:

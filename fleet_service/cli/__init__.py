@@ -21,47 +21,110 @@ BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "watch", "page", "cits", "router")  # commands that go on until a signal
 
 COMMANDS: Final = (
-    Command("run", "fleet_service.cli.run", "run the service: receive observations, serve the map, keep the archive",
-            "fleet-service run --archive archive --config service.json"),
-    Command("query", "fleet_service.cli.query", "query the map once",
-            "fleet-service query --bbox -0.5,51.2,0.3,51.7 --out map.geojson"),
-    Command("watch", "fleet_service.cli.watch", "print tiles and alerts as they change, until Ctrl-C",
-            "fleet-service watch --bbox 11.9,57.6,12.1,57.8"),
-    Command("page", "fleet_service.cli.page", "serve the live map for browsers: now, alerts, the past, routes",
-            "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
-    Command("cits", "fleet_service.cli.cits", "send alerts as DENM to an AMQP interchange, and take foreign ones",
-            "fleet-service cits --amqp amqps://host:5671 --from subscriptions --witness cits-se"),
-    Command("router", "deploy.router", "run a Zenoh router until a signal; the same as `gripmap router`",
-            "fleet-service router --listen tcp/127.0.0.1:7447"),
-    Command("hand-over", "fleet_service.cli.hand_over", "move a region to a standby while it runs",
-            "fleet-service hand-over 1202/310/* --to north-b"),
-    Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, and compute roll-ups",
-            "fleet-service compact --archive archive"),
-    Command("retention", "fleet_service.cli.retention", "remove old raw rows; their roll-ups stay",
-            "fleet-service retention --archive archive --raw-days 92 --dry-run"),
-    Command("forget", "fleet_service.cli.forget", "destroy the key of a month, or remove one vehicle's rows of it",
-            "fleet-service forget --archive archive --period 2026-01 --vehicle car-one --dry-run"),
-    Command("export", "fleet_service.cli.export", "write a part of the archive as GeoParquet, GeoJSON or CSV",
-            "fleet-service export map --archive archive --out map.parquet"),
-    Command("roads", "fleet_service.cli.roads", "assign cells to links of a road network, for analyze contract",
-            "fleet-service roads city.osm.pbf --out roads.parquet"),
     Command(
-        "analyze", "fleet_service.cli.analyze",
+        "run",
+        "fleet_service.cli.run",
+        "run the service: receive observations, serve the map, keep the archive",
+        "fleet-service run --archive archive --config service.json",
+    ),
+    Command(
+        "query",
+        "fleet_service.cli.query",
+        "query the map once",
+        "fleet-service query --bbox -0.5,51.2,0.3,51.7 --out map.geojson",
+    ),
+    Command(
+        "watch",
+        "fleet_service.cli.watch",
+        "print tiles and alerts as they change, until Ctrl-C",
+        "fleet-service watch --bbox 11.9,57.6,12.1,57.8",
+    ),
+    Command(
+        "page",
+        "fleet_service.cli.page",
+        "serve the live map for browsers: now, alerts, the past, routes",
+        "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive",
+    ),
+    Command(
+        "cits",
+        "fleet_service.cli.cits",
+        "send alerts as DENM to an AMQP interchange, and take foreign ones",
+        "fleet-service cits --amqp amqps://host:5671 --from subscriptions --witness cits-se",
+    ),
+    Command(
+        "router",
+        "deploy.router",
+        "run a Zenoh router until a signal; the same as `gripmap router`",
+        "fleet-service router --listen tcp/127.0.0.1:7447",
+    ),
+    Command(
+        "hand-over",
+        "fleet_service.cli.hand_over",
+        "move a region to a standby while it runs",
+        "fleet-service hand-over 1202/310/* --to north-b",
+    ),
+    Command(
+        "compact",
+        "fleet_service.cli.compact",
+        "sort the log into files by date and zone, and compute roll-ups",
+        "fleet-service compact --archive archive",
+    ),
+    Command(
+        "retention",
+        "fleet_service.cli.retention",
+        "remove old raw rows; their roll-ups stay",
+        "fleet-service retention --archive archive --raw-days 92 --dry-run",
+    ),
+    Command(
+        "forget",
+        "fleet_service.cli.forget",
+        "destroy the key of a month, or remove one vehicle's rows of it",
+        "fleet-service forget --archive archive --period 2026-01 --vehicle car-one --dry-run",
+    ),
+    Command(
+        "export",
+        "fleet_service.cli.export",
+        "write a part of the archive as GeoParquet, GeoJSON or CSV",
+        "fleet-service export map --archive archive --out map.parquet",
+    ),
+    Command(
+        "roads",
+        "fleet_service.cli.roads",
+        "assign cells to links of a road network, for analyze contract",
+        "fleet-service roads city.osm.pbf --out roads.parquet",
+    ),
+    Command(
+        "analyze",
+        "fleet_service.cli.analyze",
         "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, "
         "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
-    Command("rebuild", "fleet_service.cli.rebuild", "compute map and roll-ups again from raw "
-                                                    "observations, here or on Spark",
-            "fleet-service rebuild --archive archive --out rebuilt --engine spark"),
-    Command("certs", "fleet_service.cli.certs", "create certificates and router configurations for everyone on a list",
-            "fleet-service certs --fleet fleet.json --out certs"),
-    Command("evaluate", "fleet_service.cli.evaluate", "evaluate the fusion on simulated fleets, "
-                                                      "against truth and simple rules",
-            "fleet-service evaluate --quick --out evaluation"),
-    Command("completion", "fleet_service.cli.completion", "print the completion script for a shell",
-            "fleet-service completion bash > ~/.local/share/bash-completion/completions/fleet-service"),
-)  # fmt: skip
+    Command(
+        "rebuild",
+        "fleet_service.cli.rebuild",
+        "compute map and roll-ups again from raw observations, here or on Spark",
+        "fleet-service rebuild --archive archive --out rebuilt --engine spark",
+    ),
+    Command(
+        "certs",
+        "fleet_service.cli.certs",
+        "create certificates and router configurations for everyone on a list",
+        "fleet-service certs --fleet fleet.json --out certs",
+    ),
+    Command(
+        "evaluate",
+        "fleet_service.cli.evaluate",
+        "evaluate the fusion on simulated fleets, against truth and simple rules",
+        "fleet-service evaluate --quick --out evaluation",
+    ),
+    Command(
+        "completion",
+        "fleet_service.cli.completion",
+        "print the completion script for a shell",
+        "fleet-service completion bash > ~/.local/share/bash-completion/completions/fleet-service",
+    ),
+)
 LINE: Final = ("fleet-service", "One live map of grip from many vehicles.", COMMANDS)
 
 

@@ -17,10 +17,14 @@ from schemas.runtime import commandline, progress_messages
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
 # which questions an option is for; to the others it would be one that is passed over in silence
 FOR: Final = {
-    "at": ("before-after", "replay"), "stations": ("weather", "change-rates"), "step": ("replay",),
-    "min_vehicles": ("worst", "spells", "contract"), "roads": ("contract",), "level": ("contract",),
+    "at": ("before-after", "replay"),
+    "stations": ("weather", "change-rates"),
+    "step": ("replay",),
+    "min_vehicles": ("worst", "spells", "contract"),
+    "roads": ("contract",),
+    "level": ("contract",),
     "within": ("contract",),
-}  # fmt: skip
+}
 USUAL_VEHICLES: Final = 2
 
 
@@ -93,9 +97,15 @@ def run(arguments: argparse.Namespace) -> int:
     at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
     options = Options(
-        at=at, stations=arguments.stations, least_vehicles=vehicles, step_s=arguments.step, roads=arguments.roads,
-        level=arguments.level, within_s=_seconds(arguments.within), report=_report,
-    )  # fmt: skip
+        at=at,
+        stations=arguments.stations,
+        least_vehicles=vehicles,
+        step_s=arguments.step,
+        roads=arguments.roads,
+        level=arguments.level,
+        within_s=_seconds(arguments.within),
+        report=_report,
+    )
     _report(
         f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations"
     )

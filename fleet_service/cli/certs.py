@@ -69,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.enrolment.fleet import Enrolment
     from schemas.config import load
 
-    days, out = (arguments.days, arguments.ca_days, arguments.renew_days), arguments.out
+    days = (arguments.days, arguments.ca_days, arguments.renew_days)
+    out = arguments.out
     for name, value in zip(("days", "ca-days", "renew-days"), days, strict=True):
         if not 0.0 < value <= LONGEST_DAYS:
             raise InputError(

@@ -50,5 +50,6 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     }
     if arguments.to is not None:
         put = mirror.copy_new_files(arguments.archive, arguments.to)
-        summary, values = f"{summary}, {put} put", {**values, "put": put}
+        summary = f"{summary}, {put} put"
+        values = {**values, "put": put}
     return ArchiveReport(summary, values)

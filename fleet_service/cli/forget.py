@@ -44,7 +44,9 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.identity.erasure_requests import Erasure
     from fleet_service.archive.maintenance.retention import key_of, rows_of_vehicle
 
-    root, month, vehicle = arguments.archive, arguments.period, arguments.vehicle
+    root = arguments.archive
+    month = arguments.period
+    vehicle = arguments.vehicle
     key_of(root, month)
     rows = 0 if vehicle is None else rows_of_vehicle(root, vehicle, month)
     what = (

@@ -86,11 +86,19 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.archive is not None:
         _check_archive(arguments.archive)
     settings = server.PageSettings(
-        connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
-        names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
-        base_map=None if arguments.base_map is None else base_map(arguments.base_map, arguments.attribution),
-        roads=None if arguments.roads is None else read_roads(arguments.roads), datex=_publication(arguments),
-    )  # fmt: skip
+        connection=map_client.settings(arguments.connect, arguments.config),
+        host=arguments.host,
+        port=arguments.port,
+        names=arguments.name,
+        archive=arguments.archive,
+        metrics=arguments.metrics,
+        overlay=arguments.overlay,
+        base_map=None
+        if arguments.base_map is None
+        else base_map(arguments.base_map, arguments.attribution),
+        roads=None if arguments.roads is None else read_roads(arguments.roads),
+        datex=_publication(arguments),
+    )
     server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
     return 0
 

@@ -52,7 +52,8 @@ def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
             Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine
         )
     )
-    cells, parts = sum(one.cells for one in done), sum(one.parts for one in done)
+    cells = sum(one.cells for one in done)
+    parts = sum(one.parts for one in done)
     line = (
         f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"
     )

@@ -45,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     with commandline.report_write_errors(arguments.out), open_durably(arguments.out) as file:
         pq.write_table(table, file, compression="zstd")
     licence = network.source.get("licence")
-    print(f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"
-          + (f"; {licence}" if licence else ""))  # fmt: skip
+    print(
+        f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"
+        + (f"; {licence}" if licence else "")
+    )
     return 0

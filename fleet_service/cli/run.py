@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
-) -> Ownership | None:  # fmt: skip
+) -> Ownership | None:
     """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
     from fleet_service.app.metrics import standby_metrics
     from fleet_service.replication.ownership import acquire
@@ -121,11 +121,13 @@ def _open_archive(
 
     with (
         serve_metrics(
-            config.metrics_host, config.metrics_port, lambda: standby_metrics(config),
+            config.metrics_host,
+            config.metrics_port,
+            lambda: standby_metrics(config),
             lambda: [line for line in latest if "cannot" in line],
         ) as address,
         standby_signs(config, stop, watchdog.notify_waiting()) as signs,
-    ):  # fmt: skip
+    ):
         return None if stop.is_set() else acquire(config, root, stop, say, signs)
 
 

@@ -28,9 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format"
     )
     parser.add_argument(
-        "--webhook-queue", metavar="FILE", type=Path,
+        "--webhook-queue",
+        metavar="FILE",
+        type=Path,
         help="file for alerts that wait for the receiver (default: in the user's state folder)",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--health-port",
         metavar="PORT",

@@ -24,7 +24,8 @@ class AlertQueue:
     """
 
     def __init__(self, path: Path, most: int = MOST_WAITING) -> None:
-        self._most, self._guard = most, threading.Lock()
+        self._most = most
+        self._guard = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(

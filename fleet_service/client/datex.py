@@ -26,13 +26,18 @@ from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 # for which an ended situation is told: who pulls every few minutes does not miss the end
 KEPT_S: Final = 3600
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
-CERTAIN, PROBABLE = 0.97, 0.8  # of P(slippery), from which on it is said
+# of P(slippery), from which on it is said
+CERTAIN = 0.97
+PROBABLE = 0.8
 DIGITS: Final = 6  # a tenth of a metre; a cell is ten
 _XSI: Final = "http://www.w3.org/2001/XMLSchema-instance"
 _SPACES: Final = {
-    "d2": "http://datex2.eu/schema/3/d2Payload", "com": "http://datex2.eu/schema/3/common",
-    "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing", "xsi": _XSI,
-}  # fmt: skip
+    "d2": "http://datex2.eu/schema/3/d2Payload",
+    "com": "http://datex2.eu/schema/3/common",
+    "sit": "http://datex2.eu/schema/3/situation",
+    "loc": "http://datex2.eu/schema/3/locationReferencing",
+    "xsi": _XSI,
+}
 _BEARINGS: Final = {
     name: (90.0 - 90.0 * sector) % 360.0 for sector, name in enumerate(grid.HEADINGS)
 }
@@ -85,8 +90,10 @@ def publication(
         InputError: `before` is not a publication.
     """
     old = {} if before is None else _records(before)
-    root = ET.Element(_name("d2:payload"), {_name("xsi:type"): "sit:SituationPublication", "lang": "en",
-                                            "modelBaseVersion": "3"})  # fmt: skip
+    root = ET.Element(
+        _name("d2:payload"),
+        {_name("xsi:type"): "sit:SituationPublication", "lang": "en", "modelBaseVersion": "3"},
+    )
     _text(root, "com:publicationTime", iso(now))
     creator = ET.SubElement(root, _name("com:publicationCreator"))
     _text(creator, "com:country", supplier.country)
@@ -124,8 +131,10 @@ def same_but_for_time(one: bytes, other: bytes) -> bool:
 
 
 def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
-    record = ET.Element(_name("sit:situationRecord"), {_name("xsi:type"): "sit:WeatherRelatedRoadConditions",
-                                                       "id": name, "version": "1"})  # fmt: skip
+    record = ET.Element(
+        _name("sit:situationRecord"),
+        {_name("xsi:type"): "sit:WeatherRelatedRoadConditions", "id": name, "version": "1"},
+    )
     _text(record, "sit:situationRecordCreationTime", iso(now))
     _text(record, "sit:situationRecordObservationTime", iso(alert.time))
     _text(record, "sit:situationRecordVersionTime", iso(now))
@@ -150,17 +159,21 @@ def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     _text(record, "sit:weatherRelatedRoadConditionType", "slippery")
     measured = ET.SubElement(record, _name("sit:roadSurfaceConditionMeasurements"))
     friction = ET.SubElement(
-        measured, _name("com:friction"),
-        {"numberOfInputValuesUsed": str(alert.vehicles),
-         "standardDeviation": f"{(alert.mu_upper - alert.mu_lower) / INTERVAL_STD:.3f}"},
-    )  # fmt: skip
+        measured,
+        _name("com:friction"),
+        {
+            "numberOfInputValuesUsed": str(alert.vehicles),
+            "standardDeviation": f"{(alert.mu_upper - alert.mu_lower) / INTERVAL_STD:.3f}",
+        },
+    )
     _text(friction, "com:friction", f"{alert.mu:.2f}")
     return record
 
 
 def _location(alert: StretchAlert) -> ET.Element:
     """Return a line from end to end in driving direction; a point if the stretch is one cell."""
-    points, line = list(alert.points), len(alert.points) > 1
+    points = list(alert.points)
+    line = len(alert.points) > 1
     kind = "loc:LinearLocation" if line else "loc:PointLocation"
     place = ET.Element(_name("sit:locationReference"), {_name("xsi:type"): kind})
     _coordinates(place, "loc:coordinatesForDisplay", alert.latitude, alert.longitude)
@@ -172,7 +185,8 @@ def _location(alert: StretchAlert) -> ET.Element:
         f"{alert.direction}; vehicles heading {' and '.join(alert.headings)}",
     )
     if line:
-        north, east = points[-1][0] - points[0][0], points[-1][1] - points[0][1]
+        north = points[-1][0] - points[0][0]
+        east = points[-1][1] - points[0][1]
         along = {"north": north, "south": -north, "east": east, "west": -east}
         points = points if along[alert.headings[0]] >= 0.0 else points[::-1]
         drawn = ET.SubElement(

@@ -37,7 +37,9 @@ class DatexFile:
     """
 
     def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
-        self._supplier, self._path, self._say = supplier, path, say
+        self._supplier = supplier
+        self._path = path
+        self._say = say
         self.document = path.read_bytes() if path.exists() else None
         self._written = 0.0
         if self.document is not None:
@@ -65,7 +67,8 @@ class DatexFile:
         changed = before is None or not same_but_for_time(new, before)
         if not changed and not self.is_due:
             return
-        self.document, self._written = new, time.monotonic()
+        self.document = new
+        self._written = time.monotonic()
         with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(new)
         if changed:
@@ -93,7 +96,9 @@ class DatexFeed:
     """
 
     def __init__(self, file: StretchOutput) -> None:
-        self._file, self._stretches, self._lock = file, Stretches(), threading.Lock()
+        self._file = file
+        self._stretches = Stretches()
+        self._lock = threading.Lock()
         self._has_news = True
         self._heard: dict[int, bool] = {}
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
@@ -106,7 +111,8 @@ class DatexFeed:
 
     def look(self, session: zenoh.Session) -> None:
         """Query all standing alerts. Alerts of places without a service do not end."""
-        found, self._heard = standing_alerts(session), {}
+        found = standing_alerts(session)
+        self._heard = {}
 
         def is_heard(latitude: float, longitude: float) -> bool:
             tile = int(grid.tile_of(int(grid.cell_of(latitude, longitude))))

@@ -30,8 +30,19 @@ EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
 # a router ends questions to a service that was killed, and tells then that its token fell
 FALLS_S: Final = 0.1
-SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
-                "observations", "age_s")  # fmt: skip
+SHOWN: Final = (
+    "latitude",
+    "longitude",
+    "sector",
+    "mu",
+    "mu_lower",
+    "mu_upper",
+    "p_slippery",
+    "basis",
+    "vehicles",
+    "observations",
+    "age_s",
+)
 
 
 @dataclass(frozen=True)
@@ -90,7 +101,8 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
         if not declared and services.refresh(session):  # it came while it was looked for
-            declared, served = True, bool(payloads)
+            declared = True
+            served = bool(payloads)
         elif (
             not declared and served and not payloads
         ):  # likewise, and its token is on the way; or it has none

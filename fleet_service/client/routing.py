@@ -32,10 +32,9 @@ STEPS: Final = (
     MOST,
 )  # factors that are written; neighbours of one class are one line
 SHORTEST_M: Final = 15.0  # a line that can be placed on a link
-ICE_LOWER, ICE_SURE = (
-    0.3,
-    0.9,
-)  # upper end below which, and P(slippery) from which, a cell is taken out as ice
+# upper end below which, and P(slippery) from which, a cell is taken out as ice
+ICE_LOWER = 0.3
+ICE_SURE = 0.9
 HALF_WIDTH_M: Final = 8.0  # of a polygon around a road
 
 
@@ -116,7 +115,8 @@ def valhalla(
 
 def graphhopper(lines: Sequence[CostLine]) -> dict[str, Any]:
     """Return a custom model for GraphHopper: one area per class of cost, and the priority there."""
-    areas, priority = [], []
+    areas = []
+    priority = []
     for number, factor in enumerate(STEPS[1:], 1):
         rings = [[_ribbon(line.points)] for line in lines if line.factor == factor]
         if not rings:
@@ -153,7 +153,8 @@ def _known(table: pa.Table) -> tuple[IntArray, FloatArray]:
 def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return points every STEP_M along a road, with the yaw there; none of a road without length."""
     east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(road.latitude))))
-    dx, dy = np.diff(road.longitude) * east, np.diff(road.latitude) * METRES_PER_DEGREE
+    dx = np.diff(road.longitude) * east
+    dy = np.diff(road.latitude) * METRES_PER_DEGREE
     steps = np.hypot(dx, dy)
     keep = np.r_[True, steps > 0.0]
     run = np.r_[0.0, np.cumsum(steps)][keep]
@@ -172,9 +173,11 @@ def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> lis
     for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
         if cost[first] <= 1.0:
             continue
-        begin, end = first, min(last, len(cost) - 1)
+        begin = first
+        end = min(last, len(cost) - 1)
         while (end - begin) * STEP_M < SHORTEST_M and (begin > 0 or end < len(cost) - 1):
-            begin, end = max(begin - 1, 0), min(end + 1, len(cost) - 1)
+            begin = max(begin - 1, 0)
+            end = min(end + 1, len(cost) - 1)
         points = list(
             zip(
                 longitude[begin : end + 1].tolist(), latitude[begin : end + 1].tolist(), strict=True
@@ -188,12 +191,11 @@ def _ribbon(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return the ring around a line, HALF_WIDTH_M to both sides."""
     longitude, latitude = np.array(points).T
     east = METRES_PER_DEGREE * np.cos(np.radians(latitude.mean()))
-    dx, dy = np.gradient(longitude) * east, np.gradient(latitude) * METRES_PER_DEGREE
+    dx = np.gradient(longitude) * east
+    dy = np.gradient(latitude) * METRES_PER_DEGREE
     length = np.maximum(np.hypot(dx, dy), 1e-9)
-    across_x, across_y = (
-        -dy / length * HALF_WIDTH_M / east,
-        dx / length * HALF_WIDTH_M / METRES_PER_DEGREE,
-    )
+    across_x = -dy / length * HALF_WIDTH_M / east
+    across_y = dx / length * HALF_WIDTH_M / METRES_PER_DEGREE
     left = list(zip((longitude + across_x).tolist(), (latitude + across_y).tolist(), strict=True))
     right = list(zip((longitude - across_x).tolist(), (latitude - across_y).tolist(), strict=True))
     ring = [*left, *right[::-1]]

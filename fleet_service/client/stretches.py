@@ -120,14 +120,16 @@ class Stretches:
 
     def changes(self) -> list[StretchAlert]:
         """Return the changes since the last call."""
-        found, out = self._groups(), []
+        found = self._groups()
+        out = []
         for name, group in found.items():
             if name not in self._known:
                 out.append(self._stretch(name, group))
             elif self._members[name] != _cells(group):
                 out.append(replace(self._stretch(name, group), state="changed"))
         for name in [name for name in self._known if name not in found]:
-            ended, last = self._known.pop(name), self._last
+            ended = self._known.pop(name)
+            last = self._last
             del self._members[name]
             if last is not None:
                 out.append(replace(ended, state="cleared", time=last.time, reason=last.reason))
@@ -164,18 +166,31 @@ class Stretches:
         return out
 
     def _stretch(self, name: str, group: list[Alert]) -> StretchAlert:
-        worst, last = min(group, key=lambda one: one.mu), max(group, key=lambda one: one.time)
+        worst = min(group, key=lambda one: one.mu)
+        last = max(group, key=lambda one: one.time)
         known = self._known.get(name)
         headings = tuple(grid.HEADINGS[k] for k in sorted({one.sector for one in group}))
         length, direction, middle, bbox = _shape(np.array([one.cell for one in group], np.int64))
         return StretchAlert(
-            id=name, state="raised", since=known.since if known else min(one.time for one in group), time=last.time,
-            length_m=length, direction=direction, headings=headings,
-            latitude=middle[0], longitude=middle[1], bbox=bbox, cells=len(_cells(group)), mu=worst.mu,
-            mu_lower=worst.mu_lower, mu_upper=worst.mu_upper, p_slippery=worst.p_slippery,
-            vehicles=max(one.vehicles for one in group), reason=last.reason,
+            id=name,
+            state="raised",
+            since=known.since if known else min(one.time for one in group),
+            time=last.time,
+            length_m=length,
+            direction=direction,
+            headings=headings,
+            latitude=middle[0],
+            longitude=middle[1],
+            bbox=bbox,
+            cells=len(_cells(group)),
+            mu=worst.mu,
+            mu_lower=worst.mu_lower,
+            mu_upper=worst.mu_upper,
+            p_slippery=worst.p_slippery,
+            vehicles=max(one.vehicles for one in group),
+            reason=last.reason,
             points=_points(np.array(sorted(_cells(group)), np.int64)),
-        )  # fmt: skip
+        )
 
 
 def link_cells(cell: IntArray) -> IntArray:
@@ -223,7 +238,8 @@ def _shape(
     spread."""
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
-    x, y = (west + east) / 2 * scale, (south + north) / 2 * METRES_PER_DEGREE
+    x = (west + east) / 2 * scale
+    y = (south + north) / 2 * METRES_PER_DEGREE
     side = float((east[0] - west[0]) * scale)
     spread, axes = np.linalg.eigh(
         np.cov(np.stack([x - x.mean(), y - y.mean()]), ddof=0).reshape(2, 2)

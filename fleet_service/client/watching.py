@@ -48,7 +48,9 @@ def watch(
     """
     asked = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox})
     box = asked.bbox
-    stretches, lock, away = Stretches(), threading.Lock(), set[str]()
+    stretches = Stretches()
+    lock = threading.Lock()
+    away = set[str]()
 
     def near(key: str) -> int | None:
         tile = keys.parse(key).quadint

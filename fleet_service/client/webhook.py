@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 # of a whole request, so that a receiver that drips bytes does not block the queue
 TIMEOUT_S: Final = 5.0
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 60.0
+FIRST_WAIT_S = 0.5
+LONGEST_WAIT_S = 60.0
 # Answers by which a receiver refuses this message for good; repeating it would block the queue.
 REFUSALS: Final = frozenset({400, 413, 415, 422})
 LOSSES: Final = ("dropped", "refused", "unstored")
@@ -41,24 +42,38 @@ def body(alert: StretchAlert) -> dict[str, Any]:
     """Return one alert as a webhook message."""
     status = "resolved" if alert.state == "cleared" else "firing"
     labels = {
-        "alertname": "SlipperyRoad", "id": alert.id, "direction": alert.direction, "headings": ",".join(alert.headings),
+        "alertname": "SlipperyRoad",
+        "id": alert.id,
+        "direction": alert.direction,
+        "headings": ",".join(alert.headings),
         "severity": "critical" if alert.mu < SLIPPERY_MU / 2 else "warning",
-    }  # fmt: skip
+    }
     notes = {
         "summary": f"slippery road: {alert.length_m:.0f} m {alert.direction}, mu {alert.mu:.2f}",
         "description": alert.line(),
         "place": f"{alert.latitude:.6f},{alert.longitude:.6f}",
     }
     one = {
-        "status": status, "labels": labels, "annotations": notes, "startsAt": iso(alert.since),
+        "status": status,
+        "labels": labels,
+        "annotations": notes,
+        "startsAt": iso(alert.since),
         "endsAt": iso(alert.time) if status == "resolved" else _OPEN,
-        "generatorURL": f"geo:{alert.latitude:.6f},{alert.longitude:.6f}", "fingerprint": alert.id,
-    }  # fmt: skip
+        "generatorURL": f"geo:{alert.latitude:.6f},{alert.longitude:.6f}",
+        "fingerprint": alert.id,
+    }
     return {
-        "version": "4", "groupKey": f'{{}}:{{id="{alert.id}"}}', "truncatedAlerts": 0, "status": status,
-        "receiver": "gripmap", "groupLabels": {"id": alert.id}, "commonLabels": labels, "commonAnnotations": notes,
-        "externalURL": "", "alerts": [one],
-    }  # fmt: skip
+        "version": "4",
+        "groupKey": f'{{}}:{{id="{alert.id}"}}',
+        "truncatedAlerts": 0,
+        "status": status,
+        "receiver": "gripmap",
+        "groupLabels": {"id": alert.id},
+        "commonLabels": labels,
+        "commonAnnotations": notes,
+        "externalURL": "",
+        "alerts": [one],
+    }
 
 
 def queue_path(url: str) -> Path:
@@ -84,12 +99,18 @@ class Webhook:
         self, url: str, say: Callable[[str], None], queue: AlertQueue, timeout_s: float = TIMEOUT_S
     ) -> None:
         check_url(url)
-        self._url, self._say, self._queue, self._timeout_s = url, say, queue, timeout_s
+        self._url = url
+        self._say = say
+        self._queue = queue
+        self._timeout_s = timeout_s
         # a path may hold a secret
         self._name = f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"
         self.counts: Counter[str] = Counter()
-        self._failure, self._undelivered, self._is_closed = "", 0, False
-        self._more, self._stop = threading.Event(), threading.Event()
+        self._failure = ""
+        self._undelivered = 0
+        self._is_closed = False
+        self._more = threading.Event()
+        self._stop = threading.Event()
         self._more.set()
         self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
         self._thread.start()

@@ -29,9 +29,16 @@ WEATHER: Final = f"{keys.ROOT}/weather/**"
 SERVED: Final = f"{keys.SERVES}/**"
 EVERYTHING: Final = "gripmap/**"
 MESSAGES: Final = (
-    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
-    "liveliness_query", "declare_liveliness_subscriber",
-)  # fmt: skip
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
 MAX_SESSIONS: Final = 5000  # one per vehicle; Zenoh's own limit is 1000
 # A whole tile as GeoJSON is about 50 MB; Zenoh would put together a gigabyte from fragments before it looks at it.
 MAX_MESSAGE: Final = 64 * 1024 * 1024
@@ -128,8 +135,11 @@ def access_control(fleet: Enrolment) -> Section:
         _rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
     ]
     roles = {
-        "routers": list(fleet.routers), "services": fleet.services, "readers": fleet.readers, "weather": fleet.weather,
-    }  # fmt: skip
+        "routers": list(fleet.routers),
+        "services": fleet.services,
+        "readers": fleet.readers,
+        "weather": fleet.weather,
+    }
     subjects = [
         {"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names
     ]

@@ -58,7 +58,10 @@ class Registry:
     def __init__(
         self, folder: Path, terms: Terms, now: datetime, used_at: Path | None = None
     ) -> None:
-        self._folder, self._terms, self._now, self._used_at = folder, terms, now, used_at or folder
+        self._folder = folder
+        self._terms = terms
+        self._now = now
+        self._used_at = used_at or folder
         self._authority = folder / "authority"
         self._revoked = folder / "revoked"
         folder.mkdir(parents=True, exist_ok=True)
@@ -95,7 +98,8 @@ class Registry:
         return done
 
     def _signer(self, step: Step | None) -> ca.KeyPair:
-        current, coming = self._authority / "ca", self._authority / "next"
+        current = self._authority / "ca"
+        coming = self._authority / "next"
         if step == "next" and ca.read(coming) is None:
             ca.new_authority(self._terms.ca_days, self._now).write(coming)
         if step == "switch":
@@ -116,10 +120,8 @@ class Registry:
 
     def _switch(self) -> None:
         """Let the next authority sign; an interrupted call can be repeated."""
-        following, leaving = (
-            ca.read(self._authority / "next"),
-            ca.read_certificate(self._authority / "ca.pem"),
-        )
+        following = ca.read(self._authority / "next")
+        leaving = ca.read_certificate(self._authority / "ca.pem")
         if following is None or leaving is None:
             raise InputError(
                 "ca",

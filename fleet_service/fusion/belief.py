@@ -28,7 +28,9 @@ from schemas.runtime.jit import compiled, refcount_free_inlined
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
 
-BOUND, VALUE = 0, 1  # kinds of vote
+# kinds of vote
+BOUND = 0
+VALUE = 1
 _BINS: Final = mugrid.BINS
 _DIFFUSION: Final = (
     0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
@@ -61,7 +63,8 @@ def bias_kernel() -> FloatArray:
 
 def _taps() -> Float32Array:
     """B by diagonals: (2·REACH + 1, 32), so that bins stand beside each other."""
-    kernel, taps = bias_kernel(), np.zeros((2 * REACH + 1, _BINS), np.float32)
+    kernel = bias_kernel()
+    taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
     for i in range(_BINS):
         for j in range(max(i - REACH, 0), min(i + REACH + 1, _BINS)):
             taps[j - i + REACH, i] = kernel[i, j]
@@ -81,7 +84,9 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
         for i in range(_BINS):
             whole += belief[k, i]
         for j in range(len(levels)):
-            target, below, place = levels[j] * whole, 0.0, 0
+            target = levels[j] * whole
+            below = 0.0
+            place = 0
             while place < _BINS - 1 and below + belief[k, place] < target:
                 below += belief[k, place]
                 place += 1
@@ -94,7 +99,14 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 @refcount_free_inlined
 def total(p: Bins) -> float:
     """Sum of 32 numbers, in eight strands: a single one waits for itself."""
-    a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
+    a = p[0]
+    b = p[1]
+    d = p[2]
+    e = p[3]
+    f = p[4]
+    g = p[5]
+    h = p[6]
+    j = p[7]
     for i in range(8, _BINS, 8):
         a += p[i]
         b += p[i + 1]
@@ -110,7 +122,14 @@ def total(p: Bins) -> float:
 @refcount_free_inlined
 def largest(p: Bins) -> float:
     """Largest of 32 numbers, in eight strands."""
-    a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
+    a = p[0]
+    b = p[1]
+    d = p[2]
+    e = p[3]
+    f = p[4]
+    g = p[5]
+    h = p[6]
+    j = p[7]
     for i in range(8, _BINS, 8):
         a = p[i] if p[i] > a else a
         b = p[i + 1] if p[i + 1] > b else b
@@ -216,7 +235,8 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 @refcount_free_inlined
 def vote(p: Bins, likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
-    s, rest = np.float32(strength), np.float32(1.0 - strength)
+    s = np.float32(strength)
+    rest = np.float32(1.0 - strength)
     for i in range(_BINS):
         p[i] *= s * likelihood[i] + rest
 
@@ -224,8 +244,14 @@ def vote(p: Bins, likelihood: Bins, strength: float) -> None:
 @refcount_free_inlined
 def mean_of(likelihood: Bins) -> float:
     """Mean of a likelihood of mean 1 against the uniform prior."""
-    a, b, d, e = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    f, g, h, j = a, a, a, a
+    a = np.float32(0.0)
+    b = np.float32(0.0)
+    d = np.float32(0.0)
+    e = np.float32(0.0)
+    f = a
+    g = a
+    h = a
+    j = a
     for i in range(0, _BINS, 8):
         a += likelihood[i] * _PLACES[i]
         b += likelihood[i + 1] * _PLACES[i + 1]
@@ -241,7 +267,8 @@ def mean_of(likelihood: Bins) -> float:
 @refcount_free_inlined
 def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
-    second, slippery = 0.0, 0.0
+    second = 0.0
+    slippery = 0.0
     for i in range(_BINS):
         second += likelihood[i] * (_CENTRES[i] - mean) ** 2
         slippery += likelihood[i] * SLIPPERY_SHARE[i]

@@ -86,7 +86,9 @@ class Fusion:
 
     def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
         """Go on from an epoch, the standings since, and the weather; the store is set before."""
-        self._epoch, self.standings, self.reports = epoch, standings, reports
+        self._epoch = epoch
+        self.standings = standings
+        self.reports = reports
         self._weather = weather_of(reports)
         self._find_shape()
 
@@ -150,13 +152,15 @@ class Fusion:
                 0,
             )
         else:
-            late, late_by = before.late, before.late_by
+            late = before.late
+            late_by = before.late_by
         old = late_by > 0
         if old.any():
             o = delayed(o, late_by, self._weather)
         left = late & ~old
         vehicle = self.store.vehicles_of(o.vehicle)
-        epoch, touched = o.time // c.EPOCH_NS, [np.zeros(0, np.int64)]
+        epoch = o.time // c.EPOCH_NS
+        touched = [np.zeros(0, np.int64)]
         for e in distinct(epoch[~left]).tolist():
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
@@ -169,7 +173,8 @@ class Fusion:
                 o, rows, arrivals, c.WAITING_MOST if before is None else _ANY
             )
             touched.append(slots)
-            late, left = late | left_out, left | left_out
+            late = late | left_out
+            left = left | left_out
         used[left] = 0.0
         late_by = np.where(left, 0, late_by)
         return Updated(late, late_by, used, distinct(np.concatenate(touched)))
@@ -249,7 +254,8 @@ class Fusion:
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
         """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does not count."""
-        row, reporters = self.live.reporters[slots], self.store.state.live.reporters
+        row = self.live.reporters[slots]
+        reporters = self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
         trusted = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
@@ -288,7 +294,7 @@ class Fusion:
 
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
-    ) -> tuple[IntArray, BoolArray]:  # fmt: skip
+    ) -> tuple[IntArray, BoolArray]:
         rows = rows[
             np.argsort(o.time[rows], kind="stable")
         ]  # in the order of time nothing has to be computed anew
@@ -306,17 +312,28 @@ class Fusion:
 
 def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: BoolArray) -> Arrivals:
     return Arrivals(
-        time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
-        evidence=o.evidence, reported=o.reported, used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
-        shared=shared_parts(o.reported), manoeuvre=o.manoeuvre, late=old,
-    )  # fmt: skip
+        time=o.time,
+        number=o.vehicle,
+        boot=o.boot,
+        sequence=o.sequence,
+        vehicle=vehicle,
+        weight=weight,
+        evidence=o.evidence,
+        reported=o.reported,
+        used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
+        shared=shared_parts(o.reported),
+        manoeuvre=o.manoeuvre,
+        late=old,
+    )
 
 
 def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """Votes of some observations: row, key and share; those of other cells and of a second sector too; by time."""
     own = 1.0 - o.other_share[rows].sum(axis=1)
     key = o.cell[rows] * grid.SECTORS
-    at, keys, share = [rows], [key + o.sector[rows]], [own]
+    at = [rows]
+    keys = [key + o.sector[rows]]
+    share = [own]
     second = np.flatnonzero(o.second[rows] >= 0)
     if len(second):
         at.append(rows[second])
@@ -348,7 +365,8 @@ def _slippery(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
     for k in range(len(slots)):
         unpack(live.belief, slots[k], p)
         weight = weights[kernel_of(live.cells, slots[k])]
-        slippery, whole = 0.0, 0.0
+        slippery = 0.0
+        whole = 0.0
         for i in range(len(p)):
             slippery += weight[0, i] * p[i]
             whole += weight[1, i] * p[i]

@@ -31,7 +31,7 @@ from fleet_service.fusion.store.records import (
     WINDOW,
     Rows,
     State,
-)  # fmt: skip
+)
 from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.weather import Reports
 from schemas import mugrid
@@ -40,9 +40,16 @@ from schemas.runtime.records import RecordArray
 
 Image = dict[str, dict[str, NDArray[Any]]]
 _RECORDS: Final = {
-    "cells": CELL, "base_cells": CELL, "base_sources": SOURCE, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR,
-    "reporters": REPORTER, "peers": PEER, "names": VEHICLE,
-}  # fmt: skip
+    "cells": CELL,
+    "base_cells": CELL,
+    "base_sources": SOURCE,
+    "windows": WINDOW,
+    "entries": ENTRY,
+    "pairs": PAIR,
+    "reporters": REPORTER,
+    "peers": PEER,
+    "names": VEHICLE,
+}
 LAYOUT: Final = hashlib.blake2b(
     repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8
 ).hexdigest()
@@ -50,14 +57,21 @@ LAYOUT: Final = hashlib.blake2b(
 
 def image_of(fusion: Fusion) -> Image:
     """Everything that a fusion holds. Windows, entries and pairs keep their places, since they point at each other."""
-    store, state = fusion.store, fusion.store.state
-    live, base = state.live, state.base
+    store = fusion.store
+    state = fusion.store.state
+    live = state.live
+    base = state.base
     records = {
-        "cells": live.cells[: store.size], "base_cells": base.cells, "base_sources": base.reporters,
-        "windows": state.windows, "entries": state.entries, "pairs": state.pairs,
+        "cells": live.cells[: store.size],
+        "base_cells": base.cells,
+        "base_sources": base.reporters,
+        "windows": state.windows,
+        "entries": state.entries,
+        "pairs": state.pairs,
         "reporters": live.reporters[: int(state.used[REPORTERS_USED])],
-        "peers": store.peers[: store.vehicles], "names": store.names[: store.vehicles],
-    }  # fmt: skip
+        "peers": store.peers[: store.vehicles],
+        "names": store.names[: store.vehicles],
+    }
     image: Image = {name: {"bytes": _bytes(array)} for name, array in records.items()}
     image["belief"] = {"bins": live.belief[: store.size].reshape(-1)}
     image["base_belief"] = {"bins": base.belief.reshape(-1)}
@@ -92,15 +106,21 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     size, vehicles, hour, epoch = image["used"]["more"].tolist()
     state = State(
         live=Rows(_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]),
-        base=Rows(_beliefs(image["base_belief"]["bins"]), records["base_cells"], records["base_sources"]),
-        windows=records["windows"], free_windows=_padded(image["free_windows"]["row"], len(records["windows"])),
-        entries=records["entries"], free_entries=_padded(image["free_entries"]["row"], len(records["entries"])),
-        pairs=records["pairs"], used=image["used"]["count"].copy(),
-    )  # fmt: skip
+        base=Rows(
+            _beliefs(image["base_belief"]["bins"]), records["base_cells"], records["base_sources"]
+        ),
+        windows=records["windows"],
+        free_windows=_padded(image["free_windows"]["row"], len(records["windows"])),
+        entries=records["entries"],
+        free_entries=_padded(image["free_entries"]["row"], len(records["entries"])),
+        pairs=records["pairs"],
+        used=image["used"]["count"].copy(),
+    )
     fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
-    epochs, newcomers = image["trusts"]["epoch"].tolist(), image["trusts"]["newcomer"].tolist()
+    epochs = image["trusts"]["epoch"].tolist()
+    newcomers = image["trusts"]["newcomer"].tolist()
     standings = [Standing(*of) for of in zip(epochs, weights, newcomers, strict=True)]
     columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
     columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)

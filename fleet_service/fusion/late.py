@@ -58,7 +58,8 @@ def aged_evidence(
 ) -> ByteArray:
     """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same roads at `end` [ns]."""
     out = np.empty_like(evidence)
-    likelihood, padded = np.empty(mugrid.BINS, np.float32), np.empty(PADDED, np.float32)
+    likelihood = np.empty(mugrid.BINS, np.float32)
+    padded = np.empty(PADDED, np.float32)
     for n in range(len(evidence)):
         whole = np.float32(0.0)
         for i in range(mugrid.BINS):

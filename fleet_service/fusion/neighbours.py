@@ -56,7 +56,8 @@ _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
 @refcount_free_inlined
 def stepped(cell: int, heading: int) -> int:
     """The next cell in a sector's direction; the date line is no border."""
-    x, y = cell & _X, cell & _Y
+    x = cell & _X
+    y = cell & _Y
     if heading == _EAST:
         x = ((x | _Y) + 1) & _X
     elif heading == _WEST:
@@ -70,11 +71,19 @@ def stepped(cell: int, heading: int) -> int:
 
 @compiled
 def beliefs(
-    live: Rows, table: IntArray, weather: Weather, kernels: Float32Array, slots: IntArray, now: IntArray
-) -> FloatArray:  # fmt: skip
+    live: Rows,
+    table: IntArray,
+    weather: Weather,
+    kernels: Float32Array,
+    slots: IntArray,
+    now: IntArray,
+) -> FloatArray:
     """Belief of each slot about its road at a time of its own [ns], (k, 32); `table` finds slots by key."""
-    out, scratch = np.empty((len(slots), _BINS)), np.empty((3, SCRATCH))
-    p, message, road = np.empty(_BINS), np.empty(_BINS), np.empty(_BINS)
+    out = np.empty((len(slots), _BINS))
+    scratch = np.empty((3, SCRATCH))
+    p = np.empty(_BINS)
+    message = np.empty(_BINS)
+    road = np.empty(_BINS)
     for k in range(len(slots)):
         prior = _aged(live, weather, slots[k], now[k], scratch)
         p[:] = scratch[P, :_BINS]
@@ -82,12 +91,15 @@ def beliefs(
         slippery = _slippery(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
-        informative, unknown = False, _slippery(weather.prior[prior])
+        informative = False
+        unknown = _slippery(weather.prior[prior])
         key = live.cells[slots[k]].key
-        cell, sector = key // grid.SECTORS, key % grid.SECTORS
+        cell = key // grid.SECTORS
+        sector = key % grid.SECTORS
         back = (sector + 2) % grid.SECTORS
         for side in range(3):
-            most, there = 0.0, cell
+            most = 0.0
+            there = cell
             for step in range(1, c.NEIGHBOURS + 1):
                 if (
                     side == 2
@@ -137,7 +149,8 @@ def _slippery(road: Bins) -> float:
 @refcount_free_inlined
 def _kept(live: Rows, row: int) -> float:
     """P(slippery) of a belief at rest, which costs a tenth of reading it."""
-    whole, slippery = 0.0, 0.0
+    whole = 0.0
+    slippery = 0.0
     for i in range(_BINS):
         whole += live.belief[row, i]
         slippery += SLIPPERY_SHARE[i] * live.belief[row, i]
@@ -148,7 +161,8 @@ def _kept(live: Rows, row: int) -> float:
 def _aged(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
     """What the fleet takes a slot's road for, with what time did to it until `now` [ns], into the scratch; returns the
     row of its region's prior."""
-    cells, p = live.cells, scratch[P]
+    cells = live.cells
+    p = scratch[P]
     unpack(live.belief, slot, p)
     seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
     drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)

@@ -31,7 +31,8 @@ class Evidence(NamedTuple):
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
     """Likelihoods (n, 32) in steps, brought to maximum 0, and the values among them described."""
-    out, reported = steps.astype(np.uint8), np.full((len(steps), 3), np.nan, np.float32)
+    out = steps.astype(np.uint8)
+    reported = np.full((len(steps), 3), np.nan, np.float32)
     _describe(out, reported)
     return Evidence(out, reported)
 
@@ -48,7 +49,10 @@ def _describe(steps: ByteArray, reported: Float32Array) -> None:
             likelihood[j] = _LIKELIHOOD[steps[n, j]]
         if steps[n, mugrid.BINS - 1] < c.VALUE_DROP_STEPS:
             continue
-        whole, first, second, slippery = 0.0, 0.0, 0.0, 0.0
+        whole = 0.0
+        first = 0.0
+        second = 0.0
+        slippery = 0.0
         for i in range(mugrid.BINS):
             whole += likelihood[i]
             first += likelihood[i] * mugrid.CENTRES[i]

@@ -62,7 +62,8 @@ def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.in
 
 def shared_parts(reported: Float32Array) -> ByteArray:
     """Return σ_s of values (n, 3) in parts of 1/SHARED; 0 of bounds."""
-    mean, std = np.nan_to_num(reported[:, 0], nan=1.0), np.nan_to_num(reported[:, 1])
+    mean = np.nan_to_num(reported[:, 0], nan=1.0)
+    std = np.nan_to_num(reported[:, 1])
     stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
     hidden = c.SHARED_PART * np.clip(stated, 0.0, 0.25)
     return np.asarray((np.clip(np.sqrt(hidden), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
@@ -143,19 +144,22 @@ def shape_class(slope: float) -> int:
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
     """Which kernel reads a row of cells."""
-    whole, squares = 0.0, 0.0
+    whole = 0.0
+    squares = 0.0
     for k in range(MANOEUVRES):
         weight = float(cells[row].manoeuvres[k])
         whole += weight
         squares += weight * weight
     if whole == 0.0:
         return 0
-    kinds, column = whole * whole / squares, 0
+    kinds = whole * whole / squares
+    column = 0
     for k in range(1, len(KINDS)):
         if kinds >= KINDS[k]:
             column = k
     used = min(int(cells[row].used / (USED * USED_STEP)), USED_ROWS - 1)
-    stated, place = cells[row].shared / SHARED, 0
+    stated = cells[row].shared / SHARED
+    place = 0
     for border in _BORDERS:
         place += stated >= border
     return 1 + (used * len(KINDS) + column) * len(STATED) + place
@@ -185,14 +189,16 @@ def note_value(
 ) -> None:
     """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
     is, the less it counts."""
-    used, shared = entries[entry].used / USED, entries[entry].shared / SHARED
+    used = entries[entry].used / USED
+    shared = entries[entry].shared / SHARED
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
     weight = (
         strength
         * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2
         / (1.0 + (shared / c.SHARED_WIDE) ** 2)
     )
-    before, largest = 0.0, 0
+    before = 0.0
+    largest = 0
     for k in range(MANOEUVRES):
         before += cells[row].manoeuvres[k]
         if cells[row].manoeuvres[k] > cells[row].manoeuvres[largest]:

@@ -29,23 +29,22 @@ _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) 
 
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
-) -> tuple[IntArray, Float32Array]:  # fmt: skip
+) -> tuple[IntArray, Float32Array]:
     """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n, 2·SPREAD_CELLS).
 
     -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and in another region,
     which another service may hold. The probabilities leave at least nothing for `cell`: no vote is doubled.
     """
-    cosine, sine = np.cos(np.nan_to_num(yaw)), np.sin(np.nan_to_num(yaw))
+    cosine = np.cos(np.nan_to_num(yaw))
+    sine = np.sin(np.nan_to_num(yaw))
     steep = np.maximum(np.abs(cosine), np.abs(sine))
     side = _EARTH_M / (1 << grid.CELL_ZOOM) * np.cos(np.radians(np.clip(latitude, -85.0, 85.0)))
     share = shares(np.nan_to_num(position_std), side / steep)
     x, y = grid.deinterleave(cell)
     n = 1 << grid.CELL_ZOOM
     ahead = np.rint(_STEPS * (cosine / steep)[:, None]), np.rint(_STEPS * (-sine / steep)[:, None])
-    columns, rows = (
-        (x[:, None] + ahead[0].astype(np.int64)) % n,
-        y[:, None] + ahead[1].astype(np.int64),
-    )
+    columns = (x[:, None] + ahead[0].astype(np.int64)) % n
+    rows = y[:, None] + ahead[1].astype(np.int64)
     other = grid.interleave(columns, np.clip(rows, 0, n - 1))
     good = (share >= c.SPREAD_LEAST) & np.isfinite(yaw)[:, None] & (rows >= 0) & (rows < n)
     good &= grid.region_of(other) == grid.region_of(cell)[:, None]

@@ -40,8 +40,13 @@ _LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
 
 @refcount_free
 def compare(
-    reporters: RecordArray, row: int, peers: RecordArray, names: RecordArray, entries: RecordArray, entry: int
-) -> None:  # fmt: skip
+    reporters: RecordArray,
+    row: int,
+    peers: RecordArray,
+    names: RecordArray,
+    entries: RecordArray,
+    entry: int,
+) -> None:
     """Compare a value with those that others gave here lately; it takes the place of its vehicle's own, or the oldest.
 
     `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere, or comes late, is compared with
@@ -50,10 +55,14 @@ def compare(
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:
         return
-    vehicle, now = int(entries[entry].vehicle), entries[entry].time // NS
-    mean, std = float(entries[entry].mean), float(entries[entry].std)
-    reporter, reported = here.reporter, here.time
-    used, place = entries[entry].used / USED, 0
+    vehicle = int(entries[entry].vehicle)
+    now = entries[entry].time // NS
+    mean = float(entries[entry].mean)
+    std = float(entries[entry].std)
+    reporter = here.reporter
+    reported = here.time
+    used = entries[entry].used / USED
+    place = 0
     for k in range(c.REPORTERS):
         if reporter[k] == vehicle:
             place = k
@@ -152,12 +161,16 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
 @compiled
 def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
     """Fill the weights of vehicles (V,), from those `before`; returns whether the service is established."""
-    known, trusted = np.empty(len(out), np.bool_), 0
+    known = np.empty(len(out), np.bool_)
+    trusted = 0
     for v in range(len(out)):
-        this, heard, agreed = peers[v], 0.0, 0.0
+        this = peers[v]
+        heard = 0.0
+        agreed = 0.0
         for k in range(c.PEERS):
             if this.other[k] != NOBODY:
-                theirs, met = float(before[this.other[k]]), float(this.met[k])
+                theirs = float(before[this.other[k]])
+                met = float(this.met[k])
                 weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
                 heard += weight
                 agreed += weight * float(this.agreed[k]) / max(met, 1.0)

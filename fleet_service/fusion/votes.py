@@ -23,7 +23,7 @@ from fleet_service.fusion.belief import (
     pack,
     unpack,
     vote,
-)  # fmt: skip
+)
 from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade, note_value
 from fleet_service.fusion.store.pairs import returning
 from fleet_service.fusion.store.records import (
@@ -45,7 +45,9 @@ from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and `convolve_bias`, the likelihood.
-P, PADDED, LIKELIHOOD = 0, 1, 2
+P = 0
+PADDED = 1
+LIKELIHOOD = 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
 _GRIP_MEAN: Final = 0.5 * (
@@ -63,7 +65,8 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 
     What was `reported` (3,) is a value, and described as it was reported, whatever of it is used.
     """
-    evidence, likelihood = entries[entry].evidence, scratch[LIKELIHOOD]
+    evidence = entries[entry].evidence
+    likelihood = scratch[LIKELIHOOD]
     known = not math.isnan(reported[0])
     kind = VALUE if known else kind_of(evidence)
     entries[entry].kind = kind
@@ -103,26 +106,35 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
     Times are whole seconds from either, so that it does not matter which.
     """
-    kind, pair = int(entries[entry].kind), entries[entry].pair
+    kind = int(entries[entry].kind)
+    pair = entries[entry].pair
     now = entries[entry].time // NS
     least = now - now % _HOUR - _FORGOTTEN
-    time, mean, std, spent = 0, np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    time = 0
+    mean = np.float32(0.0)
+    std = np.float32(0.0)
+    spent = np.float32(0.0)
     earlier = entries[entry].before
     seen = earlier != NONE
     while earlier != NONE and entries[earlier].kind != kind:
         earlier = entries[earlier].before
     if earlier != NONE:
-        time, mean = entries[earlier].time // NS, _coarse(entries[earlier].last_mean)
-        std, spent = _coarse(entries[earlier].last_std), _coarse(entries[earlier].spent)
+        time = entries[earlier].time // NS
+        mean = _coarse(entries[earlier].last_mean)
+        std = _coarse(entries[earlier].last_std)
+        spent = _coarse(entries[earlier].spent)
     else:
         seen = (
             seen
             or pairs[pair].time[BOUND] >= max(least, 1)
             or pairs[pair].time[VALUE] >= max(least, 1)
         )
-        time, mean = int(pairs[pair].time[kind]), _coarse(pairs[pair].mean[kind])
-        std, spent = _coarse(pairs[pair].std), _coarse(pairs[pair].spent[kind])
-    new_mean, new_std = entries[entry].mean, max(entries[entry].std, np.float32(c.NOVELTY_STD))
+        time = int(pairs[pair].time[kind])
+        mean = _coarse(pairs[pair].mean[kind])
+        std = _coarse(pairs[pair].std)
+        spent = _coarse(pairs[pair].spent[kind])
+    new_mean = entries[entry].mean
+    new_std = max(entries[entry].std, np.float32(c.NOVELTY_STD))
     power = np.float32(1.0)
     if time > 0 and time >= least:
         renewed = -math.expm1(-max(now - time, 0) / c.VOTE_RENEWAL_S)
@@ -168,12 +180,23 @@ def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float
 
 @refcount_free
 def update(
-    rows: Rows, row: int, sources: int, entries: RecordArray, entry: int, weather: Weather, scratch: Bins
-) -> None:  # fmt: skip
+    rows: Rows,
+    row: int,
+    sources: int,
+    entries: RecordArray,
+    entry: int,
+    weather: Weather,
+    scratch: Bins,
+) -> None:
     """Update a row of cells by one entry, whose likelihood is in the scratch; `sources` is where its sources lie."""
-    belief, cells = rows.belief, rows.cells
-    time, kind = entries[entry].time, int(entries[entry].kind)
-    key, p, seconds, passed = cells[row].key, scratch[P], 0.0, 0.0
+    belief = rows.belief
+    cells = rows.cells
+    time = entries[entry].time
+    kind = int(entries[entry].kind)
+    key = cells[row].key
+    p = scratch[P]
+    seconds = 0.0
+    passed = 0.0
     unpack(belief, row, p)
     new = cells[row].time == 0
     if new:
@@ -185,7 +208,8 @@ def update(
         passed = (time - cells[row].time) * 1e-9
         seconds = max(passed, 0.0) + cells[row].aged / AGED
         fade(cells, row, cells[row].time, time)
-    change, prior = 0.0, 0
+    change = 0.0
+    prior = 0
     cells[row].aged = _aged(seconds)
     if seconds >= c.FORGET_S:
         drift, change, prior = aged(weather, key, time - int(seconds * NS), time)
@@ -237,7 +261,8 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
     explains the value as well as max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum
     one.
     """
-    evidence, used = entries[entry].evidence, entries[entry].used / USED
+    evidence = entries[entry].evidence
+    used = entries[entry].used / USED
     least = math.inf
     for i in range(_GRIP_BIN, mugrid.BINS):
         road = mugrid.CENTRES[i]
@@ -287,7 +312,8 @@ def _untrusted_weight(
 @refcount_free
 def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
     """Note a corroborating source: at its own place if it has one, else at that of the oldest."""
-    source, source_time = reporters[row].source, reporters[row].source_time
+    source = reporters[row].source
+    source_time = reporters[row].source_time
     place = 0
     for k in range(SOURCES):
         if source[side, k] == vehicle:

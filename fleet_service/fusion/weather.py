@@ -85,15 +85,15 @@ def rates(reports: Reports) -> FloatArray:
         reports.air_temperature - AIR_ABOVE_ROAD_C,
         reports.road_temperature,
     )
-    wet, dry = (
-        reports.precipitation >= WET_MM_H,
-        reports.precipitation < WET_MM_H,
-    )  # both False where unknown
+    # both False where unknown
+    wet = reports.precipitation >= WET_MM_H
+    dry = reports.precipitation < WET_MM_H
     freezing = (road >= FREEZING_C[0]) & (road <= FREEZING_C[1])
     change = np.select(
         [wet & freezing, wet, freezing, dry & (road >= STEADY_C)],
-        [FREEZING_CHANGE, WET_CHANGE, FROST_CHANGE, STEADY_CHANGE], 1.0,
-    )  # fmt: skip
+        [FREEZING_CHANGE, WET_CHANGE, FROST_CHANGE, STEADY_CHANGE],
+        1.0,
+    )
     return np.stack([np.where(wet, WET_DRIFT, 1.0), change], axis=1)
 
 
@@ -112,7 +112,8 @@ def weather_of(reports: Reports) -> Weather:
         np.diff(reports.time[last]) != 0, True
     )
     reports = reports.take(last[keep[: len(last)]])
-    rate, prior = rates(reports), priors(reports)
+    rate = rates(reports)
+    prior = priors(reports)
     rows: list[tuple[int, float, float, Float32Array]] = [
         (0, 1.0, 1.0, mugrid.PRIOR.astype(np.float32))
     ]
@@ -149,7 +150,8 @@ def _clocked(
 
 def no_reports() -> Reports:
     """Nothing known of any region."""
-    nothing, never = np.zeros(0, np.int64), np.zeros(0)
+    nothing = np.zeros(0, np.int64)
+    never = np.zeros(0)
     return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))
 
 
@@ -166,8 +168,11 @@ def aged(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float
     k = np.searchsorted(weather.region, region)
     if k == len(weather.region) or weather.region[k] != region:
         return seconds, seconds, 0
-    first, last = weather.start[k], weather.start[k + 1]
-    drift, change, row = 0.0, 0.0, 0
+    first = weather.start[k]
+    last = weather.start[k + 1]
+    drift = 0.0
+    change = 0.0
+    row = 0
     for time, sign in ((begin, -1.0), (end, 1.0)):
         place = first + np.searchsorted(weather.time[first:last], time, side="right") - 1
         row = place if place >= first else 0

@@ -25,7 +25,7 @@ from fleet_service.fusion.store.records import (
     REPORTERS_USED,
     Int32Array,
     State,
-)  # fmt: skip
+)
 from fleet_service.fusion.store.table import AHEAD, first_place
 from fleet_service.fusion.trust import compare
 from fleet_service.fusion.votes import (
@@ -90,7 +90,8 @@ def absorb(
     Every pool must have k free places. Returns which observations (n,) were left out, because `most` of their vehicle
     wait in their cell already; of the votes of an observation its own cell's decides.
     """
-    n, k = len(arrivals.time), len(votes.row)
+    n = len(arrivals.time)
+    k = len(votes.row)
     marks = Marks(np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.empty(k, np.int32))
     scratch = np.zeros((3, SCRATCH), np.float32)
     waiting = _absorb(state, weather, arrivals, votes, most, marks, scratch)
@@ -100,15 +101,25 @@ def absorb(
 
 @refcount_free
 def _absorb(
-    state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int, marks: Marks, scratch: Bins
-) -> int:  # fmt: skip
+    state: State,
+    weather: Weather,
+    arrivals: Arrivals,
+    votes: Votes,
+    most: int,
+    marks: Marks,
+    scratch: Bins,
+) -> int:
     """Fills the marks; returns how many windows are stale."""
-    cells, windows, entries, pairs = state.live.cells, state.windows, state.entries, state.pairs
+    cells = state.live.cells
+    windows = state.windows
+    entries = state.entries
+    pairs = state.pairs
     waiting = 0
     for k in range(len(votes.row)):
         if k % AHEAD == 0:
             _prefetch(state, arrivals, votes, k, min(k + AHEAD, len(votes.row)))
-        row, slot = votes.row[k], votes.slot[k]
+        row = votes.row[k]
+        slot = votes.slot[k]
         if marks.left_out[row]:
             continue
         pair = pair_of(pairs, state.used, slot, arrivals.vehicle[row])
@@ -145,20 +156,18 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
-    new.vehicle, new.weight, new.time = (
-        arrivals.vehicle[row],
-        arrivals.weight[row],
-        arrivals.time[row],
-    )
-    new.number, new.boot, new.sequence = (
-        arrivals.number[row],
-        arrivals.boot[row],
-        arrivals.sequence[row],
-    )
+    new.vehicle = arrivals.vehicle[row]
+    new.weight = arrivals.weight[row]
+    new.time = arrivals.time[row]
+    new.number = arrivals.number[row]
+    new.boot = arrivals.boot[row]
+    new.sequence = arrivals.sequence[row]
     for i in range(arrivals.evidence.shape[1]):
         new.evidence[i] = arrivals.evidence[row, i]
-    new.used, new.shared = arrivals.used[row], arrivals.shared[row]
-    new.manoeuvre, new.late = arrivals.manoeuvre[row], arrivals.late[row]
+    new.used = arrivals.used[row]
+    new.shared = arrivals.shared[row]
+    new.manoeuvre = arrivals.manoeuvre[row]
+    new.late = arrivals.late[row]
     return entry
 
 
@@ -168,7 +177,10 @@ def _prefetch(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: i
 
     No branch waits for memory: a processor that guesses it wrongly forgets what it has fetched meanwhile.
     """
-    live, base, windows, used = state.live, state.base, state.windows, state.used
+    live = state.live
+    base = state.base
+    windows = state.windows
+    used = state.used
     for k in range(begin, end):
         slot = votes.slot[k]
         prefetch(live.cells, slot, 0)
@@ -197,9 +209,14 @@ def _open_window(state: State, slot: int) -> int:
     """A window for a slot that has none, with its row as it is."""
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
-    live, new = state.live, state.windows[window]
+    live = state.live
+    new = state.windows[window]
     live.cells[slot].window = window
-    new.slot, new.head, new.tail, new.stale, new.values = slot, NONE, NONE, 0, 0
+    new.slot = slot
+    new.head = NONE
+    new.tail = NONE
+    new.stale = 0
+    new.values = 0
     copy_row(live, slot, state.base, window)
     reporters = live.cells[slot].reporters
     if reporters != NONE:
@@ -220,7 +237,9 @@ def _open_reporters(state: State, slot: int, window: int) -> None:
 
 @refcount_free
 def _recompute(state: State, weather: Weather, stale: Int32Array, scratch: Bins) -> None:
-    live, windows, entries = state.live, state.windows, state.entries
+    live = state.live
+    windows = state.windows
+    entries = state.entries
     for window in stale:
         slot = int(windows[window].slot)
         reporters = live.cells[slot].reporters
@@ -237,8 +256,13 @@ def _recompute(state: State, weather: Weather, stale: Int32Array, scratch: Bins)
 
 
 def commit(
-    state: State, weather: Weather, peers: RecordArray, names: RecordArray, due_windows: IntArray, before: int
-) -> None:  # fmt: skip
+    state: State,
+    weather: Weather,
+    peers: RecordArray,
+    names: RecordArray,
+    due_windows: IntArray,
+    before: int,
+) -> None:
     """Let the checkpoint pass to `before` [ns] in the windows (k,), one after the other: older entries leave them."""
     _commit(state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32))
 
@@ -246,7 +270,10 @@ def commit(
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
     """Prefetch all that the commit of windows `begin` to `end` will touch, in the same way."""
-    live, base, windows, entries = state.live, state.base, state.windows, state.entries
+    live = state.live
+    base = state.base
+    windows = state.windows
+    entries = state.entries
     for k in range(begin, end):
         prefetch(windows, due_windows[k], 0)
     for k in range(begin, end):
@@ -272,10 +299,17 @@ def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> 
 
 @refcount_free
 def _commit(
-    state: State, weather: Weather, peers: RecordArray, names: RecordArray, due_windows: IntArray, before: int,
+    state: State,
+    weather: Weather,
+    peers: RecordArray,
+    names: RecordArray,
+    due_windows: IntArray,
+    before: int,
     scratch: Bins,
-) -> None:  # fmt: skip
-    live, windows, entries = state.live, state.windows, state.entries
+) -> None:
+    live = state.live
+    windows = state.windows
+    entries = state.entries
     for k in range(len(due_windows)):
         if k % AHEAD == 0:
             _prefetch_due(state, due_windows, k, min(k + AHEAD, len(due_windows)))

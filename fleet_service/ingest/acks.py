@@ -81,9 +81,11 @@ class Acks:
 
 
 def _parts(
-    stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...],
+    stream: AckedStream,
+    durable: tuple[tuple[int, int], ...],
+    rejected: tuple[tuple[int, int, str], ...],
     late: tuple[tuple[int, int], ...],
-) -> Iterator[StreamAck]:  # fmt: skip
+) -> Iterator[StreamAck]:
     """Yield the due acknowledgements of a stream in pieces."""
     for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)

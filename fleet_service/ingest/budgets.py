@@ -30,7 +30,8 @@ class Bucket:
     """Budgets by vehicle: an amount at once, and an amount per hour."""
 
     def __init__(self, at_once: float, per_hour: float) -> None:
-        self._at_once, self._rate = at_once, per_hour / HOUR
+        self._at_once = at_once
+        self._rate = per_hour / HOUR
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
@@ -55,7 +56,8 @@ class NewCells:
         """Return rows (n,) in new cells beyond their vehicle's budget; the others are charged. now [s]."""
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))
-        who, where = vehicle[order], cell[order]
+        who = vehicle[order]
+        where = cell[order]
         starts = np.flatnonzero(np.diff(who, prepend=who[:1] - 1))
         counts = np.diff(starts, append=len(who))
         place = np.cumsum(np.diff(where, prepend=where[:1]) != 0)

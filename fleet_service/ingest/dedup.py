@@ -41,8 +41,12 @@ class SequenceTracker:
     __slots__ = ("boot", "key", "low", "newest", "seen", "vehicle", "witness")
 
     def __init__(self, key: StreamKey) -> None:
-        self.key, self.vehicle, self.boot, self.witness = key, "", 0, 0
-        self.low, self.newest = 0, 0
+        self.key = key
+        self.vehicle = ""
+        self.boot = 0
+        self.witness = 0
+        self.low = 0
+        self.newest = 0
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
@@ -141,11 +145,14 @@ class SequenceTrackers:
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
         table = {
-            "vehicle": [stream.key[0] for stream in streams], "boot": [stream.key[1] for stream in streams],
+            "vehicle": [stream.key[0] for stream in streams],
+            "boot": [stream.key[1] for stream in streams],
             "kind": [_KINDS.index(stream.key[2]) for stream in streams],
-            "region": [stream.key[3] for stream in streams], "low": [stream.low for stream in streams],
-            "newest": [stream.newest for stream in streams], "above": [len(seqs) for seqs in above],
-        }  # fmt: skip
+            "region": [stream.key[3] for stream in streams],
+            "low": [stream.low for stream in streams],
+            "newest": [stream.newest for stream in streams],
+            "above": [len(seqs) for seqs in above],
+        }
         return (
             {name: np.array(values, np.int64) for name, values in table.items()},
             np.array([seq for seqs in above for seq in seqs], np.int64),
@@ -154,13 +161,16 @@ class SequenceTrackers:
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
         """Restore the streams from the result of `columns`."""
-        out, at, seqs = SequenceTrackers(), 0, above.tolist()
+        out = SequenceTrackers()
+        at = 0
+        seqs = above.tolist()
         order = ("vehicle", "boot", "kind", "region", "low", "newest", "above")
         for vehicle, boot, kind, region, low, newest, n in zip(
             *(columns[name].tolist() for name in order), strict=True
         ):
             stream = out[vehicle, boot, _KINDS[kind], region]
-            stream.low, stream.newest = low, newest
+            stream.low = low
+            stream.newest = newest
             if n:
                 stream.seen = set(seqs[at : at + n])
                 at += n
@@ -172,9 +182,15 @@ class SequenceTrackers:
             del self._streams[key]
 
     def restore(
-        self, kind: Kind, vehicle: IntArray, boot: IntArray, region: IntArray,
-        seq: IntArray, first_held: IntArray, time: IntArray,
-    ) -> None:  # fmt: skip
+        self,
+        kind: Kind,
+        vehicle: IntArray,
+        boot: IntArray,
+        region: IntArray,
+        seq: IntArray,
+        first_held: IntArray,
+        time: IntArray,
+    ) -> None:
         """Record archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
         if not len(seq):
             return

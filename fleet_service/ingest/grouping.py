@@ -16,7 +16,9 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
     """Return the group of each row (n,), in order of first appearance, and the first row of each group (k,)."""
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)
-    group, first, k = np.empty(len(a), np.int32), np.empty(len(a), np.int64), 0
+    group = np.empty(len(a), np.int32)
+    first = np.empty(len(a), np.int64)
+    k = 0
     for i in range(len(a)):
         mixed = (np.uint64(a[i]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
             np.uint64(b[i]) * np.uint64(0xBF58476D1CE4E5B9)

@@ -79,14 +79,18 @@ class Inbox:
         self._queue: queue.SimpleQueue[Message] = (
             queue.SimpleQueue()
         )  # without locks in Python, a fifth of the cost
-        self._capacity, self._counts, self._limits = capacity, counts, limits
-        self._bytes, self._guard = 0, Lock()
+        self._capacity = capacity
+        self._counts = counts
+        self._limits = limits
+        self._bytes = 0
+        self._guard = Lock()
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
         """Return the subscriber's callback for one kind."""
 
         def take(sample: zenoh.Sample) -> None:
-            key, payload = str(sample.key_expr), sample.payload
+            key = str(sample.key_expr)
+            payload = sample.payload
             encoding = str(sample.encoding)
             if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(
                 key, len(payload), encoding
@@ -147,12 +151,10 @@ class BatchIntake:
     def __init__(
         self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks
     ) -> None:
-        self._streams, self._pseudonyms, self._counts, self._acks = (
-            streams,
-            pseudonyms,
-            counts,
-            acks,
-        )
+        self._streams = streams
+        self._pseudonyms = pseudonyms
+        self._counts = counts
+        self._acks = acks
         self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
@@ -160,7 +162,8 @@ class BatchIntake:
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {
             kind: {} for kind in Kind
         }
-        self._forgot, self._now = 0, 0.0
+        self._forgot = 0
+        self._now = 0.0
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
@@ -265,7 +268,9 @@ class BatchIntake:
         batches = zip(
             range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True
         )
-        known, pending, again = self._known[kind], self._pending, 0
+        known = self._known[kind]
+        pending = self._pending
+        again = 0
         for place, vehicle, boot, region, day, seq, first_held in compress(batches, good.tolist()):
             name = vehicle, boot, region, day
             stream = known.get(name) or self._look_up(kind, name, int(time[place]))
@@ -307,13 +312,16 @@ class BatchIntake:
             self._counts["too_many_streams"] += 1
             return None
         stream = self._known[kind][name] = self._streams[key]
-        stream.vehicle, stream.boot, stream.witness = vehicle, boot, witness
+        stream.vehicle = vehicle
+        stream.boot = boot
+        stream.witness = witness
         return stream
 
     def _rows(
         self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock
     ) -> AcceptedBatches:
-        batches, (rows, heads, sizes) = list(new), _select_batches(found, list(new.values()))
+        batches = list(new)
+        (rows, heads, sizes) = _select_batches(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
@@ -341,7 +349,9 @@ class BatchIntake:
                 good[place] = False
         if not good.all():
             rows = {name: column[good[owner]] for name, column in rows.items()}
-            batches, heads, sizes = list(compress(batches, good)), heads.take(good), sizes[good]
+            batches = list(compress(batches, good))
+            heads = heads.take(good)
+            sizes = sizes[good]
         self._pending.update(batches)
         return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
@@ -408,11 +418,13 @@ def _with_identity(
     """Return rows with the identity of their batches, for the archive."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
-        "vehicle": texts(numbers), "witness": np.array([stream.witness for stream, _ in batches], np.int64),
+        "vehicle": texts(numbers),
+        "witness": np.array([stream.witness for stream, _ in batches], np.int64),
         "estimator": np.array(heads.estimator, np.bytes_),
         "boot": np.array([stream.key[1] for stream, _ in batches], np.int64),
-        "seq": heads.seq, "first_held": heads.first_held,
-    }  # fmt: skip
+        "seq": heads.seq,
+        "first_held": heads.first_held,
+    }
     rows |= {name: np.repeat(values, sizes) for name, values in identity.items()}
     rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)
     if kind is Kind.STATE:

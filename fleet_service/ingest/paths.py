@@ -66,18 +66,18 @@ class VehiclePaths:
             self._grow()
         place = np.column_stack([latitude, longitude]).astype(np.float64)
         return _find_implausible(
-            row[inverse], np.asarray(time, np.int64), place,
+            row[inverse],
+            np.asarray(time, np.int64),
+            place,
             (self._time, self._place, self._is_gap, self._count, self._leap),
-        )  # fmt: skip
+        )
 
     def _grow(self) -> None:
-        time, place, is_gap, count, leap = (
-            self._time,
-            self._place,
-            self._is_gap,
-            self._count,
-            self._leap,
-        )
+        time = self._time
+        place = self._place
+        is_gap = self._is_gap
+        count = self._count
+        leap = self._leap
         rows = len(count)
         self._make_room(2 * rows)
         self._time[:rows] = time
@@ -96,7 +96,8 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
     anchors, places, is_gap, count, leap = paths
     out = np.zeros(len(row), np.bool_)
     for n in range(len(row)):
-        v, t = row[n], time[n]
+        v = row[n]
+        t = time[n]
         held = count[v]
         after = held
         while after > 0 and anchors[v, after - 1] > t:
@@ -107,7 +108,8 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
         if after < held:
             excess = max(excess, _excess(anchors[v, after] - t, places[v, after], place[n]))
         if 0 < after < held and is_gap[v, after - 1]:
-            there, back = places[v, after - 1], places[v, after]
+            there = places[v, after - 1]
+            back = places[v, after]
             detour = _metres(there, place[n]) + _metres(place[n], back) - _metres(there, back)
             if detour > _DETOUR_M:
                 excess = np.inf
@@ -141,11 +143,14 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
 @compiled
 def _least_needed(anchors: IntArray) -> int:
     """Return the inner anchor (of (ANCHORS,) times) whose gap is the smallest compared with its age."""
-    newest, best, least = anchors[-1], 1, np.inf
+    newest = anchors[-1]
+    best = 1
+    least = np.inf
     for k in range(1, len(anchors) - 1):
         gap = (anchors[k + 1] - anchors[k - 1]) / float(newest - anchors[k] + _RECENT_NS)
         if gap < least:
-            best, least = k, gap
+            best = k
+            least = gap
     return best
 
 
@@ -158,5 +163,6 @@ def _excess(apart: int, there: Float32Array, here: FloatArray) -> float:
 @compiled
 def _metres(there: Float32Array, here: FloatArray | Float32Array) -> float:
     """Return the distance between two places (2,) [deg], the short way around the date line."""
-    north, east = here[0] - there[0], (here[1] - there[1] + 180.0) % 360.0 - 180.0
+    north = here[0] - there[0]
+    east = (here[1] - there[1] + 180.0) % 360.0 - 180.0
     return float(np.hypot(north, east * np.cos(np.radians(here[0])))) * METRES_PER_DEGREE

@@ -40,13 +40,11 @@ class RateLimiter:
         counts: Counter[str],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._rate, self._burst, self._known, self._counts, self._clock = (
-            rate,
-            burst,
-            known,
-            counts,
-            clock,
-        )
+        self._rate = rate
+        self._burst = burst
+        self._known = known
+        self._counts = counts
+        self._clock = clock
         self._buckets: dict[str, tuple[float, float]] = {}  # what is left, and when that was [s]
         self._swept = -float("inf")
 
@@ -75,7 +73,8 @@ class RateLimiter:
 
     def _forget(self, now: float) -> bool:
         """Drop full buckets, but not at every message; return True if there is room now."""
-        rate, burst = self._rate, self._burst
+        rate = self._rate
+        burst = self._burst
         if now - self._swept >= burst / rate:
             self._swept = now
             self._buckets = {

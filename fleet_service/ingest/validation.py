@@ -96,7 +96,8 @@ def check_heads(
     Returns:
         (k,) index of the first broken rule into the second value, -1 for a valid one; and the rules.
     """
-    topic, held = _TOPIC[kind], heads.first_held
+    topic = _TOPIC[kind]
+    held = heads.first_held
     wrong_owner = [
         o.name != name or o.topic.name != topic
         for o, name in zip(owners, heads.vehicle, strict=True)
@@ -109,9 +110,12 @@ def check_heads(
         else np.zeros(len(owners), bool)
     )
     broken = (
-        np.array(wrong_owner, bool), wrong_region, (heads.boot < 0) | (held < 1) | (held > heads.seq),
-        np.array(bad_name, bool), _untimely(time, time, clock),
-    )  # fmt: skip
+        np.array(wrong_owner, bool),
+        wrong_region,
+        (heads.boot < 0) | (held < 1) | (held > heads.seq),
+        np.array(bad_name, bool),
+        _untimely(time, time, clock),
+    )
     return _first(broken), _HEAD_RULES
 
 
@@ -204,7 +208,8 @@ def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
 
 
 def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]], list[Refusal]]:
-    broken, rules = [], []
+    broken = []
+    rules = []
     for column, least, most, optional in RANGES[kind]:
         values = columns[column]
         broken.append(
@@ -228,7 +233,9 @@ def _cell_of(columns: Columns) -> IntArray:
 
 
 def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:
-    enter, leave, cell = columns["enter_time"], columns["leave_time"], columns["cell"]
+    enter = columns["enter_time"]
+    leave = columns["leave_time"]
+    cell = columns["cell"]
     at = _cell_of(columns)
     wrong_cell = at != cell
     beside = np.flatnonzero(wrong_cell)
@@ -236,16 +243,38 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
         wrong_cell[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
     with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
-    mu, lower, upper = columns["mu"], columns["mu_lower"], columns["mu_upper"]
+    mu = columns["mu"]
+    lower = columns["mu_lower"]
+    upper = columns["mu_upper"]
     no_peak = columns["with_likelihood"] & (columns["log_likelihood"].min(axis=1) > 0)
     return [
-        (_untimely(enter, leave, clock), "time", "leave_time: too old or in the future; set the clock"),
-        ((leave < enter) | (leave - enter > MAX_VISIT_NS), "time", "leave_time: before or long after enter_time; mend"),
-        (wrong_cell, "cell", "cell: is not at the pose; use the z21 quadint of latitude and longitude"),
+        (
+            _untimely(enter, leave, clock),
+            "time",
+            "leave_time: too old or in the future; set the clock",
+        ),
+        (
+            (leave < enter) | (leave - enter > MAX_VISIT_NS),
+            "time",
+            "leave_time: before or long after enter_time; mend",
+        ),
+        (
+            wrong_cell,
+            "cell",
+            "cell: is not at the pose; use the z21 quadint of latitude and longitude",
+        ),
         (turned, "sector", "sector: is not the yaw's; 0 east, 1 north, 2 west, 3 south"),
-        (no_peak, "log_likelihood", "log_likelihood: has no maximum; give steps below it, so that it reads 0"),
-        ((lower > mu) | (mu > upper) | (lower > upper), "mu", "mu: not mu_lower <= mu <= mu_upper; correct it"),
-    ]  # fmt: skip
+        (
+            no_peak,
+            "log_likelihood",
+            "log_likelihood: has no maximum; give steps below it, so that it reads 0",
+        ),
+        (
+            (lower > mu) | (mu > upper) | (lower > upper),
+            "mu",
+            "mu: not mu_lower <= mu <= mu_upper; correct it",
+        ),
+    ]
 
 
 def _broken_state(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:

@@ -63,7 +63,9 @@ class WeatherInbox:
     """
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
-        self._folder, self.fusion, self._counts = root / FOLDER, fusion, counts
+        self._folder = root / FOLDER
+        self.fusion = fusion
+        self._counts = counts
         self._name = with_term(name, read_epoch(root))
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
@@ -251,7 +253,8 @@ def _row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
     if unknown := row.keys() - set(COLUMNS):
         raise InputError("weather", f"{sorted(unknown)[0]} is no column of it", fix)
     try:
-        region, at = row["region"], row["time"]
+        region = row["region"]
+        at = row["time"]
         region = grid.from_quadkey(region) if isinstance(region, str) else int(region)
         when = (
             int(at)

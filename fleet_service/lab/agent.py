@@ -91,8 +91,10 @@ class Errors:
         relative = model.bias * rng.normal(size=vehicles)
         return Errors(
             relative + model.tyres + np.where(np.arange(vehicles) % 2, model.half, 0.0),
-            BIAS_ABSOLUTE * rng.normal(size=vehicles), SLOPE_NATS * rng.uniform(-1.0, 1.0, vehicles), model,
-        )  # fmt: skip
+            BIAS_ABSOLUTE * rng.normal(size=vehicles),
+            SLOPE_NATS * rng.uniform(-1.0, 1.0, vehicles),
+            model,
+        )
 
 
 class Passes(NamedTuple):
@@ -139,12 +141,13 @@ def noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
 
 def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     """Reports of visits (n,)."""
-    model, who = errors.model, p.vehicle
+    model = errors.model
+    who = p.vehicle
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - p.share)
     shape = -model.low * (1.0 - p.share)
     seen = np.maximum(
         p.mu * (1.0 + errors.relative[who] + p.common + shape) + errors.additive[who], mugrid.LOWER
-    )  # fmt: skip
+    )
     std = np.hypot(NOISE_ABSOLUTE, relative * seen)
     reading = seen + std * p.e
     used = np.clip(p.share * p.mu + USED_STD * rng.normal(size=len(p.mu)), 0.02, 1.3)
@@ -154,8 +157,12 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     peaked = likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
     std = np.where(p.excited, model.stated * std, np.nan)
     return SimulatedReports(
-        np.where(p.excited, reading, np.nan), std, used, p.manoeuvre, np.where(p.excited[:, None], peaked, sloping)
-    )  # fmt: skip
+        np.where(p.excited, reading, np.nan),
+        std,
+        used,
+        p.manoeuvre,
+        np.where(p.excited[:, None], peaked, sloping),
+    )
 
 
 def likelihood(

@@ -31,10 +31,17 @@ from fleet_service.lab.town import CELLS, LENGTH, Town, Visits
 from schemas.config import ServiceConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
-VEHICLES, ATTACKERS, FLOODERS, NAMES = 60, 6, 3, 40
-BEGIN, MINUTES = 18, 26  # minute in which the attack begins; length of the drive
+VEHICLES = 60
+ATTACKERS = 6
+FLOODERS = 3
+NAMES = 40
+# minute in which the attack begins; length of the drive
+BEGIN = 18
+MINUTES = 26
 FLOOD: Final = 400  # visits of one flooder to its cell
-CLEARLY_DRY, CLEARLY_ICY, ENOUGH = 0.5, 0.25, 5
+CLEARLY_DRY = 0.5
+CLEARLY_ICY = 0.25
+ENOUGH = 5
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,8 @@ def measure(seeds: range) -> dict[str, float]:
 
 def differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
     """Cells in which the attack raised or suppressed an alert."""
-    raised, suppressed = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
+    raised = np.zeros(CELLS, bool)
+    suppressed = np.zeros(CELLS, bool)
     for minute in range(BEGIN, MINUTES):
         raised |= attacked[minute] & ~alone[minute]
         suppressed |= alone[minute] & ~attacked[minute]
@@ -93,9 +101,12 @@ def random(rng: Generator, drive: AttackedDrive) -> Visits:
 
 def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
     reports = SimulatedReports(
-        v.reports.reading, v.reports.std, np.where(lying, claim, v.reports.used), v.reports.manoeuvre,
+        v.reports.reading,
+        v.reports.std,
+        np.where(lying, claim, v.reports.used),
+        v.reports.manoeuvre,
         np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
-    )  # fmt: skip
+    )
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
 
 
@@ -150,16 +161,22 @@ def _added(
         np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True)
     )
     both = Visits(
-        np.append(v.seconds, seconds), np.append(v.vehicle, vehicle), np.append(v.place, place),
-        np.append(v.mu, np.full(len(claim), np.nan)), np.append(v.excited, np.zeros(len(claim), bool)),
+        np.append(v.seconds, seconds),
+        np.append(v.vehicle, vehicle),
+        np.append(v.place, place),
+        np.append(v.mu, np.full(len(claim), np.nan)),
+        np.append(v.excited, np.zeros(len(claim), bool)),
         SimulatedReports(*joined),
-    )  # fmt: skip
+    )
     return town.take(both, np.argsort(both.seconds, kind="stable"))
 
 
 VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
-    "random": random, "shifted_pose": shifted_pose, "flood_one_cell": flood_one_cell, "newcomers": newcomers,
-}  # fmt: skip
+    "random": random,
+    "shifted_pose": shifted_pose,
+    "flood_one_cell": flood_one_cell,
+    "newcomers": newcomers,
+}
 
 
 def replayed(rng: Generator, drive: AttackedDrive) -> int:
@@ -174,7 +191,8 @@ def replayed(rng: Generator, drive: AttackedDrive) -> int:
         for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))
     ]
     key = rng.bytes(32)
-    alone, attacked = _alerted(sent, at, [], key), _alerted(sent, at, forged, key)
+    alone = _alerted(sent, at, [], key)
+    attacked = _alerted(sent, at, forged, key)
     return differing(drive, alone, attacked)
 
 

@@ -129,6 +129,7 @@ BARS: Final[dict[str, MapBar]] = {
 def judged(measured: Mapping[str, float]) -> list[Figure]:
     """Every figure that has a bar, NaN where it was not measured; then those that are only shown."""
     named = [
-        Figure(name, measured.get(name, math.nan), bar.unit, bar.bar, bar.better) for name, bar in BARS.items()
-    ]  # fmt: skip
+        Figure(name, measured.get(name, math.nan), bar.unit, bar.bar, bar.better)
+        for name, bar in BARS.items()
+    ]
     return named + [Figure(name, value, "") for name, value in measured.items() if name not in BARS]

@@ -30,7 +30,8 @@ from schemas.runtime.figures import Figure
 
 # Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those below.
 JUDGING: Final = 20_000
-SEEDS, QUICK_SEEDS = 10, 1
+SEEDS = 10
+QUICK_SEEDS = 1
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)} | dict.fromkeys(
     end_to_end.WAYS, (20, 1800.0)
 )  # vehicles, seconds
@@ -82,8 +83,9 @@ def run(
 def drives_end_to_end(quick: bool) -> Drives:
     """The end-to-end drives, level and rough, or a few seconds of them."""
     return {
-        world: end_to_end.command(*((4, 3.0) if quick else length), world) for world, length in LENGTHS.items()
-    }  # fmt: skip
+        world: end_to_end.command(*((4, 3.0) if quick else length), world)
+        for world, length in LENGTHS.items()
+    }
 
 
 def holds(found: Sequence[Figure]) -> bool:
@@ -99,8 +101,9 @@ def _ways(drives: Drives, folder: Path, seeds: range) -> list[tuple[str, Part]]:
     ways = {world: drive for world, drive in drives.items() if world in end_to_end.WAYS}
     parts: list[tuple[str, Part]] = [
         (f"end to end, {world.scenario}", partial(end_to_end.measure, drive, folder, world))
-        for world, drive in drives.items() if world not in ways
-    ]  # fmt: skip
+        for world, drive in drives.items()
+        if world not in ways
+    ]
     rough = [
         (f"end to end, {len(ways)} rough ways", partial(_rough, ways, folder)),
         ("towns with the errors of these ways", partial(_resampled, ways, folder, seeds)),
@@ -137,9 +140,11 @@ def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
 
 def _exact(seeds: range) -> dict[str, float]:
     measures = {
-        "fusion.order.max_difference": exact.order, "fusion.replay.max_difference": exact.replay,
+        "fusion.order.max_difference": exact.order,
+        "fusion.replay.max_difference": exact.replay,
         "fusion.unexcited.upper_shift": exact.upper_shift,
-    }  # fmt: skip
+    }
     return {
-        name: max(measure(np.random.default_rng([seed, 3])) for seed in seeds) for name, measure in measures.items()
-    }  # fmt: skip
+        name: max(measure(np.random.default_rng([seed, 3])) for seed in seeds)
+        for name, measure in measures.items()
+    }

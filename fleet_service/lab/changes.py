@@ -16,8 +16,12 @@ from fleet_service.lab.town import LENGTH, Town
 from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
 from schemas.numeric import FloatArray, IntArray
 
-DRY, ICE = 0.85, 0.20
-VEHICLES, MINUTES, CHANGE = 60, 40, 22  # the road changes after so many minutes
+DRY = 0.85
+ICE = 0.20
+# the road changes after so many minutes
+VEHICLES = 60
+MINUTES = 40
+CHANGE = 22
 EXCITEMENT: Final = 0.3  # of a pass over the road
 UNREACHED: Final = 99  # passes, where the drive ended before the map had seen it
 
@@ -25,7 +29,8 @@ UNREACHED: Final = 99  # passes, where the drive ended before the map had seen i
 def changing(rng: Generator, before: float, after: float) -> Town:
     """A town whose first road is `before` and becomes `after`."""
     drawn = town.build(rng, MINUTES, 0.0)
-    mu, excitement = drawn.mu.copy(), drawn.excitement.copy()
+    mu = drawn.mu.copy()
+    excitement = drawn.excitement.copy()
     mu[:CHANGE, :LENGTH], mu[CHANGE:, :LENGTH], excitement[:LENGTH] = before, after, EXCITEMENT
     return Town(mu, excitement, drawn.changed, drawn.common, drawn.usual)
 
@@ -40,7 +45,8 @@ def delays(rng: Generator, before: float, after: float) -> IntArray:
     visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     o = observations_of(rows_of(visits), visits.vehicle)
     here = (visits.place < LENGTH) & visits.excited & (visits.seconds >= 60.0 * CHANGE)
-    passes, seen = np.zeros(LENGTH, np.int64), np.full(LENGTH, UNREACHED)
+    passes = np.zeros(LENGTH, np.int64)
+    seen = np.full(LENGTH, UNREACHED)
     fusion = Fusion(LATENESS_S)
     for part in np.split(np.arange(len(visits)), np.flatnonzero(here) + 1):
         if not len(part) or (seen < UNREACHED).all():

@@ -24,7 +24,9 @@ from schemas.wire import Kind
 
 LATENESS_S: Final = 120.0
 DELAY_S: Final = 4.0  # mean; a batch waits a second, and the network now and then
-LATE_SHARE, LATE_S = 0.02, 300.0  # ... and some lie in a spool for minutes: up to this long
+# ... and some lie in a spool for minutes: up to this long
+LATE_SHARE = 0.02
+LATE_S = 300.0
 TWICE_SHARE: Final = 0.03
 CELL: Final = cell_numbers()
 
@@ -34,8 +36,10 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
     `cells` are the grid's numbers of the visits' places.
     """
-    n, nan = len(v), np.full(len(v), np.nan, np.float32)
-    cell, used = cells[v.place], v.reports.used.astype(np.float32)
+    n = len(v)
+    nan = np.full(len(v), np.nan, np.float32)
+    cell = cells[v.place]
+    used = v.reports.used.astype(np.float32)
     along, across = (
         used * np.array(part, np.float32)[v.reports.manoeuvre]
         for part in ((1, -1, 0, 0), (0, 0, 1, -1))
@@ -45,14 +49,25 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     first = np.searchsorted(v.vehicle[order], v.vehicle[order])
     seq[order] = np.arange(n) - first + 1
     return {
-        "leave_time": START + (v.seconds * NS).astype(np.int64), "cell": cell, "latitude": grid.centre(cell)[0],
+        "leave_time": START + (v.seconds * NS).astype(np.int64),
+        "cell": cell,
+        "latitude": grid.centre(cell)[0],
         "sector": np.zeros(n, np.int8),
-        "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
-        "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "with_likelihood": np.ones(n, bool),
+        "yaw": np.zeros(n, np.float32),
+        "position_std": np.full(n, 1.5, np.float32),
+        "boot": v.vehicle + 1,
+        "region": grid.region_of(cell),
+        "seq": seq,
+        "row": np.zeros(n, np.int32),
+        "with_likelihood": np.ones(n, bool),
         "log_likelihood": mugrid.encode_log_likelihood(v.reports.log_likelihood),
-        "used_longitudinal": along, "used_lateral": across, "mu": nan, "mu_lower": nan, "mu_upper": nan,
+        "used_longitudinal": along,
+        "used_lateral": across,
+        "mu": nan,
+        "mu_lower": nan,
+        "mu_upper": nan,
         "mu_utilised": used,
-    }  # fmt: skip
+    }
 
 
 def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
@@ -70,8 +85,11 @@ def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
     """Those deliveries that the service admits: each identity once."""
-    streams, kept = SequenceTrackers(), []
-    region, boot, seq = rows["region"].tolist(), rows["boot"].tolist(), rows["seq"].tolist()
+    streams = SequenceTrackers()
+    kept = []
+    region = rows["region"].tolist()
+    boot = rows["boot"].tolist()
+    seq = rows["seq"].tolist()
     for k, row in enumerate(which.tolist()):
         stream = streams[int(vehicle[row]), boot[row], Kind.OBSERVATION, region[row]]
         if not stream.accepted(seq[row]):
@@ -117,7 +135,8 @@ def watch(
     rows = rows_of(v)
     at, which = arrivals(rng, v)
     kept = novel(rows, v.vehicle, which)
-    at, which = at[kept], which[kept]
+    at = at[kept]
+    which = which[kept]
     fusion = Fusion(LATENESS_S)
     watched = AlertWatch(fusion, Alerts(fusion))
     o = observations_of(rows, v.vehicle).take(which)

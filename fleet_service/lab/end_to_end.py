@@ -28,7 +28,8 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Alert
 
-OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
+OBSERVATIONS = "observations.parquet"
+TRUTH = "truth.parquet"
 # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
 SEVERAL: Final = 2
 SAME: Final = 0.02  # of friction within a cell of one surface
@@ -91,23 +92,28 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     false, beside = false_ice(raised, visits)
     slots, truth = joined(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
-    slots, truth = slots[several], truth[several]
+    slots = slots[several]
+    truth = truth[several]
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
     with_value = is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)
     pure = with_value & one_surface(fusion, visits)[slots]
     found = _figures(scores, with_value) | {
-        "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5, "safe95": safe(scores),
-        "observations": float(len(columns["cell"])), "alerts": float(len(raised)), "false_ice": float(false),
+        "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5,
+        "safe95": safe(scores),
+        "observations": float(len(columns["cell"])),
+        "alerts": float(len(raised)),
+        "false_ice": float(false),
         "false_ice.beside": float(beside),
-    }  # fmt: skip
+    }
     return {f"{world.prefix}.{name}": value for name, value in found.items()}
 
 
 def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
     """Fuse the observations second by second, as a service would, and return the alerts that were raised."""
-    alerts, raised = Alerts(fusion), []
+    alerts = Alerts(fusion)
+    raised = []
     second = (o.time - o.time.min()) // NS
     for rows in np.split(np.argsort(second, kind="stable"), np.cumsum(np.bincount(second))[:-1]):
         if len(rows):
@@ -124,7 +130,8 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     metres wide: who is warned of the cell beside the ice is warned rightly.
     """
     east, north = grid.deinterleave(visits["cell"].to_numpy())
-    mu, enter = visits["mu"].to_numpy(), visits["enter_time"].cast(pa.int64()).to_numpy()
+    mu = visits["mu"].to_numpy()
+    enter = visits["enter_time"].cast(pa.int64()).to_numpy()
     false = beside = 0
     for alert in raised:
         x, y = (int(value[0]) for value in grid.deinterleave(np.array([alert.cell])))
@@ -132,7 +139,8 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
         slippery = (mu < SURE_GRIP) & (enter <= alert.time)
         if not (slippery & (far == 0)).any():
             near = bool((slippery & (far == 1)).any())
-            false, beside = false + (not near), beside + near
+            false = false + (not near)
+            beside = beside + near
     return false, beside
 
 
@@ -156,7 +164,8 @@ def mean(values: np.ndarray[Any, Any]) -> float:
 
 def read(path: Path) -> dict[str, Any]:
     """Columns of observations as the archive would give them."""
-    table, out = pq.read_table(path), {}
+    table = pq.read_table(path)
+    out = {}
     for name, dtype in wire.column_types(wire.Kind.OBSERVATION).items():
         if name == "log_likelihood":
             out[name] = np.frombuffer(
@@ -181,19 +190,24 @@ def observations_in(columns: dict[str, Any]) -> Observations:
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {
-        "boot": columns["vehicle"] + 1, "region": grid.region_of(columns["cell"]), "seq": np.arange(1, n + 1),
-        "row": np.zeros(n, np.int32), "with_likelihood": with_likelihood,
-    }  # fmt: skip
+        "boot": columns["vehicle"] + 1,
+        "region": grid.region_of(columns["cell"]),
+        "seq": np.arange(1, n + 1),
+        "row": np.zeros(n, np.int32),
+        "with_likelihood": with_likelihood,
+    }
     return observations_of(columns | identity, columns["vehicle"])
 
 
 def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
     """Slots that a vehicle truly visited, and their friction at the last such visit's half minute."""
-    cell, sector = visits["cell"].to_numpy(), visits["sector"].to_numpy()
+    cell = visits["cell"].to_numpy()
+    sector = visits["sector"].to_numpy()
     time = visits["leave_time"].cast(pa.int64()).to_numpy()
     recent = time > time.max() - 30 * NS
     slot = fusion.slots_of(cell, sector.astype(np.int64))
-    total, count = np.zeros((2, fusion.size)), np.zeros((2, fusion.size))
+    total = np.zeros((2, fusion.size))
+    count = np.zeros((2, fusion.size))
     for row, rows in enumerate((slot >= 0, (slot >= 0) & recent)):
         np.add.at(total[row], slot[rows], visits["mu"].to_numpy()[rows])
         np.add.at(count[row], slot[rows], 1)
@@ -205,8 +219,10 @@ def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Whether all that was truly visited of a slot had one friction, (slots,)."""
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
-    mu, known = visits["mu"].to_numpy(), slot >= 0
-    least, most = np.full(fusion.size, np.inf), np.zeros(fusion.size)
+    mu = visits["mu"].to_numpy()
+    known = slot >= 0
+    least = np.full(fusion.size, np.inf)
+    most = np.zeros(fusion.size)
     np.minimum.at(least, slot[known], mu[known])
     np.maximum.at(most, slot[known], mu[known])
     return np.asarray(most - least <= SAME)

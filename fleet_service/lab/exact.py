@@ -20,7 +20,8 @@ from schemas import mugrid
 from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray
 
-VEHICLES, MINUTES = 40, 20
+VEHICLES = 40
+MINUTES = 20
 UNEXCITED: Final = (1, 3, 10, 100, 1000)
 PARTS: Final = 60  # portions in which a shuffled drive comes
 
@@ -44,7 +45,8 @@ def order(rng: Generator) -> float:
     """In order of time against any order within the lateness."""
     visits = drive(rng)
     o = observations_of(rows_of(visits), visits.vehicle)
-    straight, mixed = Fusion(LATENESS_S), Fusion(LATENESS_S)
+    straight = Fusion(LATENESS_S)
+    mixed = Fusion(LATENESS_S)
     straight.update(o)
     arrival = np.argsort(visits.seconds + rng.uniform(0.0, 0.5 * LATENESS_S, len(visits)))
     late = sum(
@@ -78,7 +80,8 @@ def upper_shift(rng: Generator) -> float:
         for mu, _, _ in town.SURFACES.values():
             n = max(vehicles, 200)
             seconds: FloatArray = np.sort(rng.random(n)) * 3600.0
-            who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
+            who = rng.integers(0, vehicles, n)
+            along = np.zeros(n, np.int64)
             shares = agent.shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
             passes = Passes(

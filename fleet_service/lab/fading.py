@@ -19,7 +19,10 @@ from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY, NS
 
 PREFIX: Final = "fusion.stays_dry"
-DRY, PASSES, CARS, HOUR_S = 0.85, 60, 40, 3600.0
+DRY = 0.85
+PASSES = 60
+CARS = 40
+HOUR_S = 3600.0
 AFTER_MIN: Final = (0, 5, 15, 30, 60, 120, 180, 360)  # [min] after the hour of the passes
 
 
@@ -31,12 +34,17 @@ class WeatherSince(NamedTuple):
 
 
 WEATHER: Final[dict[str, WeatherSince | None]] = {
-    "unknown": None, "mild_dry": WeatherSince(8.0, 0.0), "mild_rain": WeatherSince(8.0, 1.0),
+    "unknown": None,
+    "mild_dry": WeatherSince(8.0, 0.0),
+    "mild_rain": WeatherSince(8.0, 1.0),
     "freezing": WeatherSince(-1.0, 0.0),
-}  # fmt: skip
+}
 TITLES: Final = {
-    "unknown": "unknown", "mild_dry": "8 °C, dry", "mild_rain": "8 °C, rain", "freezing": "−1 °C, dry or wet",
-}  # fmt: skip
+    "unknown": "unknown",
+    "mild_dry": "8 °C, dry",
+    "mild_rain": "8 °C, rain",
+    "freezing": "−1 °C, dry or wet",
+}
 
 
 def measure(seeds: range) -> dict[str, float]:
@@ -45,16 +53,22 @@ def measure(seeds: range) -> dict[str, float]:
         f"{PREFIX}.{name}.min{minutes}": float(lower)
         for name, known in WEATHER.items()
         for minutes, lower in zip(
-            AFTER_MIN, np.mean([lower_ends(np.random.default_rng([seed, 23]), known) for seed in seeds], axis=0),
+            AFTER_MIN,
+            np.mean(
+                [lower_ends(np.random.default_rng([seed, 23]), known) for seed in seeds], axis=0
+            ),
             strict=True,
         )
-    }  # fmt: skip
+    }
 
 
 def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
     """Lower end at each of AFTER_MIN, after excited passes over a dry road for an hour."""
-    seconds, who = np.sort(rng.random(PASSES)) * HOUR_S, rng.integers(0, CARS, PASSES)
-    mu, nothing, excited = np.full(PASSES, DRY), np.zeros(PASSES, np.int64), np.ones(PASSES, bool)
+    seconds = np.sort(rng.random(PASSES)) * HOUR_S
+    who = rng.integers(0, CARS, PASSES)
+    mu = np.full(PASSES, DRY)
+    nothing = np.zeros(PASSES, np.int64)
+    excited = np.ones(PASSES, bool)
     passes = Passes(
         who,
         mu,
@@ -81,9 +95,13 @@ def _reports(known: WeatherSince) -> Reports:
     n = len(hours)
     temperature = np.full(n, known.temperature)
     return Reports(
-        np.repeat(grid.region_of(CELL[:1]), n), START + hours * 3600 * NS, temperature, temperature,
-        np.full(n, known.precipitation), np.full((n, mugrid.BINS), np.nan),
-    )  # fmt: skip
+        np.repeat(grid.region_of(CELL[:1]), n),
+        START + hours * 3600 * NS,
+        temperature,
+        temperature,
+        np.full(n, known.precipitation),
+        np.full((n, mugrid.BINS), np.nan),
+    )
 
 
 def table(values: Mapping[str, float]) -> str:

@@ -27,11 +27,12 @@ from schemas.numeric import BoolArray
 
 VEHICLES: Final = 60
 CHANGING: Final = 0.1  # share of roads that get another surface during the drive
-DRY, ICY = 0.7, 0.25  # truths that count as dry and as ice
-ENOUGH, EARLIER = (
-    5,
-    20,
-)  # excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
+# truths that count as dry and as ice
+DRY = 0.7
+ICY = 0.25
+# excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
+ENOUGH = 5
+EARLIER = 20
 
 
 class Fleet(NamedTuple):
@@ -74,7 +75,8 @@ class Found:
 def one(fleet: Fleet, seed: int, found: Found) -> None:
     """Drive one seed and note what the map shows."""
     rng = np.random.default_rng([seed, 1])
-    place, errors = town.build(rng, fleet.minutes, CHANGING), Errors.draw(rng, VEHICLES)
+    place = town.build(rng, fleet.minutes, CHANGING)
+    errors = Errors.draw(rng, VEHICLES)
     visits = town.drive(rng, place, errors, fleet.minutes)
     if fleet.share:
         visits = town.wrong(
@@ -89,8 +91,10 @@ def one(fleet: Fleet, seed: int, found: Found) -> None:
         if earlier_visits(visits, 60.0 * minute, VEHICLES).min() < EARLIER:
             continue
         counted = excited_vehicles(visits, place, minute, VEHICLES) >= ENOUGH
-        mu, alerted = place.mu[minute], watched.alerted[minute - 1]
-        dry, icy = alerted[counted & (mu > DRY)], ~alerted[counted & (mu < ICY)]
+        mu = place.mu[minute]
+        alerted = watched.alerted[minute - 1]
+        dry = alerted[counted & (mu > DRY)]
+        icy = ~alerted[counted & (mu < ICY)]
         found.false_ice.append(dry)
         found.missed_ice.append(icy)
         if minute > fleet.begin:
@@ -111,7 +115,8 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
-    ours, out = joined(found.ours), {}
+    ours = joined(found.ours)
+    out = {}
     name = f"fusion.{fleet.name}"
     out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = (
         rmse(ours),

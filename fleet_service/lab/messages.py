@@ -37,7 +37,8 @@ def clock_of(seconds: float) -> int:
 
 def messages(v: Visits) -> list[SentMessage]:
     """Each vehicle's visits in batches, in order of time per vehicle and region."""
-    rows, out = rows_of(v), []
+    rows = rows_of(v)
+    out = []
     latitude, longitude = grid.centre(rows["cell"])
     order = np.lexsort((v.seconds, rows["region"], v.vehicle))
     streams = np.flatnonzero(np.diff(v.vehicle[order]) | np.diff(rows["region"][order])) + 1
@@ -50,18 +51,32 @@ def messages(v: Visits) -> list[SentMessage]:
 
 
 def _message(
-    v: Visits, rows: dict[str, np.ndarray], latitude: np.ndarray, longitude: np.ndarray, part: IntArray, seq: int
-) -> SentMessage:  # fmt: skip
+    v: Visits,
+    rows: dict[str, np.ndarray],
+    latitude: np.ndarray,
+    longitude: np.ndarray,
+    part: IntArray,
+    seq: int,
+) -> SentMessage:
     n = len(part)
     columns: dict[str, np.ndarray] = {
-        "enter_time": rows["leave_time"][part] - NS, "leave_time": rows["leave_time"][part],
-        "cell": rows["cell"][part], "sector": rows["sector"][part], "latitude": latitude[part],
-        "longitude": longitude[part], "position_std": np.full(n, 1.5), "yaw": np.zeros(n), "yaw_std": np.full(n, 0.02),
-        "speed": np.full(n, 13.0), "mu_utilised": rows["mu_utilised"][part],
-        "used_longitudinal": rows["used_longitudinal"][part], "used_lateral": rows["used_lateral"][part],
+        "enter_time": rows["leave_time"][part] - NS,
+        "leave_time": rows["leave_time"][part],
+        "cell": rows["cell"][part],
+        "sector": rows["sector"][part],
+        "latitude": latitude[part],
+        "longitude": longitude[part],
+        "position_std": np.full(n, 1.5),
+        "yaw": np.zeros(n),
+        "yaw_std": np.full(n, 0.02),
+        "speed": np.full(n, 13.0),
+        "mu_utilised": rows["mu_utilised"][part],
+        "used_longitudinal": rows["used_longitudinal"][part],
+        "used_lateral": rows["used_lateral"][part],
         "log_likelihood": rows["log_likelihood"][part],
-    }  # fmt: skip
-    vehicle, region = int(v.vehicle[part[0]]), int(rows["region"][part[0]])
+    }
+    vehicle = int(v.vehicle[part[0]])
+    region = int(rows["region"][part[0]])
     name = name_of(vehicle)
     batch = Batch(Kind.OBSERVATION, name, vehicle + 1, region, seq, 1, columns, "synthetic")
     key = keys.observation_key(region, name)

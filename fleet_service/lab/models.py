@@ -54,7 +54,8 @@ def one(
 ) -> tuple[Scores, list[Scores]]:
     """Scores of the map, and of the rules, on one town; its reports are drawn from those of `ways`, if there are."""
     rng = np.random.default_rng([seed, 11])
-    place, errors = town.build(rng, MINUTES, 0.0, model), Errors.draw(rng, VEHICLES, model)
+    place = town.build(rng, MINUTES, 0.0, model)
+    errors = Errors.draw(rng, VEHICLES, model)
     visits = town.drive(rng, place, errors, MINUTES, ACQUAINTED)
     if ways is not None:
         visits = resampled.drawn(rng, visits, ways, VEHICLES)
@@ -86,7 +87,8 @@ def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
 
 def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
     ours, theirs = zip(*towns, strict=True)
-    whole, others = joined(list(ours)), [joined(list(of)) for of in zip(*theirs, strict=True)]
+    whole = joined(list(ours))
+    others = [joined(list(of)) for of in zip(*theirs, strict=True)]
     out = {
         f"{prefix}.coverage90": coverage(whole),
         f"{prefix}.interval_score": _mean(whole.interval),

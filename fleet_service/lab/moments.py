@@ -48,19 +48,24 @@ class AskedWay(NamedTuple):
 def moments(folder: Path) -> list[AskedWay]:
     """What a map made of a way says at MOMENTS, as far as it lasts."""
     o = end_to_end.observations_in(end_to_end.read(folder / OBSERVATIONS))
-    visits, begin = pq.read_table(folder / TRUTH), int(o.time.min())
+    visits = pq.read_table(folder / TRUTH)
+    begin = int(o.time.min())
     left = visits["leave_time"].cast(pa.int64())
-    fusion, taken, out = Fusion(LATENESS_S), begin - 1, []
+    fusion = Fusion(LATENESS_S)
+    taken = begin - 1
+    out = []
     for seconds in MOMENTS:
         until = begin + int(seconds * NS)
         rows = np.flatnonzero((o.time > taken) & (o.time <= until))
         if not len(rows):
             break
         end_to_end.raised_alerts(fusion, o.take(rows))
-        past, taken = visits.filter(pc.less_equal(left, pa.scalar(until))), until
+        past = visits.filter(pc.less_equal(left, pa.scalar(until)))
+        taken = until
         slots, truth = end_to_end.joined(fusion, past)
         several = fusion.live.vehicles[slots] >= SEVERAL
-        slots, truth = slots[several], truth[several]
+        slots = slots[several]
+        truth = truth[several]
         belief = fusion.beliefs(slots, until)
         lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
         scores = of_beliefs(belief, truth, end_to_end.excited(fusion, past)[slots])

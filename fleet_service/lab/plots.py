@@ -31,8 +31,11 @@ def draw(
     values = {figure.name: figure.value for figure in found}
     paths = []
     for name, plot in (
-        ("reliability", _reliability), ("rmse", _rmse), ("delay", _delay), ("misbehaving", _misbehaving)
-    ):  # fmt: skip
+        ("reliability", _reliability),
+        ("rmse", _rmse),
+        ("delay", _delay),
+        ("misbehaving", _misbehaving),
+    ):
         canvas = Canvas(figsize=SIZE, layout="constrained")
         axes = canvas.subplots()
         plot(axes, values)
@@ -70,9 +73,12 @@ def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     )
     axes.axhline(0.05, color="0.7", linewidth=1)
     axes.set(
-        title="Error against excited vehicles", xlabel="excited vehicles of the cell", ylabel="RMSE of the median",
-        xscale="log", ylim=(0, None),
-    )  # fmt: skip
+        title="Error against excited vehicles",
+        xlabel="excited vehicles of the cell",
+        ylabel="RMSE of the median",
+        xscale="log",
+        ylim=(0, None),
+    )
 
 
 def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
@@ -100,11 +106,18 @@ def _misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN40
     for rule, style in zip(RULES, list(ESTIMATORS.values())[1:], strict=False):
         label = rule.replace(" ", "_")
         axes.plot(
-            shares.values(), [values.get(f"rule.{n}.{label}.rmse", float("nan")) for n in shares], marker=".",
-            linewidth=1, label=rule, color=style.colour, linestyle=style.dash,
-        )  # fmt: skip
+            shares.values(),
+            [values.get(f"rule.{n}.{label}.rmse", float("nan")) for n in shares],
+            marker=".",
+            linewidth=1,
+            label=rule,
+            color=style.colour,
+            linestyle=style.dash,
+        )
     axes.set(
-        title="Error against misbehaving vehicles", xlabel="% that always claim .25, sure", ylabel="RMSE of the median",
+        title="Error against misbehaving vehicles",
+        xlabel="% that always claim .25, sure",
+        ylabel="RMSE of the median",
         ylim=(0, None),
-    )  # fmt: skip
+    )
     axes.legend(fontsize=7)

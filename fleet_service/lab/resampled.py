@@ -60,14 +60,17 @@ def driven(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
         own = order[truth.vehicle[order] == who]
         here = vehicle == who
         row[here] = own[np.maximum(np.searchsorted(truth.enter[own], middle[here], "right") - 1, 0)]
-    along, across = observations["used_longitudinal"], observations["used_lateral"]
+    along = observations["used_longitudinal"]
+    across = observations["used_lateral"]
     reading = observations["mu"].astype(float)
     std = (observations["mu_upper"] - observations["mu_lower"]).astype(float) / (2.0 * Z_95)
     reports = SimulatedReports(
-        reading, np.where(np.isnan(reading), np.nan, std), np.nan_to_num(observations["mu_utilised"].astype(float)),
+        reading,
+        np.where(np.isnan(reading), np.nan, std),
+        np.nan_to_num(observations["mu_utilised"].astype(float)),
         np.maximum(manoeuvre_of(along, across), 0).astype(np.int64),
         mugrid.decode_log_likelihood(observations["log_likelihood"]),
-    )  # fmt: skip
+    )
     return DrivenVisits(vehicle, truth.mu[row], truth.share[row] >= EXCITED_SHARE, reports)
 
 
@@ -115,9 +118,13 @@ def _scaled(reports: SimulatedReports, row: IntArray, by: FloatArray) -> Simulat
         (mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0
     )
     left = np.minimum(place.astype(np.int64), mugrid.BINS - 2)
-    reported, part = reports.log_likelihood[row], place - left
+    reported = reports.log_likelihood[row]
+    part = place - left
     below, above = (np.take_along_axis(reported, at, axis=1) for at in (left, left + 1))
     return SimulatedReports(
-        reports.reading[row] * by, reports.std[row] * by, reports.used[row] * by, reports.manoeuvre[row],
+        reports.reading[row] * by,
+        reports.std[row] * by,
+        reports.used[row] * by,
+        reports.manoeuvre[row],
         below + part * (above - below),
-    )  # fmt: skip
+    )

@@ -27,13 +27,17 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 RULES: Final = (
-    "newest report", "inverse variance", "one per pass", "covariance intersection", "federated reset", "median",
-)  # fmt: skip
+    "newest report",
+    "inverse variance",
+    "one per pass",
+    "covariance intersection",
+    "federated reset",
+    "median",
+)
 MEDIAN_MIN: Final = 60  # minutes that the median looks back
-MEDIAN_COMMON, MEDIAN_OWN = (
-    0.06,
-    0.12,
-)  # relative standard deviations of the median's interval: of all, and of one
+# relative standard deviations of the median's interval: of all, and of one
+MEDIAN_COMMON = 0.06
+MEDIAN_OWN = 0.12
 SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
 PRIOR_MEAN: Final = 0.5 * (mugrid.LOWER + mugrid.UPPER)
 PRIOR_VAR: Final = (mugrid.UPPER - mugrid.LOWER) ** 2 / 12.0
@@ -48,7 +52,8 @@ def posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
     """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior along the road."""
-    mean, variance = np.full(vehicles, PRIOR_MEAN), np.full(vehicles, PRIOR_VAR)
+    mean = np.full(vehicles, PRIOR_MEAN)
+    variance = np.full(vehicles, PRIOR_VAR)
     out = np.empty((len(vehicle), 2))
     for k in range(len(vehicle)):
         who = vehicle[k]
@@ -64,10 +69,18 @@ def posteriors(
 
 
 @compiled
-def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatArray, std: FloatArray,
-         asked: FloatArray, cells: int) -> FloatArray:  # fmt: skip
+def fuse(
+    place: IntArray,
+    seconds: FloatArray,
+    sent: FloatArray,
+    reading: FloatArray,
+    std: FloatArray,
+    asked: FloatArray,
+    cells: int,
+) -> FloatArray:
     """Mean and variance per asking time, rule and cell, (times, 5, cells, 2)."""
-    mean, variance = np.full((5, cells), PRIOR_MEAN), np.full((5, cells), PRIOR_VAR)
+    mean = np.full((5, cells), PRIOR_MEAN)
+    variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)
     out = np.empty((len(asked), 5, cells, 2))
     k = 0
@@ -79,17 +92,21 @@ def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatA
                     variance[rule, cell] + DRIFT_VAR * (seconds[k] - last[cell]), PRIOR_VAR
                 )
             last[cell] = seconds[k]
-            m, p = sent[k, 0], sent[k, 1]
+            m = sent[k, 0]
+            p = sent[k, 1]
             for rule in range(5):
-                own, m0 = 1.0 / variance[rule, cell], mean[rule, cell]
-                added, m1 = 1.0 / p, m
+                own = 1.0 / variance[rule, cell]
+                m0 = mean[rule, cell]
+                added = 1.0 / p
+                m1 = m
                 if rule == _NEWEST:
                     own = 0.0
                 elif rule == _ALL:
                     added *= SAMPLES
                 elif rule == _INTERSECTION:
                     share = own / (own + added)
-                    own, added = share * own, (1.0 - share) * added
+                    own = share * own
+                    added = (1.0 - share) * added
                 elif rule == _FEDERATED:
                     reports = np.isfinite(reading[k])
                     added, m1 = (1.0 / std[k] ** 2, reading[k]) if reports else (0.0, m0)
@@ -107,7 +124,8 @@ def medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     pair = v.place[rows] * (int(v.vehicle.max(initial=0)) + 1) + v.vehicle[rows]
     _, last = np.unique(pair[::-1], return_index=True)  # visits are in order of time
     rows = rows[::-1][last]
-    mean, std = np.full(CELLS, PRIOR_MEAN), np.full(CELLS, PRIOR_VAR**0.5)
+    mean = np.full(CELLS, PRIOR_MEAN)
+    std = np.full(CELLS, PRIOR_VAR**0.5)
     for cell in np.unique(v.place[rows]).tolist():
         readings = v.reports.reading[rows[v.place[rows] == cell]]
         mean[cell] = np.median(readings)
@@ -117,7 +135,7 @@ def medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 
 def scores(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
-) -> list[Scores]:  # fmt: skip
+) -> list[Scores]:
     """Scores of each of RULES at some minutes, for the cells `where` an excited vehicle was."""
     sent = posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

@@ -17,10 +17,9 @@ from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
 ENOUGH: Final = 3  # excited vehicles, for an error to count
-MISSED, RAISED = (
-    0.3,
-    0.5,
-)  # of P(slippery): slippery road below it is missed, grip above it is called slippery
+# of P(slippery): slippery road below it is missed, grip above it is called slippery
+MISSED = 0.3
+RAISED = 0.5
 SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
 BINS: Final = 10  # of P(slippery)
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
@@ -74,9 +73,14 @@ def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
 
 
 def of_intervals(
-    lower: FloatArray, mid: FloatArray, upper: FloatArray, truth: FloatArray, vehicles: IntArray, rank: FloatArray,
+    lower: FloatArray,
+    mid: FloatArray,
+    upper: FloatArray,
+    truth: FloatArray,
+    vehicles: IntArray,
+    rank: FloatArray,
     slippery: FloatArray,
-) -> Scores:  # fmt: skip
+) -> Scores:
     """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which the truth is missed."""
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
@@ -126,9 +130,13 @@ def crps_of(belief: FloatArray, truth: FloatArray) -> FloatArray:
 
 
 def snapshots(
-    beliefs: Mapping[int, FloatArray], town: Town, v: Visits, at: tuple[int, ...], vehicles: int,
+    beliefs: Mapping[int, FloatArray],
+    town: Town,
+    v: Visits,
+    at: tuple[int, ...],
+    vehicles: int,
     where: BoolArray | bool = True,
-) -> Scores:  # fmt: skip
+) -> Scores:
     """Scores of the cells `where` an excited vehicle was, at some minutes."""
     out = []
     for minute in at:

@@ -27,24 +27,34 @@ USED: Final = (0.05, 0.12, 0.24, 0.48, 0.7)
 BOUNDED: Final = 100  # vehicles that only say "at least"
 BACKLOG: Final = 20  # vehicles of an outage
 HOUR_S: Final = 3600.0
-ICE, DRY = 0.18, 0.85
+ICE = 0.18
+DRY = 0.85
 FREEZING_C: Final = -1.0
-CARS, CURVES = 60, 20  # fleets on a wet curve
-WET, GENTLE = 0.60, 0.30
+# fleets on a wet curve
+CARS = 60
+CURVES = 20
+WET = 0.60
+GENTLE = 0.30
 WINTER: Final = agent.CLEAN._replace(share=(0.25, 0.35), low=0.65, tyres=-0.05, alike=1.0)
 VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with common tyres
 
 
 def bounded(used: float, path: str) -> float:
     """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by one path of the wire."""
-    n, nan = BOUNDED, float("nan")
+    n = BOUNDED
+    nan = float("nan")
     cell = np.full(n, CELL[0])
     latitude, longitude = grid.centre(cell)
     columns: dict[str, Any] = {
-        "enter_time": START + np.arange(n) * 5 * NS, "latitude": latitude, "longitude": longitude, "yaw": np.zeros(n),
-        "mu_utilised": np.full(n, used), "mu": np.full(n, nan), "mu_lower": np.full(n, nan),
+        "enter_time": START + np.arange(n) * 5 * NS,
+        "latitude": latitude,
+        "longitude": longitude,
+        "yaw": np.zeros(n),
+        "mu_utilised": np.full(n, used),
+        "mu": np.full(n, nan),
+        "mu_lower": np.full(n, nan),
         "mu_upper": np.full(n, nan),
-    }  # fmt: skip
+    }
     if "likelihood" in path:
         above = np.where(used > mugrid.CENTRES, -6.0, 0.3 * mugrid.CENTRES)
         columns["log_likelihood"] = np.tile(mugrid.encode_log_likelihood(above), (n, 1))
@@ -67,10 +77,12 @@ def bounded(used: float, path: str) -> float:
 
 def _received(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
     """A batch as the service reads it from its bytes."""
-    payload, encoding = wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]
+    payload = wire.encode(batch)
+    encoding = wire.ENCODING[Kind.OBSERVATION]
     if as_json:
         message = wire.MESSAGES[Kind.OBSERVATION].FromString(payload)
-        payload, encoding = json_format.MessageToJson(message).encode(), wire.JSON
+        payload = json_format.MessageToJson(message).encode()
+        encoding = wire.JSON
     found = wire.decode(payload, encoding, Kind.OBSERVATION)
     columns = dict(found.columns)
     given = columns["log_likelihood"].shape[1] > 0
@@ -90,7 +102,8 @@ def lower_excess() -> float:
 
 def backlog_fused(rng: Generator) -> float:
     """Share of an hour's rows that are fused when they come after an outage, while another vehicle drives on."""
-    place, errors = town.build(rng, 60, 0.0), Errors.draw(rng, BACKLOG + 1)
+    place = town.build(rng, 60, 0.0)
+    errors = Errors.draw(rng, BACKLOG + 1)
     visits = town.drive(rng, place, errors, 60)
     o = observations_of(rows_of(visits), visits.vehicle)
     live = o.vehicle == BACKLOG
@@ -109,7 +122,8 @@ def safe_excess(rng: Generator) -> float:
         [np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0]
     )
     icy = seconds >= HOUR_S
-    n, who = len(seconds), rng.integers(0, 40, len(seconds))
+    n = len(seconds)
+    who = rng.integers(0, 40, len(seconds))
     share: FloatArray = np.where(icy, 0.2, rng.uniform(0.6, 1.0, n))
     mu: FloatArray = np.where(icy, ICE, DRY)
     nothing = np.zeros(n, np.int64)
@@ -139,7 +153,8 @@ def _weather(temperature: float) -> Reports:
 
 def false_alert(rng: Generator) -> bool:
     """Whether CARS on winter tyres whom nobody knows, who all take a wet curve gently, make an alert of it."""
-    n, who = CARS, np.arange(CARS)
+    n = CARS
+    who = np.arange(CARS)
     share = rng.uniform(*WINTER.share, n)
     valued = rng.random(n) < VALUED
     mu: FloatArray = np.full(n, WET)
@@ -150,8 +165,10 @@ def false_alert(rng: Generator) -> bool:
     visits = Visits(
         seconds, who, 0 * who, mu, valued, agent.report(rng, Errors.draw(rng, n, WINTER), passes)
     )
-    o, fusion = observations_of(rows_of(visits), who), Fusion(LATENESS_S)
-    alerts, raised = Alerts(fusion), False
+    o = observations_of(rows_of(visits), who)
+    fusion = Fusion(LATENESS_S)
+    alerts = Alerts(fusion)
+    raised = False
     for k in range(n):
         raised |= any(
             alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots)

@@ -53,7 +53,8 @@ GAINS: Final = {"third_party": 0.05, "third_party.gain_common": 0.10}  # standar
 
 CHANGE_CELLS: Final = 30
 CHANGE_STRETCH: Final = 6  # no cell has a neighbour of another road
-DRY, WHITE = 0.85, 0.15
+DRY = 0.85
+WHITE = 0.15
 CHANGE_VISITS: Final = 240  # per cell and road
 STEP_S: Final = 10.0  # the alerts are read so often
 NEVER: Final = 999

@@ -21,12 +21,20 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import NS
 
 START: Final = 1_800_000_000 * NS
-ROADS, LENGTH = 10, 12  # cells of a road
+# cells of a road
+ROADS = 10
+LENGTH = 12
 CELLS: Final = ROADS * LENGTH
 STRETCH: Final = 4  # cells of one surface
-SURFACES: Final = {"dry": (0.85, 0.08, 0.45), "wet": (0.55, 0.07, 0.25), "snow": (0.30, 0.04, 0.15),
-                   "ice": (0.15, 0.03, 0.15)}  # mean, spread, share  # fmt: skip
-LEAST, MOST = 0.08, 1.10  # of any road
+SURFACES: Final = {
+    "dry": (0.85, 0.08, 0.45),
+    "wet": (0.55, 0.07, 0.25),
+    "snow": (0.30, 0.04, 0.15),
+    "ice": (0.15, 0.03, 0.15),
+}  # mean, spread, share
+# of any road
+LEAST = 0.08
+MOST = 1.10
 DRIFT: Final = 0.03  # per square root of an hour
 ZONE: Final = 6  # cells of one EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
 EXCITEMENT: Final = (
@@ -34,8 +42,10 @@ EXCITEMENT: Final = (
     (0.08, 0.4),
     (0.02, 0.4),
 )  # P(a pass is excited), share of such cells
-CELL_M, FIX_STD_M = 10.0, 1.5
-_NORTH, _WEST = 57.70, 11.90
+CELL_M = 10.0
+FIX_STD_M = 1.5
+_NORTH = 57.70
+_WEST = 11.90
 
 
 def cell_numbers(cells: int = CELLS) -> IntArray:
@@ -66,7 +76,8 @@ class Town:
 
 def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
     """Draw a town. `changing` is the share of roads that get another surface at some minute."""
-    names, share = list(SURFACES.values()), [s[2] for s in SURFACES.values()]
+    names = list(SURFACES.values())
+    share = [s[2] for s in SURFACES.values()]
     stretches = CELLS // STRETCH
 
     def surface() -> FloatArray:
@@ -79,7 +90,8 @@ def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLE
         * np.sqrt(1 / 60)
         * np.vstack([np.zeros(stretches), rng.normal(size=(minutes, stretches))])
     )
-    before, after = surface(), surface()
+    before = surface()
+    after = surface()
     change = np.where(
         rng.random(ROADS) < changing, rng.uniform(0.2, 0.8, ROADS) * minutes, np.inf
     ).repeat(LENGTH)
@@ -119,15 +131,18 @@ def drive(
     Until the minute `acquainted` only the first half of the roads are driven, from then on the other half, if it is not
     nought: then vehicles know each other, and nobody knows the roads.
     """
-    vehicles, model = len(errors.slope), errors.model
+    vehicles = len(errors.slope)
+    model = errors.model
     passes = rng.poisson(vehicles * minutes)
-    begin, who = rng.random(passes) * minutes * 60.0, rng.integers(0, vehicles, passes)
+    begin = rng.random(passes) * minutes * 60.0
+    who = rng.integers(0, vehicles, passes)
     along = np.tile(np.arange(LENGTH), passes)
     seconds = np.repeat(begin, LENGTH) + along
     roads = rng.integers(0, ROADS, passes)
     if acquainted:
         roads = roads // 2 + np.where(begin < 60.0 * acquainted, 0, ROADS // 2)
-    vehicle, place = np.repeat(who, LENGTH), np.repeat(roads * LENGTH, LENGTH) + along
+    vehicle = np.repeat(who, LENGTH)
+    place = np.repeat(roads * LENGTH, LENGTH) + along
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
     manoeuvre = np.where(
@@ -135,7 +150,8 @@ def drive(
         town.usual[place],
         rng.integers(0, MANOEUVRES, len(place)),
     )
-    shares, noise = agent.shares(rng, excited, model), agent.noise(rng, along, model.tails)
+    shares = agent.shares(rng, excited, model)
+    noise = agent.noise(rng, along, model.tails)
     common = town.common[place, manoeuvre]
     reports = agent.report(
         rng, errors, Passes(vehicle, mu, common, shares, noise, manoeuvre, excited)
@@ -161,7 +177,10 @@ def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)
     reports = SimulatedReports(
-        readings, np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std), np.where(lying, claim, v.reports.used),
-        v.reports.manoeuvre, np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
-    )  # fmt: skip
+        readings,
+        np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std),
+        np.where(lying, claim, v.reports.used),
+        v.reports.manoeuvre,
+        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
+    )
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)

@@ -35,7 +35,8 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
         own = cell[label == number]
         west, south, east, north = grid.bounds(own)
         box = [float(west.min()), float(south.min()), float(east.max()), float(north.max())]
-        latitude, longitude = (box[1] + box[3]) / 2, (box[0] + box[2]) / 2
+        latitude = (box[1] + box[3]) / 2
+        longitude = (box[0] + box[2]) / 2
         alerts = sum(_inside(box, one["longitude"], one["latitude"]) for one in standing)
         found.append(
             {

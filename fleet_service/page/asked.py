@@ -77,7 +77,8 @@ def _interval(text: str, now: int) -> tuple[int, int | None]:
     RFC 3339: an instant, or an interval of which one side may be open (`..` or nothing).
     """
     first, is_interval, last = text.partition("/")
-    begin, end = _instant(first), _instant(last if is_interval else first)
+    begin = _instant(first)
+    end = _instant(last if is_interval else first)
     if begin is None and end is None and not is_interval:
         raise InputError(
             "datetime",

@@ -15,7 +15,8 @@ from typing import Any, Final, NamedTuple, Protocol
 from fleet_service.page.vector_tiles import PmtilesFile, unpack_tile
 from schemas.errors import InputError
 
-MBTILES, PMTILES = ".mbtiles", ".pmtiles"
+MBTILES = ".mbtiles"
+PMTILES = ".pmtiles"
 OWN: Final = "/base/{z}/{x}/{y}"  # address of the tiles of a file
 VECTOR: Final = "pbf"
 KINDS: Final = {

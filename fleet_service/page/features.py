@@ -22,7 +22,9 @@ CRS84: Final = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 CONFORMANCE: Final = tuple(
     f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "geojson")
 )
-FEW, MOST = 1000, 10_000  # features in an answer: unless asked otherwise, and at the most
+# features in an answer: unless asked otherwise, and at the most
+FEW = 1000
+MOST = 10_000
 TITLE: Final = "Grip of the road, measured by vehicles"
 ABOUT: Final = (
     "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % quantiles. basis: "
@@ -34,10 +36,11 @@ ABOUT: Final = (
 _PLACE: Final = ("latitude", "longitude", "west", "south", "east", "north")
 COLUMNS: Final = tuple(field for field in tables.MAP_CELL if field.name not in _PLACE)
 _TYPES: Final[dict[pa.DataType, dict[str, str]]] = {
-    pa.string(): {"type": "string"}, tables.NS: {"type": "string", "format": "date-time"},
+    pa.string(): {"type": "string"},
+    tables.NS: {"type": "string", "format": "date-time"},
     **{kind: {"type": "number"} for kind in (pa.float32(), pa.float64())},
     **{kind: {"type": "integer"} for kind in (pa.int8(), pa.int32(), pa.int64())},
-}  # fmt: skip
+}
 Box = tuple[float, float, float, float]
 
 
@@ -71,7 +74,8 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 def landing(base: str) -> dict[str, Any]:
     """Return the landing page; `base` is the address without a final slash."""
     return {
-        "title": "GripMap", "description": ABOUT,
+        "title": "GripMap",
+        "description": ABOUT,
         "links": [
             _link(f"{base}/?f=json", "self", JSON, "this document"),
             _link(f"{base}/", "alternate", "text/html", "the live page"),
@@ -79,7 +83,7 @@ def landing(base: str) -> dict[str, Any]:
             _link(f"{base}/conformance", "conformance", JSON, "what it conforms to"),
             _link(f"{base}/collections", "data", JSON, "the collections"),
         ],
-    }  # fmt: skip
+    }
 
 
 def conformance() -> dict[str, Any]:
@@ -97,13 +101,17 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
     """Return the collection; `extent` is the box of all cells, if there are any."""
     own = f"{base}/collections/{COLLECTION}"
     found: dict[str, Any] = {
-        "id": COLLECTION, "title": TITLE, "description": ABOUT, "itemType": "feature", "crs": [CRS84],
+        "id": COLLECTION,
+        "title": TITLE,
+        "description": ABOUT,
+        "itemType": "feature",
+        "crs": [CRS84],
         "links": [
             _link(own, "self", JSON, "this document"),
             _link(f"{own}/items", "items", GEOJSON, "the features"),
             _link(f"{own}/schema", "describedby", SCHEMA_JSON, "the columns"),
         ],
-    }  # fmt: skip
+    }
     if extent is not None:
         found["extent"] = {"spatial": {"bbox": [list(extent)], "crs": CRS84}}
     return found
@@ -117,12 +125,15 @@ def schema(base: str) -> dict[str, Any]:
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"{base}/collections/{COLLECTION}/schema", "type": "object", "title": TITLE,
+        "$id": f"{base}/collections/{COLLECTION}/schema",
+        "type": "object",
+        "title": TITLE,
         "properties": {
-            "type": {"type": "string"}, "geometry": {"type": "object"},
+            "type": {"type": "string"},
+            "geometry": {"type": "object"},
             "properties": {"type": "object", "properties": columns},
         },
-    }  # fmt: skip
+    }
 
 
 def api(base: str) -> dict[str, Any]:
@@ -145,26 +156,38 @@ def api(base: str) -> dict[str, Any]:
         }
 
     asked = (
-        parameter("bbox", "query", "west, south, east, north [deg]", type="array", items={"type": "number"},
-                  minItems=4, maxItems=4) | {"style": "form", "explode": False},
+        parameter(
+            "bbox",
+            "query",
+            "west, south, east, north [deg]",
+            type="array",
+            items={"type": "number"},
+            minItems=4,
+            maxItems=4,
+        )
+        | {"style": "form", "explode": False},
         parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
-        parameter("limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW),
+        parameter(
+            "limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW
+        ),
         parameter("after", "query", "id after which to go on; links say it", type="string"),
-    )  # fmt: skip
-    one, own = (
-        parameter("featureId", "path", "CELL-SECTOR", type="string"),
-        f"/collections/{COLLECTION}",
     )
+    one = parameter("featureId", "path", "CELL-SECTOR", type="string")
+    own = f"/collections/{COLLECTION}"
     return {
-        "openapi": "3.0.3", "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
+        "openapi": "3.0.3",
+        "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
         "servers": [{"url": base}],
         "paths": {
-            "/": route("what there is"), "/conformance": route("what it conforms to"),
-            "/collections": route("the collections"), own: route("the collection"),
-            f"{own}/schema": route("the columns"), f"{own}/items": route("features", *asked),
+            "/": route("what there is"),
+            "/conformance": route("what it conforms to"),
+            "/collections": route("the collections"),
+            own: route("the collection"),
+            f"{own}/schema": route("the columns"),
+            f"{own}/items": route("features", *asked),
             f"{own}/items/{{featureId}}": route("one feature", one),
         },
-    }  # fmt: skip
+    }
 
 
 def page_of(
@@ -184,9 +207,12 @@ def page_of(
     if more:
         links.append(_link(following, "next", GEOJSON, "what follows"))
     return {
-        "type": "FeatureCollection", "timeStamp": stamp, "numberReturned": len(found), "links": links,
+        "type": "FeatureCollection",
+        "timeStamp": stamp,
+        "numberReturned": len(found),
+        "links": links,
         "features": found,
-    }  # fmt: skip
+    }
 
 
 def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:

@@ -65,9 +65,14 @@ class ServiceHealth:
             )
         }
         return {
-            "address": address, "answers": True, "observations": rows, "per_second": rate,
-            "refused": found.get("refused_messages", {}), "failures": found.get("failures", {}), **single,
-        }  # fmt: skip
+            "address": address,
+            "answers": True,
+            "observations": rows,
+            "per_second": rate,
+            "refused": found.get("refused_messages", {}),
+            "failures": found.get("failures", {}),
+            **single,
+        }
 
 
 def values(text: str) -> dict[str, dict[str, float]]:

@@ -51,7 +51,8 @@ class Moments:
     """
 
     def __init__(self, root: Path | None, recent: RecentMoments | None = None) -> None:
-        self._root, self._recent = root, recent or RecentMoments()
+        self._root = root
+        self._recent = recent or RecentMoments()
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
         self._lock = threading.Lock()
 

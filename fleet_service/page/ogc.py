@@ -37,14 +37,20 @@ class FeatureRoutes:
     """
 
     def __init__(self, world: MapMirror, reader: Reader) -> None:
-        self._world, self._reader = world, reader
+        self._world = world
+        self._reader = reader
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
         """Return the handlers by path."""
         return {
-            "/conformance": self.conformance, "/collections": self.collections, _OWN: self.collection, "/api": self.api,
-            f"{_OWN}/schema": self.schema, f"{_OWN}/items": self.items, f"{_OWN}/items/{{feature}}": self.item,
-        }  # fmt: skip
+            "/conformance": self.conformance,
+            "/collections": self.collections,
+            _OWN: self.collection,
+            "/api": self.api,
+            f"{_OWN}/schema": self.schema,
+            f"{_OWN}/items": self.items,
+            f"{_OWN}/items/{{feature}}": self.item,
+        }
 
     async def landing(self, request: Request) -> Response:
         """Return the landing page for programs."""
@@ -82,7 +88,8 @@ class FeatureRoutes:
         table = self._cells(question)
         more = table.num_rows > question.limit
         table = table.slice(0, question.limit)
-        address, last = f"{_base(request)}{_OWN}/items", ""
+        address = f"{_base(request)}{_OWN}/items"
+        last = ""
         if table.num_rows:
             last = features.identity(table["cell"][-1].as_py(), table["sector"][-1].as_py())
         given = {name: value for name, value in request.query_params.items() if name != "after"}
@@ -92,9 +99,12 @@ class FeatureRoutes:
             .replace("+00:00", "Z")
         )
         answer = features.page_of(
-            features.with_identity(extract.features(geo.with_cells(table))), more, str(request.url),
-            f"{address}?{urlencode(given | {'after': last})}", stamp,
-        )  # fmt: skip
+            features.with_identity(extract.features(geo.with_cells(table))),
+            more,
+            str(request.url),
+            f"{address}?{urlencode(given | {'after': last})}",
+            stamp,
+        )
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
 
     async def item(self, request: Request) -> Response:
@@ -120,7 +130,8 @@ class FeatureRoutes:
         Raises:
             InputError: a service refused the query.
         """
-        found, rows = [MAP_SCHEMA.empty_table()], 0
+        found = [MAP_SCHEMA.empty_table()]
+        rows = 0
         for table in self._tiles(question):
             place = table["cell"].to_numpy() * grid.SECTORS + table["sector"].to_numpy()
             newest = table["last_time"].cast(pa.int64()).to_numpy()

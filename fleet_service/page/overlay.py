@@ -30,6 +30,7 @@ def cells(path: Path | None) -> dict[str, list[Any]] | None:
         ) from error
     found = table.group_by(["cell", "sector"]).aggregate([("mu", "mean")])
     return {
-        "cell": [str(cell) for cell in found["cell"].to_pylist()], "sector": found["sector"].to_pylist(),
+        "cell": [str(cell) for cell in found["cell"].to_pylist()],
+        "sector": found["sector"].to_pylist(),
         "mu": found["mu_mean"].to_numpy().round(3).tolist(),
-    }  # fmt: skip
+    }

@@ -44,7 +44,8 @@ class Reader:
     """
 
     def __init__(self, connection: ZenohSettings, world: MapMirror) -> None:
-        self._connection, self._world = connection, world
+        self._connection = connection
+        self._world = world
         self._session: zenoh.Session | None = None
         self._queriers: dict[int, Any] = {}
         self._away_since: dict[int, float] = {}
@@ -53,7 +54,9 @@ class Reader:
         self._fallen: dict[
             str, float
         ] = {}  # regions whose service said that it serves them, and went: since when
-        self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
+        self._served = False
+        self._stood = 0.0
+        self._tried = -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
         """Receive until `stop` is set."""
@@ -102,24 +105,29 @@ class Reader:
     def regions(self) -> list[dict[str, Any]]:
         """Return regions with cells: their box, whether a service answers, and since when none does."""
         return [
-            {"region": grid.quadkey(region, grid.REGION_ZOOM), "box": box_of(region, grid.REGION_ZOOM),
-             "served": region not in self._away_since, "since": self._away_since.get(region)}
+            {
+                "region": grid.quadkey(region, grid.REGION_ZOOM),
+                "box": box_of(region, grid.REGION_ZOOM),
+                "served": region not in self._away_since,
+                "since": self._away_since.get(region),
+            }
             for region in list(self._queriers)
         ] + [
             {"region": region, "box": _box_of_expression(region), "served": False, "since": since}
             for region, since in self._fallen.copy().items()
-        ]  # fmt: skip
+        ]
 
     def _note_fallen(self, services: tokens.PresenceTracker) -> None:
         """Record regions that lost their service and have no known cell; others are found through their cells."""
         here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
-            token.region for token in services.lost
+            token.region
+            for token in services.lost
             if token.region.startswith(tuple("0123"))
             and not any(regions.covers(one, token.region) for one in here)
             and not any(regions.overlap(one, token.region) for one in known)
-        }  # fmt: skip
+        }
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:

@@ -22,10 +22,19 @@ from schemas.thresholds import NS
 # last: newest observation [s since 1970]; place: cell within the tile · 4 + sector; mu, lower, upper: in MU_STEPS a
 # unit, 255 is 'no number'; slippery: P(mu < .4) in SHARE_STEPS; vehicles: 255 is '255 or more'; unknown: share of what
 # is below a place that was not measured.
-RECORD: Final = np.dtype([
-    ("last", "<u4"), ("place", "<u2"), ("mu", "u1"), ("lower", "u1"), ("upper", "u1"), ("slippery", "u1"),
-    ("basis", "u1"), ("vehicles", "u1"), ("unknown", "u1"),
-])  # fmt: skip
+RECORD: Final = np.dtype(
+    [
+        ("last", "<u4"),
+        ("place", "<u2"),
+        ("mu", "u1"),
+        ("lower", "u1"),
+        ("upper", "u1"),
+        ("slippery", "u1"),
+        ("basis", "u1"),
+        ("vehicles", "u1"),
+        ("unknown", "u1"),
+    ]
+)
 Records = NDArray[np.void]
 HEAD: Final = struct.Struct(
     "<4IB7xd"
@@ -33,7 +42,10 @@ HEAD: Final = struct.Struct(
 MU_STEPS: Final = 200
 SHARE_STEPS: Final = 254
 NO_NUMBER: Final = 255
-BOUND, MEASURED, BORROWED, GONE = 0, 1, 2, 255
+BOUND = 0
+MEASURED = 1
+BORROWED = 2
+GONE = 255
 CELL_LEVEL: Final = grid.CELL_ZOOM
 LEAST_LEVEL: Final = grid.TILE_ZOOM
 
@@ -103,11 +115,12 @@ def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
     measured = row["basis"] != BOUND and row["mu"] != NO_NUMBER
     return {
         "mu": int(row["mu"]) / MU_STEPS if measured else None,
-        "mu_lower": int(row["lower"]) / MU_STEPS, "mu_upper": int(row["upper"]) / MU_STEPS,
+        "mu_lower": int(row["lower"]) / MU_STEPS,
+        "mu_upper": int(row["upper"]) / MU_STEPS,
         "p_slippery": min(int(row["slippery"]) / SHARE_STEPS, 1.0),
         "basis": {MEASURED: "measured", BORROWED: "borrowed"}.get(int(row["basis"]), "bound"),
         "vehicles": int(row["vehicles"]),
-    }  # fmt: skip
+    }
 
 
 def aggregate_worst(records: Records, level: int) -> Records:

@@ -84,7 +84,9 @@ def read_roads(path: Path) -> RoadMap:
 
 
 def _add(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]) -> None:
-    kind, points, name = geometry["type"], geometry["coordinates"], str(about.get("name") or "")
+    kind = geometry["type"]
+    points = geometry["coordinates"]
+    name = str(about.get("name") or "")
     if kind == "Point" and name:
         found.places.append((name, float(points[0]), float(points[1])))
     lines = [points] if kind == "LineString" else points if kind == "MultiLineString" else []

@@ -56,8 +56,12 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
         if along[last] <= along[first]:
             continue
         middle = (first + last) // 2
-        place = {"from_m": round(float(along[first]), 1), "to_m": round(float(along[last]), 1),
-                 "longitude": float(longitude[middle]), "latitude": float(latitude[middle])}  # fmt: skip
+        place = {
+            "from_m": round(float(along[first]), 1),
+            "to_m": round(float(along[last]), 1),
+            "longitude": float(longitude[middle]),
+            "latitude": float(latitude[middle]),
+        }
         stretches.append(
             place | (_described(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN})
         )
@@ -76,9 +80,10 @@ def _described(cell: dict[str, Any]) -> dict[str, Any]:
     measured = cell["basis"] == "measured"
     names = ("cell", "sector", "basis", "mu_lower", "mu_upper", "p_slippery", "vehicles", "age_s")
     return {name: cell[name] for name in names} | {
-        "mu": cell["mu"] if measured else None, "cell": str(cell["cell"]),
+        "mu": cell["mu"] if measured else None,
+        "cell": str(cell["cell"]),
         "safe_speed": safe_speeds(cell["mu_lower"]) if measured else None,
-    }  # fmt: skip
+    }
 
 
 def _samples(points: Points) -> tuple[Any, Any, Any, Any]:

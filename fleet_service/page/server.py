@@ -138,9 +138,15 @@ async def _serve(
     say: Callable[[str], None],
 ) -> None:
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, server_header=False, lifespan="on", ws="none",
-        timeout_graceful_shutdown=LEAVE_S, h11_max_incomplete_event_size=64 * 1024,
-    )  # fmt: skip
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        lifespan="on",
+        ws="none",
+        timeout_graceful_shutdown=LEAVE_S,
+        h11_max_incomplete_event_size=64 * 1024,
+    )
     server = _Server(config)
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     while not server.started and not serving.done():

@@ -17,12 +17,18 @@ from typing import Any, Final, NamedTuple
 from schemas.errors import InputError
 
 EXTENT: Final = 4096
-POINT, LINE, POLYGON = 1, 2, 3
-_MOVE, _DRAW, _CLOSE = 1, 2, 7
+POINT = 1
+LINE = 2
+POLYGON = 3
+_MOVE = 1
+_DRAW = 2
+_CLOSE = 7
 _GZIP: Final = b"\x1f\x8b"
 _MAGIC: Final = b"PMTiles\x03"
 _HEAD: Final = struct.Struct("<7sB11Q6B")
-_NO_COMPRESSION, _GZIP_COMPRESSION, _MVT = 1, 2, 1
+_NO_COMPRESSION = 1
+_GZIP_COMPRESSION = 2
+_MVT = 1
 _MOST_DIRECTORY: Final = 16 << 20
 
 
@@ -61,13 +67,16 @@ def _layer(name: str, shapes: list[TileShape]) -> bytes:
 
 
 def _commands(shape: TileShape) -> bytes:
-    out, x, y = [], 0, 0
+    out = []
+    x = 0
+    y = 0
 
     def move_to(points: Sequence[tuple[int, int]]) -> None:
         nonlocal x, y
         for px, py in points:
             out.append(_varint(_zigzag(px - x)) + _varint(_zigzag(py - y)))
-            x, y = px, py
+            x = px
+            y = py
 
     for part in shape.parts:
         if shape.kind == POINT:
@@ -143,7 +152,8 @@ class PmtilesFile:
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
         """Return a tile, counted from the north-west, unpacked; None if there is none."""
         wanted = _hilbert(zoom, x, y)
-        offset, size = self._root, self._root_size
+        offset = self._root
+        size = self._root_size
         for _ in range(4):
             entry = _entry(self._part(offset, size), wanted)
             if entry is None:
@@ -168,7 +178,8 @@ def _entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
     """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is a leaf directory."""
     numbers = _varints(directory)
     count = next(numbers)
-    ids, at = [], 0
+    ids = []
+    at = 0
     for _ in range(count):
         at += next(numbers)
         ids.append(at)
@@ -200,13 +211,17 @@ def _hilbert(zoom: int, x: int, y: int) -> int:
     found: int = (4**zoom - 1) // 3
     side = 1 << zoom >> 1
     while side:
-        right, below = int(bool(x & side)), int(bool(y & side))
+        right = int(bool(x & side))
+        below = int(bool(y & side))
         found += side * side * ((3 * right) ^ below)
         if not below:
             if right:
-                x, y = side - 1 - x, side - 1 - y
+                x = side - 1 - x
+                y = side - 1 - y
             x, y = y, x
-        x, y, side = x & (side - 1), y & (side - 1), side >> 1
+        x = x & (side - 1)
+        y = y & (side - 1)
+        side = side >> 1
     return found
 
 

@@ -54,7 +54,9 @@ class Watchers:
     def __init__(
         self, world: MapMirror, state: Callable[[], dict[str, Any]], most: int = MOST
     ) -> None:
-        self._world, self._state, self._most = world, state, most
+        self._world = world
+        self._state = state
+        self._most = most
         self._watchers: set[_OpenPage] = set()
         self.reloads = 0
 

@@ -62,16 +62,28 @@ def application(
         hosts: accepted host names; empty accepts any.
         lifespan: runs next to it.
     """
-    routes, base = Routes(sources), sources.base_map
+    routes = Routes(sources)
+    base = sources.base_map
     paths: dict[str, Callable[[Request], Awaitable[Response]]] = {
-        "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/texts": routes.texts,
-        "/tiles": routes.tiles, "/blocks": routes.blocks, "/events": routes.events,
+        "/": routes.index,
+        "/static/{name}": routes.file,
+        "/settings": routes.settings,
+        "/texts": routes.texts,
+        "/tiles": routes.tiles,
+        "/blocks": routes.blocks,
+        "/events": routes.events,
         "/cell/{cell}/{sector}": routes.cell,
-        "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
-        "/health": routes.health, "/overlay": routes.overlay, "/roads": routes.roads,
-        "/areas": routes.areas, "/datex2/situation.xml": routes.situations,
-        "/base/{z:int}/{x:int}/{y:int}": routes.picture, **routes.features.paths(),
-    }  # fmt: skip
+        "/history/{cell}/{sector}": routes.history,
+        "/moments": routes.times,
+        "/route": routes.route,
+        "/health": routes.health,
+        "/overlay": routes.overlay,
+        "/roads": routes.roads,
+        "/areas": routes.areas,
+        "/datex2/situation.xml": routes.situations,
+        "/base/{z:int}/{x:int}/{y:int}": routes.picture,
+        **routes.features.paths(),
+    }
     app = Starlette(
         routes=[Route(path, with_errors(answer)) for path, answer in paths.items()],
         lifespan=lifespan,
@@ -87,7 +99,8 @@ class Routes:
     """Handlers, one method per route."""
 
     def __init__(self, sources: Sources) -> None:
-        self._of, self._files = sources, Files(STATIC)
+        self._of = sources
+        self._files = Files(STATIC)
         self.features = FeatureRoutes(sources.world, sources.reader)
 
     async def index(self, request: Request) -> Response:
@@ -113,15 +126,24 @@ class Routes:
     async def settings(self, _: Request) -> Response:
         """Return the numbers and colours that the page computes with."""
         base = self._of.base_map
-        return JSONResponse({
-            "colours": colours.as_json(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
-            "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "overlay": self._of.overlay is not None,
-            "base_map": base and {
-                "address": base.address, "zooms": base.zooms, "vector": base.is_vector,
-                "attribution": base.attribution,
-            },
-            "archive": self._of.moments.has_archive,
-        })  # fmt: skip
+        return JSONResponse(
+            {
+                "colours": colours.as_json(),
+                "reaction_s": REACTION_S,
+                "sights_m": route.SIGHTS_M,
+                "mu_steps": records.MU_STEPS,
+                "share_steps": records.SHARE_STEPS,
+                "overlay": self._of.overlay is not None,
+                "base_map": base
+                and {
+                    "address": base.address,
+                    "zooms": base.zooms,
+                    "vector": base.is_vector,
+                    "attribution": base.attribution,
+                },
+                "archive": self._of.moments.has_archive,
+            }
+        )
 
     async def roads(self, _: Request) -> Response:
         """Return the lines along which ribbons are drawn: of the operator's file, or learned from the cells."""
@@ -160,7 +182,9 @@ class Routes:
 
     async def blocks(self, request: Request) -> Response:
         """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed cells too."""
-        wanted, level, at = asked.tiles(request), asked.level(request), asked.moment(request)
+        wanted = asked.tiles(request)
+        level = asked.level(request)
+        at = asked.moment(request)
         if at is not None:
             made = await run_in_threadpool(
                 lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted]
@@ -238,12 +262,19 @@ class Routes:
     async def health(self, _: Request) -> Response:
         """Return the health of services and of this page."""
         services = await run_in_threadpool(self._of.health.services)
-        reader, watchers = self._of.reader, self._of.watchers
-        return JSONResponse({
-            "services": services, "names": reader.names("shard"), "vehicles": len(reader.names("alive")),
-            "regions": reader.regions(), "router": reader.is_connected,
-            "watchers": len(watchers), "reloads": watchers.reloads,
-        })  # fmt: skip
+        reader = self._of.reader
+        watchers = self._of.watchers
+        return JSONResponse(
+            {
+                "services": services,
+                "names": reader.names("shard"),
+                "vehicles": len(reader.names("alive")),
+                "regions": reader.regions(),
+                "router": reader.is_connected,
+                "watchers": len(watchers),
+                "reloads": watchers.reloads,
+            }
+        )
 
     async def situations(self, _: Request) -> Response:
         """Return the slippery stretches as a DATEX II publication (snapshot pull)."""
@@ -281,17 +312,20 @@ class Guarded:
     """Adds the headers of every answer, and refuses foreign host names against DNS rebinding."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
-        self._app, self._hosts = app, hosts
+        self._app = app
+        self._hosts = hosts
         pictures = f"'self' data: {origin(base_map or '')}".rstrip()
         policy = (
             f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self'; "
             "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
         self._headers = [
-            (b"content-security-policy", policy.encode()), (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"), (b"cross-origin-resource-policy", b"same-origin"),
+            (b"content-security-policy", policy.encode()),
+            (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"cross-origin-resource-policy", b"same-origin"),
             (b"x-frame-options", b"DENY"),
-        ]  # fmt: skip
+        ]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request and add the headers."""

@@ -59,7 +59,9 @@ class MapMirror:
             if np.array_equal(held.cells, cells):
                 return
             self._before.setdefault(tile, _Before(held.cells, held.version))
-            held.cells, held.version, held.made = cells, held.version + 1, {}
+            held.cells = cells
+            held.version = held.version + 1
+            held.made = {}
 
     def take_alert(self, alert: Alert, now: float) -> None:
         """Record that an alert of a cell was raised, repeated or cleared."""
@@ -98,7 +100,8 @@ class MapMirror:
     def changes(self) -> list[TileBlock]:
         """Return the changes of each tile since the last call."""
         with self._lock:
-            before, self._before = self._before, {}
+            before = self._before
+            self._before = {}
             found = []
             for tile, (cells, version) in before.items():
                 held = self._tiles[tile]
@@ -112,10 +115,8 @@ class MapMirror:
     def alerts_changed(self) -> bool:
         """Return True if stretches changed since the last call."""
         with self._lock:
-            found, self._alerts_changed = (
-                bool(self._stretches.changes()) or self._alerts_changed,
-                False,
-            )
+            found = bool(self._stretches.changes()) or self._alerts_changed
+            self._alerts_changed = False
             return found
 
     def stretches(self) -> list[StretchAlert]:

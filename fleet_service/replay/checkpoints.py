@@ -56,7 +56,8 @@ def save(root: Path, taken: Taken) -> Path:
         OSError: the disk is full; earlier checkpoints stay.
     """
     folder = root / CHECKPOINTS
-    draft, path = folder / _DRAFT, folder / f"{taken.cut.epoch:010d}-{taken.cut.number:012d}"
+    draft = folder / _DRAFT
+    path = folder / f"{taken.cut.epoch:010d}-{taken.cut.number:012d}"
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     for name, table in taken.tables.items():

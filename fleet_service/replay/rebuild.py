@@ -67,8 +67,11 @@ class Begin(NamedTuple):
 
 
 def restore_streams(
-    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = skip_damaged  # noqa: B008 immutable
-) -> None:  # fmt: skip
+    root: Path,
+    streams: SequenceTrackers,
+    begin: Begin = Begin(),
+    damaged: Damaged = skip_damaged,
+) -> None:
     """Record every archived batch as admitted, file by file.
 
     Args:
@@ -164,9 +167,13 @@ def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
 
 
 def past_fusion(
-    root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None,
+    root: Path,
+    lateness_s: float,
+    until: int,
+    box: Box | None = None,
+    most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
-) -> Fusion:  # fmt: skip
+) -> Fusion:
     """Return the fusion of a service that had received everything until a moment [ns], near a box [deg].
 
     The object that `listener` makes for it is called with the fused observations.
@@ -177,10 +184,8 @@ def past_fusion(
     """
     fusion = fusion_with_weather(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
-    wanted, heard = (
-        Since(begin, until=until, box=box, most=most),
-        nobody if listener is None else listener(fusion),
-    )
+    wanted = Since(begin, until=until, box=box, most=most)
+    heard = nobody if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history
     return fusion
@@ -233,10 +238,8 @@ def replay(
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
             rows = {name: column[new] for name, column in rows.items()}
-        o, before = (
-            observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"])),
-            _before(rows),
-        )
+        o = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
+        before = _before(rows)
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
         o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
@@ -254,13 +257,17 @@ def _before(rows: segments.Rows) -> Before:
 def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
     """Return parts joined in order."""
     of = Observations(
-        **{f.name: np.concatenate([getattr(o, f.name) for o, _ in parts]) for f in fields(Observations)}
-    )  # fmt: skip
+        **{
+            f.name: np.concatenate([getattr(o, f.name) for o, _ in parts])
+            for f in fields(Observations)
+        }
+    )
     befores = [before for _, before in parts]
     return of, Before(
-        late=np.concatenate([b.late for b in befores]), late_by=np.concatenate([b.late_by for b in befores]),
+        late=np.concatenate([b.late for b in befores]),
+        late_by=np.concatenate([b.late_by for b in befores]),
         weight=np.concatenate([b.weight for b in befores]),
-    )  # fmt: skip
+    )
 
 
 def _select_rows(
@@ -362,7 +369,8 @@ class _Held:
     """
 
     def __init__(self, name: str, borders: list[int]) -> None:
-        self._name, self._borders = name, borders
+        self._name = name
+        self._borders = borders
         self._kept: list[list[pa.Buffer]] = [[] for _ in borders[1:]]
         self._taken: list[tuple[int, int, pa.Buffer]] = []  # chunk and rows
         self.rows = 0
@@ -371,10 +379,8 @@ class _Held:
         """Add rows to those that `keep` or `forget` decides on."""
         time = segments.nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
-        table, places = (
-            _with_numbers(table).take(order),
-            np.searchsorted(time[order], self._borders).tolist(),
-        )
+        table = _with_numbers(table).take(order)
+        places = np.searchsorted(time[order], self._borders).tolist()
         for k, (start, stop) in enumerate(pairwise(places)):
             if stop > start:
                 sink = pa.BufferOutputStream()

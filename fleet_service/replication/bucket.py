@@ -58,11 +58,9 @@ class ObjectBucket:
             raise InputError(
                 "archive.copy", "a copy needs obstore, which is not installed", fix
             ) from error
-        self._do, self._known, self._missing = (
-            obstore,
-            AlreadyExistsError,
-            (NotFoundError, FileNotFoundError),
-        )
+        self._do = obstore
+        self._known = AlreadyExistsError
+        self._missing = (NotFoundError, FileNotFoundError)
         self._failed: tuple[type[Exception], ...] = (BaseError, OSError)
         places = (
             options.get("endpoint"),

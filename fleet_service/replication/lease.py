@@ -116,11 +116,16 @@ class Lease:
     """
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
-        self._holder, self._bucket, self.service, self._lease_s = holder, bucket, service, lease_s
+        self._holder = holder
+        self._bucket = bucket
+        self.service = service
+        self._lease_s = lease_s
         self._mine: LeaseRecord | None = None
-        self._renewed, self._stop = 0.0, threading.Event()
+        self._renewed = 0.0
+        self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self.lost, self.succeeds = False, False
+        self.lost = False
+        self.succeeds = False
         self.serves: Callable[[], bool] = lambda: True
 
     @property
@@ -178,7 +183,10 @@ class Lease:
             CopyError: the bucket cannot be reached, and this one is no standby.
         """
         seen: LeaseRecord | None = None
-        since, ahead, logged, stood = time.monotonic(), 0.0, "", False
+        since = time.monotonic()
+        ahead = 0.0
+        logged = ""
+        stood = False
         while not stop.is_set():
             line = ""
             if standby is not None:
@@ -194,7 +202,8 @@ class Lease:
                             "archive.copy", problem, "stop it, or start with --standby"
                         )
                     stood = stood and seen is not None and found.number == seen.number
-                    seen, since = found, time.monotonic()
+                    seen = found
+                    since = time.monotonic()
                 stands = standby is not None and found is not None and standby.stands(found.service)
                 stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
                 stood = stood or stands
@@ -231,7 +240,8 @@ class Lease:
         self._stop.set()
         if self._thread is not None:
             self._thread.join(self._lease_s)
-        mine, self._mine = self._mine, None
+        mine = self._mine
+        self._mine = None
         if mine is not None and not self.lost:
             try:
                 self._bucket.put(
@@ -291,7 +301,8 @@ class Lease:
         began = elapsed_seconds()
         if not self._bucket.make(mine.name, mine.content):
             return False
-        self._mine, self._renewed = mine, began
+        self._mine = mine
+        self._renewed = began
         self.succeeds = found is not None and found.holder != self._holder
         if found is not None and self._bucket.get(found.name) != found.content:
             stop.wait(
@@ -311,16 +322,15 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
     Raises:
         OSError: the folder cannot be read or written.
     """
-    path, place = (
-        root / HOLDER,
-        {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino},
-    )
+    path = root / HOLDER
+    place = {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino}
     identity: dict[str, Any] = {}
     if path.exists():
         with suppress(ValueError):
             identity = json.loads(path.read_bytes())
     if not place.items() <= identity.items() or "holder" not in identity:
-        known, identity = identity.get("copy") == url, {**place, "holder": secrets.token_hex(8)}
+        known = identity.get("copy") == url
+        identity = {**place, "holder": secrets.token_hex(8)}
         with open_durably(path) as file:
             file.write(json.dumps(identity).encode())
         return str(identity["holder"]), known

@@ -36,8 +36,11 @@ class Ownership:
     def __init__(
         self, lock_file: BinaryIO, copy: BucketReplica | None, lease: Lease | None = None
     ) -> None:
-        self._lock_file, self.copy, self.lease = lock_file, copy, lease
-        self.to, self.leaves = "", False
+        self._lock_file = lock_file
+        self.copy = copy
+        self.lease = lease
+        self.to = ""
+        self.leaves = False
 
     @property
     def epoch(self) -> int:
@@ -146,10 +149,15 @@ def acquire(
 
 
 def _leased(
-    config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None,
+    config: ServiceConfig,
+    root: Path,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    signs: Signs | None,
     lock_file: BinaryIO,
-) -> Ownership | None:  # fmt: skip
-    url, options = str(config.archive.second), config.archive.options
+) -> Ownership | None:
+    url = str(config.archive.second)
+    options = config.archive.options
     empty = not any((root / folder).exists() for folder in FOLDERS)
     holder, known = holder_of(root, url)
     lease = Lease(

@@ -71,19 +71,23 @@ class BucketReplica:
     """
 
     def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
-        self._root, self._url = root, url
-        self._quick, self._slow = (
-            ObjectBucket(url, options, QUICK_S),
-            ObjectBucket(url, options, SLOW_S),
-        )
+        self._root = root
+        self._url = url
+        self._quick = ObjectBucket(url, options, QUICK_S)
+        self._slow = ObjectBucket(url, options, SLOW_S)
         self._copied = UploadJournal(root, url)
         self._following = Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
-        self.failures, self._in_a_row, self._not_before, self._error = 0, 0, 0.0, ""
+        self.failures = 0
+        self._in_a_row = 0
+        self._not_before = 0.0
+        self._error = ""
         self._since: float | None = None
         self._may: Callable[[], bool] = lambda: True
         self._alone: Callable[[], None] | None = None
-        self._term, self._fence, self._turn = Term(0, 0), Fence(0, frozenset()), 0
+        self._term = Term(0, 0)
+        self._fence = Fence(0, frozenset())
+        self._turn = 0
 
     def close(self) -> None:
         """Close the copy and leave the bucket unchanged."""
@@ -97,7 +101,8 @@ class BucketReplica:
             may: returns True if the lease is certainly held.
             alone: checks in the bucket that no later lease exists; CopyError if one exists or the check fails.
         """
-        self._may, self._alone = may, alone
+        self._may = may
+        self._alone = alone
 
     @property
     def away_s(self) -> float:
@@ -186,7 +191,8 @@ class BucketReplica:
     def _put_fence(self, term: Term, fence: Fence) -> None:
         self._turn += 1
         put_fence(self._slow, term.number, self._turn, fence)
-        self._term, self._fence = term, fence
+        self._term = term
+        self._fence = fence
 
     def _mirror(self) -> int:
         """Make the folder identical to the bucket; return the number of downloaded files."""
@@ -225,13 +231,15 @@ class BucketReplica:
             self._put_soon([*keys, *missing])
         except CopyError as error:
             self.failures += 1
-            self._error, self._since = str(error), self._since or time.monotonic()
+            self._error = str(error)
+            self._since = self._since or time.monotonic()
             self._not_before = time.monotonic() + min(
                 BACK_OFF_S * 2.0**self._in_a_row, MOST_BACK_OFF_S
             )
             self._in_a_row = min(self._in_a_row + 1, 10)
             raise
-        self._in_a_row, self._since = 0, None
+        self._in_a_row = 0
+        self._since = None
 
     def sync(self) -> int:
         """Upload new and rewritten files, then delete removed ones; return the number of changed objects.
@@ -270,9 +278,10 @@ class BucketReplica:
             )  # before the files: what comes meanwhile is not taken for gone
             local = self._files(FOLDERS)
             new = [
-                name for name, stamp in local.items()
+                name
+                for name, stamp in local.items()
                 if known.get(name) != stamp and (with_log or not name.startswith(LOG))
-            ]  # fmt: skip
+            ]
             new.sort(key=lambda name: name.endswith(_LAST))
             vanished = [name for name in new if not self._put_there(name)]
             removed = [
@@ -306,7 +315,8 @@ class BucketReplica:
         return True
 
     def _put(self, path: Path, bucket: ObjectBucket) -> None:
-        name, stamp = self._name(path), stamp_of(path)
+        name = self._name(path)
+        stamp = stamp_of(path)
         if self._copied.stamp(name) is None and (name.startswith(LOG) or name.endswith(".key")):
             self._put_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
@@ -354,11 +364,13 @@ class BucketReplica:
         known = self._copied.stamps()
         whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{_LAST}")}
         wanted = [
-            name for name in there
-            if name not in local and _ours(name)
+            name
+            for name in there
+            if name not in local
+            and _ours(name)
             and (name not in known or self._aside(name).exists())
             and (not name.startswith(CHECKPOINTS) or name.rpartition("/")[0] in whole)
-        ]  # fmt: skip
+        ]
         list(self._pool.map(self._get, wanted))
         paths = [self._root / name for name in wanted]
         sync_tree(self._root, {path.parent for path in paths})
@@ -370,7 +382,8 @@ class BucketReplica:
         return len(wanted)
 
     def _get(self, name: str) -> None:
-        path, secret = self._root / name, name.startswith(KEYS)
+        path = self._root / name
+        secret = name.startswith(KEYS)
         path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
         with open_durably(path, 0o600 if secret else None, named=False) as file:
             for part in self._slow.parts(name):

@@ -48,7 +48,8 @@ class UploadJournal:
     """
 
     def __init__(self, root: Path, url: str) -> None:
-        path, head = root / NAME, json.dumps({"copy": url})
+        path = root / NAME
+        head = json.dumps({"copy": url})
         self._guard = Lock()
         self._stamps: dict[str, Stamp] = {}
         lines = path.read_text(errors="replace").splitlines() if path.exists() else []

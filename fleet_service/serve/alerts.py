@@ -45,7 +45,8 @@ class Alerts:
     """
 
     def __init__(self, fusion: Fusion, idle_roads: IdleRoads | None = None) -> None:
-        self._fusion, self._idle_roads = fusion, idle_roads
+        self._fusion = fusion
+        self._idle_roads = idle_roads
         self._standing: dict[int, Alert] = {}
 
     @property
@@ -75,7 +76,8 @@ class Alerts:
 
     def update(self, slots: IntArray) -> list[Alert]:
         """Return the alerts that updated cells raise or clear."""
-        time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
+        time = self._fusion.live.time[slots]
+        slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         likely = np.flatnonzero((slippery > LIKELY) & ~standing)
         likely = likely[self._have_witnesses(slots[likely], ICE, time[likely])]
@@ -83,7 +85,8 @@ class Alerts:
         believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
         out = []
         for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
-            slot, when = int(slots[k]), int(time[k])
+            slot = int(slots[k])
+            when = int(time[k])
             if probability > RAISE_ABOVE and self._is_admitted(slot, when):
                 reason = f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
                 self._standing[slot] = self._alert(slot, when, True, reason)
@@ -135,7 +138,16 @@ class Alerts:
         latitude, longitude = grid.centre(cell)
         lower, mu, upper = quantiles(belief, (LOWER, 0.5, UPPER))[:, 0].tolist()
         return Alert(
-            cell=cell, sector=sector, raised=raised, time=time, mu=mu, mu_lower=lower, mu_upper=upper,
-            p_slippery=float(belief[0] @ SLIPPERY_SHARE), vehicles=int(fusion.live.vehicles[slot]),
-            latitude=float(latitude), longitude=float(longitude), reason=reason,
-        )  # fmt: skip
+            cell=cell,
+            sector=sector,
+            raised=raised,
+            time=time,
+            mu=mu,
+            mu_lower=lower,
+            mu_upper=upper,
+            p_slippery=float(belief[0] @ SLIPPERY_SHARE),
+            vehicles=int(fusion.live.vehicles[slot]),
+            latitude=float(latitude),
+            longitude=float(longitude),
+            reason=reason,
+        )

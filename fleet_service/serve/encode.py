@@ -18,7 +18,8 @@ from schemas.query import Format
 from schemas.thresholds import GRAVITY
 
 _BASES: Final = pa.array(["bound", "measured", "borrowed"])
-_BOUND, _BORROWED = 0, 2
+_BOUND = 0
+_BORROWED = 2
 _SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
 _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end
 
@@ -31,13 +32,26 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
     slippery = cells.belief @ SLIPPERY_SHARE
     basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values, slippery))
     columns: dict[str, Any] = {
-        "cell": cells.cell, "sector": cells.sector, "mu": pa.array(middle, mask=basis == _BOUND), "mu_lower": lower,
-        "mu_upper": upper, "p_slippery": slippery, "basis": _BASES.take(basis.astype(np.int8)),
-        "vehicles": cells.vehicles, "observations": cells.observations,
-        "first_time": cells.first, "last_time": cells.last, "age_s": np.maximum(now - cells.last, 0) * 1e-9,
-        "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
+        "cell": cells.cell,
+        "sector": cells.sector,
+        "mu": pa.array(middle, mask=basis == _BOUND),
+        "mu_lower": lower,
+        "mu_upper": upper,
+        "p_slippery": slippery,
+        "basis": _BASES.take(basis.astype(np.int8)),
+        "vehicles": cells.vehicles,
+        "observations": cells.observations,
+        "first_time": cells.first,
+        "last_time": cells.last,
+        "age_s": np.maximum(now - cells.last, 0) * 1e-9,
+        "latitude": latitude,
+        "longitude": longitude,
+        "west": west,
+        "south": south,
+        "east": east,
+        "north": north,
         "safe_deceleration": GRAVITY * lower,
-    }  # fmt: skip
+    }
     found = ((columns[f.name], f.type) for f in tables.MAP_SCHEMA)
     arrays = [
         (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False) for c, kind in found

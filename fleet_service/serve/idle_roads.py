@@ -60,7 +60,8 @@ class IdleRoads:
 
 def _is_within(areas: Sequence[tuple[int, FloatArray]], place: FloatArray) -> bool:
     for _, centre in areas:
-        north, east = place[0] - centre[0], (place[1] - centre[1] + 180.0) % 360.0 - 180.0
+        north = place[0] - centre[0]
+        east = (place[1] - centre[1] + 180.0) % 360.0 - 180.0
         if np.hypot(north, east * np.cos(np.radians(place[0]))) * METRES_PER_DEGREE <= AREA_M:
             return True
     return False

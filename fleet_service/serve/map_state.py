@@ -46,7 +46,8 @@ class MapState:
 
     def take_dirty(self) -> list[int]:
         """Return the tiles that changed since the last call."""
-        dirty, self._dirty = sorted(self._dirty), set()
+        dirty = sorted(self._dirty)
+        self._dirty = set()
         return dirty
 
     def tiles(self) -> list[int]:

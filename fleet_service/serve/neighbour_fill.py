@@ -42,34 +42,40 @@ def impute(
         & (grid.tile_of(near) == tile)
         & (fusion.slots_of(np.maximum(near, 0), sector) < 0)
     )
-    keys, visited = (near * grid.SECTORS + sector)[free], visited[free]
+    keys = (near * grid.SECTORS + sector)[free]
+    visited = visited[free]
     share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
         ahead = np.isin(keys, route)
         along = _along(fusion, route, tile)
         keys, visited, share = (
-            np.concatenate([a[ahead], b]) for a, b in zip((keys, visited, share), along, strict=True)
-        )  # fmt: skip
+            np.concatenate([a[ahead], b])
+            for a, b in zip((keys, visited, share), along, strict=True)
+        )
     wanted, group = np.unique(keys, return_inverse=True)
-    belief, whole, most = (
-        np.zeros((len(wanted), mugrid.BINS)),
-        np.zeros(len(wanted)),
-        np.zeros(len(wanted)),
-    )
+    belief = np.zeros((len(wanted), mugrid.BINS))
+    whole = np.zeros(len(wanted))
+    most = np.zeros(len(wanted))
     np.add.at(belief, group, share[:, None] * fusion.beliefs(visited, now))
     np.add.at(whole, group, share)
     np.maximum.at(most, group, share)
     vehicles = np.full(len(wanted), np.iinfo(np.int64).max)
-    first, last = vehicles.copy(), np.zeros(len(wanted), np.int64)
+    first = vehicles.copy()
+    last = np.zeros(len(wanted), np.int64)
     np.minimum.at(vehicles, group, live.vehicles[visited])
     np.minimum.at(first, group, live.first[visited])
     np.maximum.at(last, group, live.time[visited])
     return CellView(
-        cell=wanted // grid.SECTORS, sector=wanted % grid.SECTORS,
+        cell=wanted // grid.SECTORS,
+        sector=wanted % grid.SECTORS,
         belief=mugrid.PRIOR + most[:, None] * (belief / whole[:, None] - mugrid.PRIOR),
-        values=np.zeros(len(wanted), np.float32), vehicles=vehicles, observations=np.zeros(len(wanted), np.int64),
-        first=first, last=last, imputed=np.ones(len(wanted), bool),
-    )  # fmt: skip
+        values=np.zeros(len(wanted), np.float32),
+        vehicles=vehicles,
+        observations=np.zeros(len(wanted), np.int64),
+        first=first,
+        last=last,
+        imputed=np.ones(len(wanted), bool),
+    )
 
 
 def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArray, FloatArray]:

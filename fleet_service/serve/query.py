@@ -87,7 +87,8 @@ def _view_tile(
 ) -> ShownTile:
     """View and impute the cells of one tile that may match; along a route in its order."""
     with cache.guard:
-        fusion, slots = cache.state.fusion, cache.state.slots(tile)
+        fusion = cache.state.fusion
+        slots = cache.state.slots(tile)
         passed = slots
         if route is not None:
             ahead = route[grid.tile_of(route // grid.SECTORS) == tile]
@@ -105,7 +106,8 @@ def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     Usually that is a complete tile, or a contiguous part of it. Every step that releases the interpreter lock may wait
     for it ten times as long as the step takes, so cells are compared one by one only if necessary.
     """
-    columns, run = shown.columns, slice(0, len(shown.cells))
+    columns = shown.columns
+    run = slice(0, len(shown.cells))
     if query.bbox is not None and shown.payload:
         _, south, _, north = query.bbox
         run = slice(

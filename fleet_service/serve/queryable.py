@@ -87,7 +87,9 @@ class _TokenBucket:
     """Token bucket for cheap answers."""
 
     def __init__(self) -> None:
-        self._left, self._since, self._guard = LIGHT_PER_S, time.monotonic(), threading.Lock()
+        self._left = LIGHT_PER_S
+        self._since = time.monotonic()
+        self._guard = threading.Lock()
 
     def take(self, cost: float) -> bool:
         """Take `cost` from the bucket; return False if it is too empty."""
@@ -110,7 +112,8 @@ class MapQueryable:
     """
 
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
-        self._answering, self._counts = answering, counts
+        self._answering = answering
+        self._counts = counts
         self._past = threading.Lock()
         self._heavy: list[_QueuedQuery] = []  # a heap
         self._light = _TokenBucket()

@@ -76,7 +76,10 @@ class TileCache:
         least: int,
         visitors: Visitors | None = None,
     ) -> None:
-        self.state, self.guard, self._least, self._visitors = state, guard, least, visitors
+        self.state = state
+        self.guard = guard
+        self._least = least
+        self._visitors = visitors
         self._kept: dict[int, ShownTile] = {}
         self._held = 0  # bytes
         self._acknowledged = 0  # change up to which all must be seen
@@ -145,7 +148,8 @@ def used_once(cells: CellView, now: int) -> ShownTile:
 def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, tuple[float, float, float, float]]:
     if not len(columns["vehicles"]):
         return 0, NOTHING
-    west, east = float(columns["west"].max()), float(columns["east"].min())
+    west = float(columns["west"].max())
+    east = float(columns["east"].min())
     return int(columns["vehicles"].min()), (west, -math.inf, east, math.inf)
 
 

@@ -35,14 +35,13 @@ class TileRounds:
         counts: Counter[str],
         clock: Callable[[], float],
     ) -> None:
-        self._every_s, self._changed, self._put, self._counts, self._clock = (
-            every_s,
-            changed,
-            put,
-            counts,
-            clock,
-        )
-        self._due, self._left = clock() + every_s, deque[int]()
+        self._every_s = every_s
+        self._changed = changed
+        self._put = put
+        self._counts = counts
+        self._clock = clock
+        self._due = clock() + every_s
+        self._left = deque[int]()
 
     @property
     def waiting(self) -> int:

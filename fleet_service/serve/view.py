@@ -13,7 +13,9 @@ from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.thresholds import NS
 
 CountArray = NDArray[np.integer[Any]]
-LOWER, UPPER = 0.05, 0.95  # of the interval
+# of the interval
+LOWER = 0.05
+UPPER = 0.95
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved
@@ -53,10 +55,16 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     live = fusion.live
     key = live.key[slots]
     return CellView(
-        cell=key // grid.SECTORS, sector=key % grid.SECTORS, belief=fusion.beliefs(slots, now),
-        values=live.values[slots], vehicles=live.vehicles[slots], observations=live.visits[slots],
-        first=live.first[slots], last=live.time[slots], imputed=np.zeros(len(slots), bool),
-    )  # fmt: skip
+        cell=key // grid.SECTORS,
+        sector=key % grid.SECTORS,
+        belief=fusion.beliefs(slots, now),
+        values=live.values[slots],
+        vehicles=live.vehicles[slots],
+        observations=live.visits[slots],
+        first=live.first[slots],
+        last=live.time[slots],
+        imputed=np.zeros(len(slots), bool),
+    )
 
 
 def coarsen(cells: CellView) -> CellView:

@@ -74,7 +74,8 @@ class Visitors:
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
         """Restore the visitors from `columns`; empty if the columns do not match the fusion."""
-        made, bits = Visitors(fusion), columns["bits"]
+        made = Visitors(fusion)
+        bits = columns["bits"]
         if len(bits) == PARTS * fusion.size:
             made._bits = bits.view(np.uint64).reshape(-1, PARTS).copy()
             made._part = int(columns["part"][0])

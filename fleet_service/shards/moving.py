@@ -81,7 +81,8 @@ def hand_over(
         if service == to:
             return None
         say(f"{service} hands over {_request_handover(session, service, to)}")
-        end, absent_since = time.monotonic() + MOVED_S, 0.0
+        end = time.monotonic() + MOVED_S
+        absent_since = 0.0
         while (now := _server(there, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):

@@ -84,8 +84,11 @@ def rival_tokens(
 
 
 def _claimed(
-    session: zenoh.Session, mine: frozenset[ServiceToken], stop: threading.Event, former: Collection[str]
-) -> list[zenoh.LivelinessToken]:  # fmt: skip
+    session: zenoh.Session,
+    mine: frozenset[ServiceToken],
+    stop: threading.Event,
+    former: Collection[str],
+) -> list[zenoh.LivelinessToken]:
     def others_there() -> list[ServiceToken]:
         return rival_tokens(
             mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former

@@ -120,10 +120,8 @@ class _Fields(NamedTuple):
         for at, (name, dtype) in enumerate(column_types(self.kind).items()):
             column: NDArray[Any]
             if name == LIKELIHOOD:
-                likelihood, column = (
-                    np.repeat(self.walked.counts[:, at] > 0, self.sizes),
-                    np.zeros((n, mugrid.BINS), np.uint8),
-                )
+                likelihood = np.repeat(self.walked.counts[:, at] > 0, self.sizes)
+                column = np.zeros((n, mugrid.BINS), np.uint8)
             elif dtype.kind == "f":
                 column = np.full(n, np.nan, dtype)
             else:

@@ -71,9 +71,12 @@ def join_negative_numbers(argv: Sequence[str]) -> list[str]:
 def add_command(commands: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:  # noqa: ANN401 argparse's own
     """Add a subcommand with its example and the common options."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=about, epilog=f"example:\n  {example}",
+        name,
+        help=about,
+        description=about,
+        epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    )
     louder = parser.add_mutually_exclusive_group()
     louder.add_argument("-v", "--verbose", action="store_true", help="say what libraries say too")
     louder.add_argument("-q", "--quiet", action="store_true", help="errors only")

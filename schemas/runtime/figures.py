@@ -90,7 +90,8 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 def row(figure: Figure) -> list[str]:
     """Return name, value with unit, bar and verdict of a figure."""
-    signs, bar = {"less": "≤ ", "more": "≥ "}, figure.bar
+    signs = {"less": "≤ ", "more": "≥ "}
+    bar = figure.bar
     value = f"{figure.value:.4g} {figure.unit}"
     if bar is None:
         return [figure.name, value, "", ""]

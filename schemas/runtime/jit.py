@@ -80,7 +80,9 @@ def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001 numba's own types
     def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
-        kind, long, whole = signature.args[0], ir.IntType(64), ir.IntType(32)
+        kind = signature.args[0]
+        long = ir.IntType(64)
+        whole = ir.IntType(32)
         data = target.make_array(kind)(target, builder, values[0])
         place = [values[1], *[long(0)] * (kind.ndim - 1)]
         begin = builder.ptrtoint(cgutils.get_item_pointer(target, builder, kind, data, place), long)  # type: ignore[no-untyped-call]
@@ -112,8 +114,12 @@ def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
 
 
 def _compile(
-    function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
-) -> Callable[P, R]:  # fmt: skip
+    function: Callable[P, R],
+    *,
+    nogil: bool = False,
+    forceinline: bool = False,
+    references: bool = True,
+) -> Callable[P, R]:
     kept = "NUMBA_CACHE_DIR" in os.environ or cache_root() is not None
     if kept and "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
@@ -151,7 +157,8 @@ def kernel_cache(package: str) -> str:
     Numba's own cache checks only the file of a kernel, not the files of its callees and constants. It would continue
     with outdated code after a change there. Old folders may be deleted at any time.
     """
-    root, digest = Path(__file__).parents[2], hashlib.blake2b(digest_size=8)
+    root = Path(__file__).parents[2]
+    digest = hashlib.blake2b(digest_size=8)
     for folder in (root / "schemas", root / package):
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.read_bytes())

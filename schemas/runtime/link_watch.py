@@ -41,7 +41,8 @@ class LinkWatch:
     def __init__(
         self, session: zenoh.Session, name: str, on_change: Callable[[], None] = lambda: None
     ) -> None:
-        self._name, self._on_change = name, on_change
+        self._name = name
+        self._on_change = on_change
         self._lock = threading.Lock()
         self._routers = set[str]()
         self._links = dict[tuple[str, str], str]()  # protocol by identity of the router and address

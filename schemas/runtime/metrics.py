@@ -109,7 +109,8 @@ class _Handler(BaseHTTPRequestHandler):
     exposition: Callable[[], tuple[str, bytes]]
     troubles: Troubles
     timeout = READ_S
-    server_version, sys_version = "gripmap", ""
+    server_version = "gripmap"
+    sys_version = ""
 
     def do_GET(self) -> None:
         path = self.path.partition("?")[0]

@@ -20,9 +20,26 @@ DARK_TWO: Final = ("#e478a7", "#9d4e4d")
 DARK_LITTLE: Final = "#61626e"
 DARK_GROUND: Final = "#15181d"
 GRIP: Final = (
-    "#22003f", "#2f005b", "#50015b", "#6d065c", "#880f5b", "#a3195b", "#b43157", "#c44552", "#d4574c", "#e46946",
-    "#f47a3d", "#f58e3e", "#f6a03e", "#f6b23f", "#f5c43f", "#f4d53e", "#f2e63e", "#f6ec73", "#f7f2a0",
-)  # fmt: skip
+    "#22003f",
+    "#2f005b",
+    "#50015b",
+    "#6d065c",
+    "#880f5b",
+    "#a3195b",
+    "#b43157",
+    "#c44552",
+    "#d4574c",
+    "#e46946",
+    "#f47a3d",
+    "#f58e3e",
+    "#f6a03e",
+    "#f6b23f",
+    "#f5c43f",
+    "#f4d53e",
+    "#f2e63e",
+    "#f6ec73",
+    "#f7f2a0",
+)
 GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
 SURFACES: Final = {
     "ice": 0.15,

@@ -130,7 +130,8 @@ class _Formatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         raised = {"error": self.formatException(record.exc_info)} if record.exc_info else {}
-        level, event = record.levelname.lower(), record.name
+        level = record.levelname.lower()
+        event = record.name
         return _record(level, event=event, message=record.getMessage(), **self._who, **raised)
 
 

@@ -81,12 +81,14 @@ def show_status(words: str) -> Iterator[None]:
 
 def stop_status() -> None:
     """Stop the spinner: the command has ended, or asks the user a question."""
-    timer, _voice.timer = _voice.timer, None
+    timer = _voice.timer
+    _voice.timer = None
     if timer is not None:
         timer.cancel()
         timer.join()
     with _voice.lock:
-        shown, _voice.shown = _voice.shown, None
+        shown = _voice.shown
+        _voice.shown = None
     if shown is not None:
         shown.stop()
 
@@ -104,9 +106,13 @@ def _show() -> None:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     shown = Progress(
-        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=Console(stderr=True),
-        transient=True, redirect_stdout=sys.stdout.isatty(),
-    )  # fmt: skip
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+    )
     shown.add_task(_voice.words, total=None)
     shown.start()
     with _voice.lock:

@@ -23,10 +23,16 @@ from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
 NUMBERS: Final = ("boot", "region", "seq", "first_held")
 TEXTS: Final = ("vehicle", "estimator")
 _WIDTH: Final = {  # bytes of an element; 0: varints
-    FieldDescriptor.TYPE_SFIXED64: 8, FieldDescriptor.TYPE_DOUBLE: 8, FieldDescriptor.TYPE_FLOAT: 4,
-    FieldDescriptor.TYPE_INT32: 0, FieldDescriptor.TYPE_BYTES: 1,
-}  # fmt: skip
-_VARINT, _FIXED64, _RUN = 0, 1, 2  # wire types
+    FieldDescriptor.TYPE_SFIXED64: 8,
+    FieldDescriptor.TYPE_DOUBLE: 8,
+    FieldDescriptor.TYPE_FLOAT: 4,
+    FieldDescriptor.TYPE_INT32: 0,
+    FieldDescriptor.TYPE_BYTES: 1,
+}
+# wire types
+_VARINT = 0
+_FIXED64 = 1
+_RUN = 2
 _FIELDS: Final = 64  # field numbers below
 _UNKNOWN: Final = -1
 _TEXT: Final = len(NUMBERS)  # roles: numbers, texts, columns
@@ -80,10 +86,11 @@ def _layout(kind: Kind) -> _Layout:
     for role, name in enumerate((*NUMBERS, *TEXTS, *names)):
         roles[fields[name].number] = role
     return _Layout(
-        roles, np.array([_WIDTH[fields[name].type] for name in names]),
+        roles,
+        np.array([_WIDTH[fields[name].type] for name in names]),
         np.array([mugrid.BINS if name == "log_likelihood" else 1 for name in names]),
         np.array([name in NEEDED[kind] for name in names]),
-    )  # fmt: skip
+    )
 
 
 def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
@@ -95,12 +102,17 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
         ends: end of each message, (k,).
         strict: True to leave names that are not ASCII to the library; False if the library wrote the bytes.
     """
-    layout, k = _layout(kind), len(ends)
+    layout = _layout(kind)
+    k = len(ends)
     columns = len(layout.widths)
     out = ScannedFields(
-        np.zeros(k, bool), np.zeros((k, len(NUMBERS)), np.int64), np.zeros((k, len(TEXTS), 2), np.int64),
-        np.zeros((k, columns), np.int64), np.zeros((k, columns), np.int64), np.zeros(k, np.int64),
-    )  # fmt: skip
+        np.zeros(k, bool),
+        np.zeros((k, len(NUMBERS)), np.int64),
+        np.zeros((k, len(TEXTS), 2), np.int64),
+        np.zeros((k, columns), np.int64),
+        np.zeros((k, columns), np.int64),
+        np.zeros(k, np.int64),
+    )
     first = list(column_types(kind)).index(NEEDED[kind][0])
     _walk(_Scan(data, layout, strict, out), ends, first)
     return out
@@ -111,8 +123,10 @@ def gather(
 ) -> None:
     """Copy a column of all messages, one after the other, into an array (n, …) that is filled with the default
     value."""
-    width, each = int(_layout(kind).widths[column]), int(_layout(kind).per_record[column])
-    begins, counts = walked.begins[:, column], walked.counts[:, column]
+    width = int(_layout(kind).widths[column])
+    each = int(_layout(kind).per_record[column])
+    begins = walked.begins[:, column]
+    counts = walked.counts[:, column]
     if width:
         _copy(
             data,
@@ -128,7 +142,8 @@ def gather(
 @refcount_free
 def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     """Return a number and its end; the end is -1 if it is not a number of at most 64 bits."""
-    value, shift = 0, 0
+    value = 0
+    shift = 0
     while at < end and shift < 64:
         byte = int(data[at])
         at += 1
@@ -144,13 +159,18 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 @refcount_free
 def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
     """Fill the result for all messages; `first` is the column whose length is the number of records."""
-    data, layout, out = scan.data, scan.layout, scan.out
+    data = scan.data
+    layout = scan.layout
+    out = scan.out
     at = 0
     for k in range(len(ends)):
-        end, seen, fine = ends[k], 0, True
+        end = ends[k]
+        seen = 0
+        fine = True
         while fine and at < end:
             tag, at = _varint(data, at, min(end, at + 2))
-            number, wire = tag >> 3, tag & 7
+            number = tag >> 3
+            wire = tag & 7
             fine = (
                 at >= 0
                 and 0 < number < _FIELDS
@@ -174,7 +194,8 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
 @refcount_free
 def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
     """Record one field of message k; return its end, or -1 if it is not as our encoder writes it."""
-    data, out = scan.data, scan.out
+    data = scan.data
+    out = scan.out
     if role == 0:  # boot
         if wire != _FIXED64 or end - at < 8:
             return -1
@@ -196,7 +217,8 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
                 return -1
         return at + length
     column = role - _COLUMN
-    width, count = scan.layout.widths[column], 0
+    width = scan.layout.widths[column]
+    count = 0
     if width > 0:
         count = length // width
         if count * width != length:
@@ -218,7 +240,8 @@ def _copy(
 ) -> None:
     to = 0
     for k in range(len(begins)):
-        sent, written = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
+        sent = data[begins[k] : begins[k] + lengths[k]]
+        written = into[to : to + lengths[k]]
         for position in range(len(written)):  # of slices, so that many bytes are copied at once
             written[position] = sent[position]
         to += lengths_out[k]

@@ -30,12 +30,10 @@ class PresenceTracker:
     """Tokens that are tracked continuously."""
 
     def __init__(self) -> None:
-        self._guard, self._here, self._withdrawn, self._fell = (
-            Lock(),
-            set[ServiceToken](),
-            set[ServiceToken](),
-            set[ServiceToken](),
-        )
+        self._guard = Lock()
+        self._here = set[ServiceToken]()
+        self._withdrawn = set[ServiceToken]()
+        self._fell = set[ServiceToken]()
 
     @property
     def active(self) -> set[ServiceToken]:

@@ -100,7 +100,8 @@ def open_session(
     A session that lost its router reconnects by itself. The reason for waiting is logged once. Where nothing answers in
     time, the next try allows twice as long, so that a slow network is not taken for a blocked one for ever.
     """
-    stop, logged = stop or threading.Event(), set[str]()
+    stop = stop or threading.Event()
+    logged = set[str]()
     open_ms = settings.config.get(_OPEN, CLIENT[_OPEN])
     while not stop.is_set():
         patient = settings.model_copy(update={"config": {**settings.config, _OPEN: open_ms}})

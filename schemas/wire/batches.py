@@ -58,16 +58,26 @@ class Heads(NamedTuple):
     def at(self, index: int) -> Head:
         """The head of one."""
         return Head(
-            self.kind, self.vehicle[index], int(self.boot[index]), int(self.region[index]), int(self.seq[index]),
-            int(self.first_held[index]), self.estimator[index],
-        )  # fmt: skip
+            self.kind,
+            self.vehicle[index],
+            int(self.boot[index]),
+            int(self.region[index]),
+            int(self.seq[index]),
+            int(self.first_held[index]),
+            self.estimator[index],
+        )
 
     def take(self, kept: BoolArray) -> Heads:
         """Some of them."""
         return Heads(
-            self.kind, list(compress(self.vehicle, kept)), self.boot[kept], self.region[kept], self.seq[kept],
-            self.first_held[kept], list(compress(self.estimator, kept)),
-        )  # fmt: skip
+            self.kind,
+            list(compress(self.vehicle, kept)),
+            self.boot[kept],
+            self.region[kept],
+            self.seq[kept],
+            self.first_held[kept],
+            list(compress(self.estimator, kept)),
+        )
 
 
 class Decoded(NamedTuple):
@@ -198,7 +208,8 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     """Derive what follows from the pose; drop messages of which a number does not fit, or that have no place."""
-    kind, columns = sent.kind, found.columns
+    kind = sent.kind
+    columns = found.columns
     bad: dict[int, WireError] = {}
     owner = np.repeat(np.arange(len(found.sizes)), found.sizes)
 
@@ -230,10 +241,13 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     kept = np.array([at not in bad for at in range(len(found.sizes))])
     rows = kept[owner]
     return Decoded(
-        list(compress(found.indices, kept)), heads.take(kept), found.sizes[kept],
-        {name: column[rows] for name, column in columns.items()}, found.with_likelihood[rows],
+        list(compress(found.indices, kept)),
+        heads.take(kept),
+        found.sizes[kept],
+        {name: column[rows] for name, column in columns.items()},
+        found.with_likelihood[rows],
         found.errors + [(found.indices[at], error) for at, error in bad.items()],
-    )  # fmt: skip
+    )
 
 
 def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
@@ -254,7 +268,8 @@ def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
     """Heads, with the region of the first record where the sender did not name it."""
-    heads, region_missing = found.heads, found.heads.region == 0
+    heads = found.heads
+    region_missing = found.heads.region == 0
     if not region_missing.any():
         return heads
     rows = (np.cumsum(found.sizes) - found.sizes)[region_missing]

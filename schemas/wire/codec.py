@@ -113,15 +113,20 @@ def encode(batch: Batch) -> bytes:
     Raises:
         WireError: columns of unequal length, too many records, or a column that the kind does not have.
     """
-    n, types = batch.rows, column_types(batch.kind)
+    n = batch.rows
+    types = column_types(batch.kind)
     if not 1 <= n <= MAX_ROWS:
         raise WireError("rows", f"a batch of {n} records", f"send 1 to {MAX_ROWS}")
     if unknown := batch.columns.keys() - types.keys():
         raise WireError(sorted(unknown)[0], "is no column of this kind", f"use {', '.join(types)}")
     message = MESSAGES[batch.kind](
-        vehicle=batch.vehicle, boot=batch.boot, region=batch.region, seq=batch.seq,
-        first_held=batch.first_held, estimator=batch.estimator,
-    )  # fmt: skip
+        vehicle=batch.vehicle,
+        boot=batch.boot,
+        region=batch.region,
+        seq=batch.seq,
+        first_held=batch.first_held,
+        estimator=batch.estimator,
+    )
     for name, column in batch.columns.items():
         if len(column) != n:
             raise WireError(
@@ -183,10 +188,13 @@ def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
     message = pb.Ack(vehicle=vehicle, time=time)
     for stream in streams:
         part = message.streams.add()  # field by field: half of what keyword arguments take
-        part.boot, part.kind, part.region = stream.boot, _PB_KIND[stream.kind], stream.region
+        part.boot = stream.boot
+        part.kind = _PB_KIND[stream.kind]
+        part.region = stream.region
         for first, last in stream.durable:
             run = part.durable.add()
-            run.first, run.last = first, last
+            run.first = first
+            run.last = last
         for seq, row, reason in stream.rejected:
             part.rejected.add(seq=seq, row=row, reason=reason)
         for first, last in stream.late:
@@ -205,13 +213,16 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
         raise WireError("kind", "is unknown", "use KIND_OBSERVATION or KIND_STATE")
     return message.vehicle, [
         StreamAck(
-            stream.boot, _KIND_OF[stream.kind], stream.region,
+            stream.boot,
+            _KIND_OF[stream.kind],
+            stream.region,
             tuple((r.first, r.last) for r in stream.durable),
             tuple((r.seq, r.row, r.reason) for r in stream.rejected),
-            tuple((r.first, r.last) for r in stream.late), message.time,
+            tuple((r.first, r.last) for r in stream.late),
+            message.time,
         )
         for stream in message.streams
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,10 @@ from schemas.tables import MAP_SCHEMA
 MAX_BYTES: Final = 64 * 1024 * 1024  # the largest message that a router passes
 MAX_ROWS: Final = 1 << 17  # a tile has 2^14 cells of four sectors; twice that
 _BATCH: Final = 3  # type of a record batch's head in the format's schema
-_TYPE, _HEAD, _COMPRESSION = 1, 2, 3  # places of fields in the tables Message and RecordBatch
+# places of fields in the tables Message and RecordBatch
+_TYPE = 1
+_HEAD = 2
+_COMPRESSION = 3
 
 
 def decode_tile(payload: bytes) -> pa.Table:
@@ -59,7 +62,8 @@ def _refuse_compressed(payload: bytes) -> None:
     for message in pa.ipc.MessageReader.open_stream(payload):
         head = message.metadata.to_pybytes()
         root = struct.unpack_from("<I", head, 0)[0]
-        kind, body = _field(head, root, _TYPE), _field(head, root, _HEAD)
+        kind = _field(head, root, _TYPE)
+        body = _field(head, root, _HEAD)
         if kind and body and head[kind] == _BATCH:
             batch = body + struct.unpack_from("<I", head, body)[0]
             if _field(head, batch, _COMPRESSION):

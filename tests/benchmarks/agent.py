@@ -34,8 +34,11 @@ LOOK_S = 0.05
 LIVE_S = 20.0
 WARM_S = 1.0  # of a run that only fills the cache of compiled code
 START_S = 5.0  # of a run that only pays for its start
-FLEET, FLEET_RATE_HZ, FLEET_S = 100, 50, 20.0
-LOGS, LOG_S = 16, 60.0
+FLEET = 100
+FLEET_RATE_HZ = 50
+FLEET_S = 20.0
+LOGS = 16
+LOG_S = 60.0
 
 
 def agent() -> list[Figure]:
@@ -49,7 +52,8 @@ def agent() -> list[Figure]:
 
 def drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
     """A simulated log and its vehicle file."""
-    log, vehicle = folder / f"{name}.parquet", folder / f"{name}.json"
+    log = folder / f"{name}.parquet"
+    vehicle = folder / f"{name}.json"
     files = [
         "--out",
         str(log),
@@ -109,7 +113,9 @@ def watched(pid: int) -> tuple[float, resource.struct_rusage]:
 
     The peak that the system tells at the end counts from the fork on, when the memory was still that of its parent.
     """
-    peak, gone, status = 0.0, 0, Path(f"/proc/{pid}/status")
+    peak = 0.0
+    gone = 0
+    status = Path(f"/proc/{pid}/status")
     while not gone:
         found = [
             int(line.split()[1])
@@ -166,7 +172,8 @@ def fleet(folder: Path, endpoint: str) -> list[Figure]:
 def replay(folder: Path) -> list[Figure]:
     """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet included."""
     logs = [drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
-    log, vehicle = read_log(logs[0][0]), load_vehicle(logs[0][1])
+    log = read_log(logs[0][0])
+    vehicle = load_vehicle(logs[0][1])
     block = next(log.blocks(0))
     kernel = LOGS * median_s(
         lambda: bank_of("aco-fckf", [vehicle]).advance(block.t, block.signals), 3

@@ -44,7 +44,10 @@ from tests.fleet_service.analytics.agreement import differs, roads_along
 from tests.fleet_service.archive.readers import READERS, by_spark
 
 FOLDER = Path(".analytics")
-ROWS, DAYS, ROUNDS, SEED = 10_000_000, 7, 3, 0
+ROWS = 10_000_000
+DAYS = 7
+ROUNDS = 3
+SEED = 0
 TIMED = ("grip", "worst", "vehicles", "weather")
 CELLS_ASKED = 30
 SMALL = SyntheticFleet(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
@@ -73,10 +76,13 @@ def stations(folder: Path) -> Path:
     names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
     place = np.repeat(np.arange(5), len(hours))
     columns: dict[str, Any] = {
-        "station": names, "time": (np.tile(hours, 5) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
-        "latitude": 57.6 + 0.1 * place, "longitude": 11.9 + 0.1 * place,
-        "temperature": np.tile(5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float)), 5) + 0.1 * place,
-    }  # fmt: skip
+        "station": names,
+        "time": (np.tile(hours, 5) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
+        "latitude": 57.6 + 0.1 * place,
+        "longitude": 11.9 + 0.1 * place,
+        "temperature": np.tile(5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float)), 5)
+        + 0.1 * place,
+    }
     path = folder / "stations.csv"
     pacsv.write_csv(pa.table(columns), path)
     return path
@@ -195,7 +201,8 @@ def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: in
 
 
 def _different(root: Path, readings: Path) -> int:
-    count, roads = 0, root.parent / "roads.parquet"
+    count = 0
+    roads = root.parent / "roads.parquet"
     pq.write_table(
         roads_along(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()), roads
     )
@@ -203,8 +210,13 @@ def _different(root: Path, readings: Path) -> int:
         if question.name == "replay":  # asks no engine
             continue
         options = Options(
-            at=HALF, stations=readings, report=lambda _: None, roads=roads, level=0.35, within_s=3600.0
-        )  # fmt: skip
+            at=HALF,
+            stations=readings,
+            report=lambda _: None,
+            roads=roads,
+            level=0.35,
+            within_s=3600.0,
+        )
         one, other = (
             question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark")
         )

@@ -23,7 +23,8 @@ WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
 
 def contract() -> list[Figure]:
     """Cost and size of an observation on the wire, ten to a message, and in Parquet."""
-    rows, columns = 10, visits(10, 1, 10)
+    rows = 10
+    columns = visits(10, 1, 10)
     names = wire.column_types(Kind.OBSERVATION)
     batch = Batch(
         Kind.OBSERVATION, "bench", 1, 1, 1, 1, {name: columns[name] for name in names}, "aco-fckf"

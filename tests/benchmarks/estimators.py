@@ -21,14 +21,16 @@ def estimators() -> list[Figure]:
     t: FloatArray = log["t"].to_numpy()[:, None]
 
     def drive(n: int, samples: int) -> float:
-        block, times = np.repeat(signals[:samples], n, axis=1), np.repeat(t[:samples], n, axis=1)
+        block = np.repeat(signals[:samples], n, axis=1)
+        times = np.repeat(t[:samples], n, axis=1)
         banks = [
             bank_of("aco-fckf", [vehicle] * n) for _ in range(ROUNDS + 1)
         ]  # to make one is not to step it
         seconds = median_s(lambda: banks.pop().advance(times, block))
         return seconds / (n * samples) * 1e6
 
-    one, many = drive(1, len(t)), drive(200, 100)
+    one = drive(1, len(t))
+    many = drive(200, 100)
     return [
         Figure("bench.aco_fckf.us", one, "us per vehicle-step of the default, N = 1", 25),
         Figure("bench.aco_fckf.flatness", many / one, "N = 200 over N = 1", 1.2),

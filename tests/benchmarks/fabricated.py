@@ -12,10 +12,8 @@ from tests.benchmarks.measure import SEED
 def visits(rows: int, vehicles: int, cells: int) -> Columns:
     """Columns of observations spread over cells."""
     rng = np.random.default_rng(SEED)
-    latitude, longitude = (
-        57.0 + rng.integers(0, cells, rows) * 1e-4 / 100,
-        11.97 + rng.integers(0, 100, rows) * 2e-4,
-    )
+    latitude = 57.0 + rng.integers(0, cells, rows) * 1e-4 / 100
+    longitude = 11.97 + rng.integers(0, 100, rows) * 2e-4
     columns: Columns = {}
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():
         columns[name] = (

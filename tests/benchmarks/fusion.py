@@ -42,7 +42,8 @@ def visits(
     """Visits to cells of a square, anywhere in `seconds`, in order of time."""
     side = int(np.ceil(np.sqrt(cells)))
     x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
-    k, vehicle = rng.integers(0, cells, rows), rng.integers(0, VEHICLES, rows)
+    k = rng.integers(0, cells, rows)
+    vehicle = rng.integers(0, VEHICLES, rows)
     cell = grid.interleave(x + k % side, y + k // side)
     time_ns = START + np.sort(((begin_s + seconds * rng.random(rows)) * SECOND).astype(np.int64))
     mu = rng.uniform(0.2, 0.9, rows)[:, None]
@@ -52,17 +53,27 @@ def visits(
         np.where((rng.random(rows) < EXCITED)[:, None], value, bound)
     )
     return Observations(
-        time=time_ns, cell=cell, sector=np.zeros(rows, np.int8), second=np.full(rows, -1, np.int8),
-        vehicle=vehicle, boot=vehicle + 1, region=grid.region_of(cell), sequence=np.arange(rows),
-        evidence=evidence, reported=np.full((rows, 3), np.nan, np.float32),
-        used=np.full(rows, 0.9, np.float32), manoeuvre=np.full(rows, -1, np.int8),
-        other=np.full((rows, 1), -1), other_share=np.zeros((rows, 1), np.float32),
-    )  # fmt: skip
+        time=time_ns,
+        cell=cell,
+        sector=np.zeros(rows, np.int8),
+        second=np.full(rows, -1, np.int8),
+        vehicle=vehicle,
+        boot=vehicle + 1,
+        region=grid.region_of(cell),
+        sequence=np.arange(rows),
+        evidence=evidence,
+        reported=np.full((rows, 3), np.nan, np.float32),
+        used=np.full(rows, 0.9, np.float32),
+        manoeuvre=np.full(rows, -1, np.int8),
+        other=np.full((rows, 1), -1),
+        other_share=np.zeros((rows, 1), np.float32),
+    )
 
 
 def filled(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
     """A fusion that heard so many visits of each cell, and the generator to go on with."""
-    rng, fusion = np.random.default_rng(SEED), Fusion(120.0)
+    rng = np.random.default_rng(SEED)
+    fusion = Fusion(120.0)
     parts = max(cells * per_cell // 100_000, 1)
     for part in range(parts):
         for batch in batches(
@@ -95,7 +106,8 @@ def table_vs_dict() -> float:
     """Time of a look-up in 10⁶ keys by numba's typed dictionary over that by the store's table, in turns of BATCH."""
     keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
     turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))
-    store, known = Store(), Dict.empty(types.int64, types.int64)
+    store = Store()
+    known = Dict.empty(types.int64, types.int64)
     store.slots_for(keys)
     _fill(known, keys)
 
@@ -140,7 +152,8 @@ def resident() -> None:
 
 def fusion() -> list[Figure]:
     """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and their memory."""
-    few, many = per_observation_s(10_000), per_observation_s(CELLS)
+    few = per_observation_s(10_000)
+    many = per_observation_s(CELLS)
     command = [sys.executable, "-c", RESIDENT]
     megabytes, _ = subprocess.run(
         command, check=True, capture_output=True, text=True

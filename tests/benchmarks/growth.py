@@ -50,7 +50,8 @@ def growth() -> list[Figure]:
 
 def second_s(rate: int, seconds: int) -> float:
     """Processor time [s] of a second of the stream, after a warm-up; half way an epoch ends and is settled."""
-    vehicles, spent = rate // ROWS, 0.0
+    vehicles = rate // ROWS
+    spent = 0.0
     begin = time.time_ns() // EPOCH_NS * EPOCH_NS - (WARM_S + seconds // 2) * SECOND
     config = ServiceConfig(lateness_s=LATENESS_S)
     with tempfile.TemporaryDirectory() as folder, closing(Engine(config, Path(folder))) as engine:

@@ -38,7 +38,8 @@ def rows_different(root: Path, uri: str) -> int:
         ]
         there = pa.concat_tables(files)
         seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
-        ours, theirs = _counted(there), _counted(seen)
+        ours = _counted(there)
+        theirs = _counted(seen)
         different += (ours - theirs).total() + (theirs - ours).total()
     return different
 
@@ -51,7 +52,8 @@ def _counted(table: pa.Table) -> Counter[str]:
 
 def measured(folder: Path) -> float:
     """Rows that differ over four rounds of compaction and registration, and after a day has gone by retention."""
-    root, uri = folder / "archive", f"sqlite:///{folder}/tables.db"
+    root = folder / "archive"
+    uri = f"sqlite:///{folder}/tables.db"
     place = iceberg.Place(uri, iceberg.NAMESPACE, root.as_uri())
     different = 0
     for done, seed in enumerate(SEEDS, 1):

@@ -81,7 +81,8 @@ def rates(records: int) -> tuple[tuple[float, float], float, float]:
 
 
 def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) -> float:
-    turn, began = turn_of(sent), time.process_time()
+    turn = turn_of(sent)
+    began = time.process_time()
     for at in range(0, len(sent), turn):
         decode(sent[at : at + turn])
     return time.process_time() - began
@@ -147,14 +148,16 @@ def _take(sent: list[Message], records: int) -> tuple[float, float]:
         turn = turn_of(sent)
         gc.collect()
         gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         for at in range(0, len(sent), turn):
             engine.intake.ingest(sent[at : at + turn], time.time_ns())
             engine.settlement.end_flush()
             if at % FLUSH >= FLUSH - turn:
                 engine.settlement.begin_flush()
         engine.settlement.flush()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        wall = time.perf_counter() - wall
+        cpu = time.process_time() - cpu
         gc.unfreeze()
         assert engine.counts[Kind.OBSERVATION] == len(sent) * records, engine.counts
     return len(sent) * records / wall, len(sent) * records / cpu

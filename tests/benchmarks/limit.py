@@ -24,7 +24,9 @@ from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 
 FOLDER = Path(__file__).parent
-STATES, ROWS, WHEELS = 6, 3, 4
+STATES = 6
+ROWS = 3
+WHEELS = 4
 FACTOR = STATES + STATES * STATES + ROWS * 2  # place of `factor` in the struct's doubles
 # what lets gcc take roots and select in vectors; none of them changes a result
 VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
@@ -56,14 +58,26 @@ def setting_row(memberships: Memberships) -> FloatArray:
     """The kernels' Setting."""
     setting = Setting()
     return np.array(
-        [*np.sqrt(setting.process), *setting.noise, *memberships.inputs, *memberships.outputs,
-         LEAST_FACTOR, LARGEST_FACTOR, STEP_S, WINDOW_S, LOWER, UPPER, PRIOR_MU_STD]
-    )  # fmt: skip
+        [
+            *np.sqrt(setting.process),
+            *setting.noise,
+            *memberships.inputs,
+            *memberships.outputs,
+            LEAST_FACTOR,
+            LARGEST_FACTOR,
+            STEP_S,
+            WINDOW_S,
+            LOWER,
+            UPPER,
+            PRIOR_MU_STD,
+        ]
+    )
 
 
 def first_memory(first: FloatArray, speed: float) -> FloatArray:
     """Filters (N, doubles) at their first readings (N, 11) and speed [m/s], as both kernels' structs hold them."""
-    setting, (count, inputs) = Setting(), first.shape
+    setting = Setting()
+    (count, inputs) = first.shape
     turned = FACTOR + ROWS + inputs
     memory = np.zeros((count, turned + 2 * WHEELS))
     memory[:, 0], memory[:, 2:5], memory[:, 5] = speed, first[:, :3], setting.mu
@@ -88,20 +102,25 @@ class Limit:
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
         """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample; speed [m/s]."""
-        self._library, self._parameters = (
-            library("kernel.c", "-fopenmp"),
-            np.ascontiguousarray(parameters),
-        )
-        self._setting, self._memory = setting_row(memberships), first_memory(first, speed)
+        self._library = library("kernel.c", "-fopenmp")
+        self._parameters = np.ascontiguousarray(parameters)
+        self._setting = setting_row(memberships)
+        self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
         """Means (T, N, 6) after each of the readings (T, N, 11), `gone` [s] apart."""
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
         self._library.drive(
-            pointer(self._memory), pointer(self._parameters), pointer(self._setting), pointer(readings),
-            ctypes.c_double(gone), samples, vehicles, pointer(out),
-        )  # fmt: skip
+            pointer(self._memory),
+            pointer(self._parameters),
+            pointer(self._setting),
+            pointer(readings),
+            ctypes.c_double(gone),
+            samples,
+            vehicles,
+            pointer(out),
+        )
         return out
 
 
@@ -135,9 +154,15 @@ class VectorLimit:
         samples, blocks, _, lanes = readings.shape
         out = aligned(samples, blocks, STATES, lanes)
         self._library.drive(
-            pointer(self._memory), pointer(self._parameters), pointer(self._setting), pointer(readings),
-            ctypes.c_double(gone), samples, blocks, pointer(out),
-        )  # fmt: skip
+            pointer(self._memory),
+            pointer(self._parameters),
+            pointer(self._setting),
+            pointer(readings),
+            ctypes.c_double(gone),
+            samples,
+            blocks,
+            pointer(out),
+        )
         return out
 
 

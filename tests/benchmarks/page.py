@@ -131,7 +131,8 @@ def drawn(on: Stage) -> dict[str, float]:
     """First picture and frames, ours and MapLibre's in turn; what the page asked of others, and said in errors."""
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
-    errors, foreign = list[str](), list[str]()
+    errors = list[str]()
+    foreign = list[str]()
     with maplibre(on) as other:
         for _ in range(ROUNDS):
             with opened(seen_town(on.address, on.town)) as seen:
@@ -158,8 +159,10 @@ def drawn(on: Stage) -> dict[str, float]:
         float(np.median([one[k] for one in theirs] or [math.nan])) for k in (0, 1)
     )
     return found | {
-        "maplibre_first_picture_s": their_picture, "maplibre_frames_hz": their_frames, "fps": frames / their_frames,
-    }  # fmt: skip
+        "maplibre_first_picture_s": their_picture,
+        "maplibre_frames_hz": their_frames,
+        "fps": frames / their_frames,
+    }
 
 
 @contextmanager
@@ -198,13 +201,15 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 def pushed_ms(on: Stage) -> float:
     """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed cells a second."""
     with opened(seen_town(on.address, on.town)) as seen:
-        tiles, put = list(on.town.tiles), dict[int, float]()
+        tiles = list(on.town.tiles)
+        put = dict[int, float]()
         seen.page.evaluate(
             "all => { globalThis.markers = all }", [[tile, on.town.local(tile)] for tile in tiles]
         )
         due = time.monotonic()
         for k in range(PUSHES):
-            tile, number = tiles[k % len(tiles)], FIRST + k
+            tile = tiles[k % len(tiles)]
+            number = FIRST + k
             payload = on.town.change(tile, int(CHANGED_HZ * PUT_S), number)
             put[number] = 1000.0 * time.time()
             on.session.put(keys.map_key(tile), payload)
@@ -326,13 +331,18 @@ def measured() -> list[Figure]:
     found["colour_distance"] = colour_distance()
     rows: list[tuple[str, str, float | None, Any]] = [
         ("first_picture_s", f"s, {CELLS} cells, the middle of {ROUNDS}", 0.5, "less"),
-        ("maplibre_first_picture_s", "s", None, "less"), ("frames_hz", "frames/s", None, "more"),
-        ("maplibre_frames_hz", "frames/s", None, "more"), ("fps", "times MapLibre + GeoJSON", 5.0, "more"),
+        ("maplibre_first_picture_s", "s", None, "less"),
+        ("frames_hz", "frames/s", None, "more"),
+        ("maplibre_frames_hz", "frames/s", None, "more"),
+        ("fps", "times MapLibre + GeoJSON", 5.0, "more"),
         ("push_p95_ms", f"ms, put to drawn, {CHANGED_HZ} changed cells/s", 500.0, "less"),
-        ("bytes_per_cell", "bytes", 16.0, "less"), ("watchers", "with p95 of a push within 1 s, one core", 200, "more"),
-        ("foreign_requests", "requests", 0, "less"), ("console_errors", "errors", 0, "less"),
-        ("axe_serious", "findings", 0, "less"), ("colour_distance", "CIEDE2000, the least", 10.0, "more"),
-    ]  # fmt: skip
+        ("bytes_per_cell", "bytes", 16.0, "less"),
+        ("watchers", "with p95 of a push within 1 s, one core", 200, "more"),
+        ("foreign_requests", "requests", 0, "less"),
+        ("console_errors", "errors", 0, "less"),
+        ("axe_serious", "findings", 0, "less"),
+        ("colour_distance", "CIEDE2000, the least", 10.0, "more"),
+    ]
     own = [
         Figure(f"page.{name}", found[name], unit, bar, better) for name, unit, bar, better in rows
     ]

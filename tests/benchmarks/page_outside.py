@@ -41,15 +41,18 @@ from tests.waiting import until
 
 SCHEMA: Final = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
 OURS: Final = Supplier("se", "GripMap bench")
-STEPS, SEED, LEAST_ENDED = 40, 20_319, 20
+STEPS = 40
+SEED = 20_319
+LEAST_ENDED = 20
 PATIENCE_S: Final = 120.0
 ICE_NS: Final = (
     1800 * NS
 )  # age of the ice when it has melted: in seconds no road changes, and no alert would end
 _SPACES: Final = {
-    "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing",
+    "sit": "http://datex2.eu/schema/3/situation",
+    "loc": "http://datex2.eu/schema/3/locationReferencing",
     "com": "http://datex2.eu/schema/3/common",
-}  # fmt: skip
+}
 READERS: Final = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
     "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
@@ -85,7 +88,8 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
 
     Alerts of cells on a road come and go at random. NaN where the schema is not there, or hardly anything ended.
     """
-    rng, stretches = np.random.default_rng(SEED), Stretches()
+    rng = np.random.default_rng(SEED)
+    stretches = Stretches()
     before: bytes | None = None
     invalid = unended = 0
     ended = set[str]()
@@ -149,7 +153,8 @@ def driven() -> dict[str, float]:
         running(settings, Path(folder) / "archive"),
     ):
         file = DatexFile(OURS, Path(folder) / "situations.xml", lambda _: None)
-        stop, lines = threading.Event(), list[str]()
+        stop = threading.Event()
+        lines = list[str]()
         page = threading.Thread(
             target=run, args=(PageSettings(settings, port=0, datex=file), stop, lines.append)
         )
@@ -225,7 +230,8 @@ def opens(reader: str, address: str) -> bool:
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
     )
-    whole, bounds = street.known("ice", "passed", "wet"), street.known("passed")
+    whole = street.known("ice", "passed", "wet")
+    bounds = street.known("passed")
     held = done.stdout.split() == [str(whole), str(bounds), str(whole - bounds)]
     if not held:
         print(f"  {reader}: {done.stdout} {done.stderr[-500:]}", file=sys.stderr)

@@ -55,18 +55,34 @@ class Town:
         n = len(cells)
         latitude, longitude = grid.centre(cells)
         west, south, east, north = grid.bounds(cells)
-        mu, half = self.rng.uniform(0.1, 0.9, n), self.rng.uniform(0.03, 0.3, n)
-        lower, upper = np.maximum(mu - half, 0.05), np.minimum(mu + half, 1.2)
+        mu = self.rng.uniform(0.1, 0.9, n)
+        half = self.rng.uniform(0.03, 0.3, n)
+        lower = np.maximum(mu - half, 0.05)
+        upper = np.minimum(mu + half, 1.2)
         bound = self.rng.random(n) < BOUND_SHARE
         bound[0] = False
         now = np.full(n, time.time_ns())
         return {
-            "cell": cells, "sector": np.zeros(n, np.int8), "mu": pa.array(mu, mask=bound), "mu_lower": lower,
-            "mu_upper": upper, "p_slippery": (mu < 0.4) * 0.9, "basis": np.where(bound, "bound", "measured"),
-            "vehicles": np.full(n, 3), "observations": np.full(n, 5), "first_time": now, "last_time": now,
-            "age_s": np.zeros(n), "latitude": latitude, "longitude": longitude, "west": west, "south": south,
-            "east": east, "north": north, "safe_deceleration": GRAVITY * lower,
-        }  # fmt: skip
+            "cell": cells,
+            "sector": np.zeros(n, np.int8),
+            "mu": pa.array(mu, mask=bound),
+            "mu_lower": lower,
+            "mu_upper": upper,
+            "p_slippery": (mu < 0.4) * 0.9,
+            "basis": np.where(bound, "bound", "measured"),
+            "vehicles": np.full(n, 3),
+            "observations": np.full(n, 5),
+            "first_time": now,
+            "last_time": now,
+            "age_s": np.zeros(n),
+            "latitude": latitude,
+            "longitude": longitude,
+            "west": west,
+            "south": south,
+            "east": east,
+            "north": north,
+            "safe_deceleration": GRAVITY * lower,
+        }
 
     def table(self, tile: int) -> pa.RecordBatch:
         """A tile in the schema of the map."""

@@ -27,7 +27,9 @@ from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
 WORLD = SyntheticFleet(1_000_000, days=3)
-SIDE, QUERIES = 320, 15  # cells of a box's side: a thousand of them were visited
+# cells of a box's side: a thousand of them were visited
+SIDE = 320
+QUERIES = 15
 
 
 def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
@@ -109,10 +111,12 @@ def _asked(root: Path) -> tuple[list[float], int]:
     """Seconds of each query, and cells of the answers."""
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)
-    spent, cells = [], 0
+    spent = []
+    cells = 0
     with _service(root) as session:
         for _ in range(QUERIES):
-            row, column = int(rng.integers(0, 8)) * 2, int(rng.integers(0, 8))
+            row = int(rng.integers(0, 8)) * 2
+            column = int(rng.integers(0, 8))
             west = synthetic.LONGITUDE + column * 260 * step
             south = synthetic.LATITUDE + row * 260 * step * np.cos(np.radians(synthetic.LATITUDE))
             box = (

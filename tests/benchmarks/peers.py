@@ -44,7 +44,8 @@ def by_numpy(problem: Problem) -> FloatArray:
     n = len(mean)
     xi = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
     for k in range(1, PYTHON_STEPS + 1):
-        before, now = problem.readings[k - 1], problem.readings[k]
+        before = problem.readings[k - 1]
+        now = problem.readings[k]
         points = move(mean + xi @ np.linalg.cholesky(cov).T, problem.row, before, now, problem.gone)
         mean = points.mean(0)
         cov = (points - mean).T @ (points - mean) / len(xi) + noise

@@ -9,7 +9,9 @@ from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 
-RATE, DELTA, OMEGA = 2, 3, 7
+RATE = 2
+DELTA = 3
+OMEGA = 7
 
 
 def move(
@@ -17,28 +19,40 @@ def move(
 ) -> FloatArray:
     """f: states (P, 6) after `gone` [s] by Heun's rule; row (12,), before and now (11,)."""
     mu = np.clip(points[:, 5], LOWER, UPPER)
-    vx, vy, ax, ay, rate = points[:, 0], points[:, 1], points[:, 2], points[:, 3], points[:, 4]
+    vx = points[:, 0]
+    vy = points[:, 1]
+    ax = points[:, 2]
+    ay = points[:, 3]
+    rate = points[:, 4]
     _, _, turn = respond(row, vx, vy, rate, ax, ay, before, mu)
-    slope_x, slope_y = ax + rate * vy, ay - rate * vx
-    x, y, r = vx + gone * slope_x, vy + gone * slope_y, rate + gone * turn
+    slope_x = ax + rate * vy
+    slope_y = ay - rate * vx
+    x = vx + gone * slope_x
+    y = vy + gone * slope_y
+    r = rate + gone * turn
     bx, by, again = respond(row, x, y, r, ax, ay, now, mu)
-    new_x, new_y = (
-        vx + 0.5 * gone * (slope_x + bx + r * y),
-        vy + 0.5 * gone * (slope_y + by - r * x),
-    )
+    new_x = vx + 0.5 * gone * (slope_x + bx + r * y)
+    new_y = vy + 0.5 * gone * (slope_y + by - r * x)
     new_rate = rate + 0.5 * gone * (turn + again)
     felt_x, felt_y, _ = respond(row, new_x, new_y, new_rate, ax, ay, now, mu)
     return np.stack([new_x, new_y, felt_x, felt_y, new_rate, points[:, 5]], axis=1)
 
 
 def respond(
-    row: FloatArray, vx: FloatArray, vy: FloatArray, rate: FloatArray, ax: FloatArray, ay: FloatArray,
-    readings: FloatArray, mu: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    row: FloatArray,
+    vx: FloatArray,
+    vy: FloatArray,
+    rate: FloatArray,
+    ax: FloatArray,
+    ay: FloatArray,
+    readings: FloatArray,
+    mu: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(a_x, a_y, yaw acceleration), each (P,), of four Dugoff tyres."""
     front = np.array([True, True, False, False])
     left = np.array([1.0, -1.0, 1.0, -1.0])
-    base, weight = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR], row[Parameter.MASS] * GRAVITY
+    base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
+    weight = row[Parameter.MASS] * GRAVITY
     pitch = (row[Parameter.MASS] * ax * row[Parameter.CG_HEIGHT] / base)[:, None]
     axle = np.where(
         front,
@@ -48,11 +62,16 @@ def respond(
     track = np.where(front, row[Parameter.TRACK_FRONT], row[Parameter.TRACK_REAR])
     roll = (ay * row[Parameter.CG_HEIGHT] / GRAVITY)[:, None]
     load = np.maximum(0.5 * axle - left * axle * roll / track, 0.02 * weight / 4.0)
-    x, y = np.where(front, row[Parameter.TO_FRONT], -row[Parameter.TO_REAR]), left * 0.5 * track
-    cos, sin = np.cos(readings[DELTA:OMEGA]), np.sin(readings[DELTA:OMEGA])
-    ahead, aside = vx[:, None] - y * rate[:, None], vy[:, None] + x * rate[:, None]
-    along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
-    speed, grip = np.maximum(np.abs(along), 0.5), mu[:, None] * load
+    x = np.where(front, row[Parameter.TO_FRONT], -row[Parameter.TO_REAR])
+    y = left * 0.5 * track
+    cos = np.cos(readings[DELTA:OMEGA])
+    sin = np.sin(readings[DELTA:OMEGA])
+    ahead = vx[:, None] - y * rate[:, None]
+    aside = vy[:, None] + x * rate[:, None]
+    along = cos * ahead + sin * aside
+    across = cos * aside - sin * ahead
+    speed = np.maximum(np.abs(along), 0.5)
+    grip = mu[:, None] * load
     theta_x = (
         row[Parameter.SLOPE_X]
         * load
@@ -63,8 +82,10 @@ def respond(
     theta_y = row[Parameter.SLOPE_Y] * load * -across / speed / grip
     theta = np.maximum(np.hypot(theta_x, theta_y), 1e-12)
     gain = grip * np.where(theta <= 0.5, theta, 1.0 - 0.25 / theta) / theta
-    force_x, force_y = gain * theta_x, gain * theta_y
-    f_ahead, f_left = cos * force_x - sin * force_y, sin * force_x + cos * force_y
+    force_x = gain * theta_x
+    force_y = gain * theta_y
+    f_ahead = cos * force_x - sin * force_y
+    f_left = sin * force_x + cos * force_y
     moment = x * f_left - y * f_ahead
     return (
         f_ahead.sum(1) / row[Parameter.MASS],

@@ -22,7 +22,9 @@ from schemas.thresholds import METRES_PER_DEGREE
 from tests.benchmarks.sumo import Sumo
 
 FOLDER: Final = Path(".roads")
-NOISE_M, SEEDS, SECONDS = 3.0, (11, 12, 13), 600
+NOISE_M = 3.0
+SEEDS = (11, 12, 13)
+SECONDS = 600
 
 
 class Traffic(NamedTuple):
@@ -46,10 +48,8 @@ def drive(sumo: Sumo, seed: int) -> Traffic:
 
 def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
     """Shares of fixes for which the join is right."""
-    rng, east = (
-        np.random.default_rng(seed),
-        METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude)),
-    )
+    rng = np.random.default_rng(seed)
+    east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))
     error = rng.normal(0.0, NOISE_M, (2, len(east)))
     cell = grid.cell_of(
         traffic.latitude + error[0] / METRES_PER_DEGREE, traffic.longitude + error[1] / east

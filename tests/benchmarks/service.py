@@ -29,14 +29,17 @@ from schemas.wire.tile import decode_tile
 RATE = 20_000  # observations/s of the load
 ROWS = 10  # of a message
 VEHICLES = 500
-COLUMNS, LINES = (
-    40,
-    50,
-)  # of the tile's cells that the load visits; the box of a query holds half of them
-QUERIES, ALERTS, ACKS = 200, 60, 60
+# of the tile's cells that the load visits; the box of a query holds half of them
+COLUMNS = 40
+LINES = 50
+QUERIES = 200
+ALERTS = 60
+ACKS = 60
 APART = 4  # cells between two that freeze: further than a position's error reaches
-BARE, BARE_BOX = "gripmap-bare/tile", "gripmap-bare/box"
-LATITUDE, LONGITUDE = 57.7, 11.97
+BARE = "gripmap-bare/tile"
+BARE_BOX = "gripmap-bare/box"
+LATITUDE = 57.7
+LONGITUDE = 11.97
 SECOND = 10**9
 _TILE = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
 _X, _Y = (
@@ -49,19 +52,26 @@ def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool
     """Visits to cells of the tile, just now: what was used, or ice."""
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
-    n, now = len(cell), time.time_ns()
+    n = len(cell)
+    now = time.time_ns()
     shape = (
         -0.5 * np.square((mugrid.CENTRES - 0.15) / 0.04)
         if ice
         else np.where(mugrid.CENTRES < 0.2, -6.0, 0.0)
     )
     columns = {
-        "enter_time": np.full(n, now - SECOND), "leave_time": np.full(n, now), "cell": cell,
-        "sector": np.zeros(n, np.int8), "latitude": latitude, "longitude": longitude,
-        "position_std": np.ones(n, np.float32), "yaw": np.zeros(n, np.float32), "speed": np.full(n, 12.0, np.float32),
+        "enter_time": np.full(n, now - SECOND),
+        "leave_time": np.full(n, now),
+        "cell": cell,
+        "sector": np.zeros(n, np.int8),
+        "latitude": latitude,
+        "longitude": longitude,
+        "position_std": np.ones(n, np.float32),
+        "yaw": np.zeros(n, np.float32),
+        "speed": np.full(n, 12.0, np.float32),
         "mu_utilised": np.full(n, 0.15 if ice else 0.2, np.float32),
         "log_likelihood": np.tile(mugrid.encode_log_likelihood(shape), (n, 1)),
-    }  # fmt: skip
+    }
     return Batch(
         Kind.OBSERVATION,
         vehicle,
@@ -84,7 +94,10 @@ def publish(session: zenoh.Session, one: Batch) -> None:
 
 def load(endpoint: str) -> None:
     """Send RATE observations a second of unexcited visits until this process is ended."""
-    rng, seq, began, sent = np.random.default_rng(0), 0, time.monotonic(), 0
+    rng = np.random.default_rng(0)
+    seq = 0
+    began = time.monotonic()
+    sent = 0
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     while True:
@@ -198,7 +211,8 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
                     heard.put((seq, now))
 
     session.declare_subscriber(keys.ack_key("acked-0"), hear)
-    rng, sent = np.random.default_rng(0), {}
+    rng = np.random.default_rng(0)
+    sent = {}
     for seq in range(1, ACKS + 1):
         sent[seq] = time.perf_counter()
         publish(
@@ -219,7 +233,8 @@ def service() -> list[Figure]:
     west, south, east, north = (
         float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
     )  # the first cell: the box goes over all columns and half of the lines from it; borders lie in it, so less a bit
-    wide, high = COLUMNS * (east - west), LINES // 2 * (north - south)
+    wide = COLUMNS * (east - west)
+    high = LINES // 2 * (north - south)
     box = f"{west + 1e-6},{north - high + 1e-6},{west + wide - 1e-6},{north - 1e-6}"
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -260,7 +275,8 @@ def service() -> list[Figure]:
                 for selector in (*asked, BARE, BARE_BOX)
             )
         )
-        alerts, acks = alert_delays_ms(client), ack_delays_s(client)
+        alerts = alert_delays_ms(client)
+        acks = ack_delays_s(client)
     limits = [statistics.median(times) for times in least]
     vs = [f"of {limit:.1f} ms, {number} cells" for limit, number in zip(limits, cells, strict=True)]
     return [

@@ -169,7 +169,8 @@ def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
 
 
 def _send(session: zenoh.Session, burst: Sequence[Message]) -> float:
-    settled, done = 0, threading.Event()
+    settled = 0
+    done = threading.Event()
 
     def hear(sample: zenoh.Sample) -> None:
         nonlocal settled

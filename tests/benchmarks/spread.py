@@ -47,7 +47,9 @@ def drives(folder: Path) -> list[Path]:
 
 def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     """Files of estimates that are not, byte for byte, those of this machine, though each task was killed once."""
-    here, there, tries = folder / "here", folder / "there", folder / "tries"
+    here = folder / "here"
+    there = folder / "there"
+    tries = folder / "tries"
     there.mkdir(parents=True)
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     with spark_sessions.cores(2) as session:

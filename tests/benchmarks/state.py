@@ -87,7 +87,8 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     taken = engine.checkpoint(threading.Event())
     assert taken is not None
     checkpoints.save(root, taken)
-    took, busy = time.perf_counter() - began, len(turns)
+    took = time.perf_counter() - began
+    busy = len(turns)
     saved.set()
     worker.join()
     return took, max(turns[: busy + 1])

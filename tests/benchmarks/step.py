@@ -36,7 +36,8 @@ class Drive:
         table = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)
         t = log["t"].to_numpy()
         self.gone = float(t[1] - t[0])
-        self.signals, self.t = np.ascontiguousarray(table), np.arange(len(t)) * self.gone
+        self.signals = np.ascontiguousarray(table)
+        self.t = np.arange(len(t)) * self.gone
         self.readings = np.ascontiguousarray(
             table[
                 :,
@@ -96,7 +97,8 @@ def step() -> list[Figure]:
         lambda: bank_of(NAME, [drive.vehicle]).advance(t, signals),
         lambda: limit(Limit, drive, 1, speed).drive(readings, drive.gone),
     )
-    per_call, per_step = call_s(bank_of(NAME, [drive.vehicle]), t, signals), ours / SAMPLES
+    per_call = call_s(bank_of(NAME, [drive.vehicle]), t, signals)
+    per_step = ours / SAMPLES
     found = [
         Figure(
             "bench.step.us",
@@ -134,7 +136,8 @@ def bank() -> list[Figure]:
     """Many vehicles on two threads, against C on as many, and what more of them do to the cost of one."""
     drive = Drive()
     speed = same_filter(drive)
-    found, cost = [], {}
+    found = []
+    cost = {}
     for vehicles, samples in ((100, 1000), (1000, 200), (100_000, 4)):
         t, signals, readings = drive.repeated(samples, vehicles)
         fleet = [drive.vehicle] * vehicles

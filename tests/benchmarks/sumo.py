@@ -22,7 +22,8 @@ class Sumo:
     """SUMO's programs, with the town's network; everything lies in `folder`, and is there at the next start."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.extract = folder, folder / INSIDE
+        self.folder = folder
+        self.extract = folder / INSIDE
         folder.mkdir(exist_ok=True)
         environment = folder / "venv"
         self._programs = (environment / "bin").absolute()

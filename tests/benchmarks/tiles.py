@@ -31,7 +31,8 @@ from tests.benchmarks.service import LATITUDE, LONGITUDE, SECOND, ask, process, 
 from tests.fleet_service.examples import batch
 
 RATE = 1500  # visits/s of all vehicles
-VEHICLES, ROW = 1600, 5
+VEHICLES = 1600
+ROW = 5
 TILES = VEHICLES * ROW
 TURNS = (
     0,
@@ -43,8 +44,11 @@ TURNS = (
     2,
     1,
 )  # of a vehicle: neighbouring tiles, as no car is in two towns at once
-WARM_S, MEASURED_S, PATIENCE_S = 8.0, 20.0, 60.0
-READERS, QUESTIONS = 2, 200
+WARM_S = 8.0
+MEASURED_S = 20.0
+PATIENCE_S = 60.0
+READERS = 2
+QUESTIONS = 200
 _ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles of a region's side
 _ROWS = _ACROSS // ROW
 
@@ -83,7 +87,8 @@ class Acks:
         self._subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", self._hear)
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        now, (vehicle, streams) = time.perf_counter(), wire.decode_ack(sample.payload.to_bytes())
+        now = time.perf_counter()
+        (vehicle, streams) = wire.decode_ack(sample.payload.to_bytes())
         for stream in streams:
             for first, last in stream.durable:
                 for seq in range(first, last + 1):
@@ -100,7 +105,8 @@ def drive(endpoint: str) -> None:
     """Send until the time is over, wait for what is not acknowledged, and say how long each took."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
-    acks, encoding = Acks(session), wire.ENCODING[Kind.OBSERVATION]
+    acks = Acks(session)
+    encoding = wire.ENCODING[Kind.OBSERVATION]
     cars = []
     for vehicle in range(VEHICLES):
         turns = [visit(vehicle, turn) for turn in range(len(TURNS))]
@@ -108,11 +114,13 @@ def drive(endpoint: str) -> None:
         cars.append(
             (turns[0].vehicle, keys.observation_key(turns[0].region, turns[0].vehicle), messages)
         )
-    began, sent = time.perf_counter(), 0
+    began = time.perf_counter()
+    sent = 0
     while time.perf_counter() - began < WARM_S + MEASURED_S:
         turn, vehicle = divmod(sent, VEHICLES)
         name, place, messages = cars[vehicle]
-        message, now = messages[turn % len(TURNS)], time.time_ns()
+        message = messages[turn % len(TURNS)]
+        now = time.time_ns()
         message.seq, message.leave_time[0], message.enter_time[0] = turn + 1, now, now - SECOND
         acks.put[name, turn + 1] = time.perf_counter()
         session.put(
@@ -123,7 +131,8 @@ def drive(endpoint: str) -> None:
         )
         sent += 1
         time.sleep(max(began + sent / RATE - time.perf_counter(), 0.0))
-    took, since = time.perf_counter() - began, began + WARM_S
+    took = time.perf_counter() - began
+    since = began + WARM_S
     deadline = time.perf_counter() + PATIENCE_S
     while len(acks.waits) < sent and time.perf_counter() < deadline:
         time.sleep(0.05)
@@ -158,7 +167,8 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     for thread in threads:
         thread.start()
     waits: list[float] = []
-    pause, deadline = threading.Event(), time.monotonic() + 2 * PATIENCE_S
+    pause = threading.Event()
+    deadline = time.monotonic() + 2 * PATIENCE_S
     try:
         while (len(waits) < QUESTIONS or not all(got)) and time.monotonic() < deadline:
             began = time.perf_counter()

@@ -129,7 +129,9 @@ class Cluster:
     """An overlay's pods on this machine."""
 
     def __init__(self, overlay: str, root: Path) -> None:
-        self.overlay, self.root, self.objects = overlay, root, built(overlay)
+        self.overlay = overlay
+        self.root = root
+        self.objects = built(overlay)
         self.pods = pods(self.objects, root)
         self.failed: list[str] = []
         self._configs = {
@@ -331,10 +333,13 @@ def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
 
 def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
     return {
-        "AWS_ENDPOINT": bucket.store["endpoint"], "AWS_REGION": bucket.store["region"], "AWS_ALLOW_HTTP": "true",
-        "AWS_ACCESS_KEY_ID": bucket.store["access_key_id"], "AWS_DISABLE_BULK_DELETE": "true",
+        "AWS_ENDPOINT": bucket.store["endpoint"],
+        "AWS_REGION": bucket.store["region"],
+        "AWS_ALLOW_HTTP": "true",
+        "AWS_ACCESS_KEY_ID": bucket.store["access_key_id"],
+        "AWS_DISABLE_BULK_DELETE": "true",
         "AWS_SECRET_ACCESS_KEY": bucket.store["secret_access_key"],
-    }  # fmt: skip
+    }
 
 
 @contextmanager
@@ -350,7 +355,10 @@ def cluster(overlay: str, root: Path) -> Iterator[Cluster]:
 
 def main() -> int:
     """Validate and start every overlay; 1 where a bar does not hold."""
-    wrong, failed, objects, started = list[str](), list[str](), 0, 0
+    wrong = list[str]()
+    failed = list[str]()
+    objects = 0
+    started = 0
     for overlay in OVERLAYS:
         found = built(overlay)
         objects += len(found)
@@ -366,10 +374,11 @@ def main() -> int:
     for line in (*wrong, *failed):
         print(line)
     figures = [
-        Figure("kube.invalid", len(wrong), "of the objects", 0), Figure("kube.objects", objects, "objects"),
+        Figure("kube.invalid", len(wrong), "of the objects", 0),
+        Figure("kube.objects", objects, "objects"),
         Figure("kube.commands_failed", len(failed), "of the containers", 0),
         Figure("kube.pods", started, "pods started as processes", 13, "more"),
-    ]  # fmt: skip
+    ]
     write(ROOT / ".kube" / "figures.json", "kube", [0], figures)
     print(markdown(figures))
     return int(not all(figure.holds for figure in figures))

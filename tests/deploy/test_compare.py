@@ -40,13 +40,23 @@ def tile(cells: list[int], lower: float, upper: float) -> pa.Table:
     n = len(cells)
     return pa.table(
         {
-            "cell": cells, "sector": pa.array([0] * n, pa.int8()), "mu": [(lower + upper) / 2] * n,
-            "mu_lower": [lower] * n, "mu_upper": [upper] * n, "p_slippery": [0.1] * n, "vehicles": [2] * n,
-            "observations": [3] * n, "basis": ["measured"] * n, "latitude": [57.7] * n, "longitude": [11.97] * n,
-            "west": [11.97 + 1e-4 * i for i in range(n)], "south": [57.7] * n,
-            "east": [11.9701 + 1e-4 * i for i in range(n)], "north": [57.7001] * n,
+            "cell": cells,
+            "sector": pa.array([0] * n, pa.int8()),
+            "mu": [(lower + upper) / 2] * n,
+            "mu_lower": [lower] * n,
+            "mu_upper": [upper] * n,
+            "p_slippery": [0.1] * n,
+            "vehicles": [2] * n,
+            "observations": [3] * n,
+            "basis": ["measured"] * n,
+            "latitude": [57.7] * n,
+            "longitude": [11.97] * n,
+            "west": [11.97 + 1e-4 * i for i in range(n)],
+            "south": [57.7] * n,
+            "east": [11.9701 + 1e-4 * i for i in range(n)],
+            "north": [57.7001] * n,
         }
-    )  # fmt: skip
+    )
 
 
 def alert(cell: int) -> Alert:
@@ -68,11 +78,15 @@ def test_a_cell_without_a_truth_is_left_out() -> None:
 
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
     road = visits(
-        ("z", 1, 7, 0.9, 0.9), ("z", 2, 8, 0.9, 0.9),  # it was dry
-        ("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9),  # one pass of a over two cells
-        ("b", 20, 7, 0.2, 0.9), ("c", 21, 7, 0.2, 0.1),  # c rolled over it
-        ("a", 40, 7, 0.2, 0.9), ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
-    )  # fmt: skip
+        ("z", 1, 7, 0.9, 0.9),
+        ("z", 2, 8, 0.9, 0.9),  # it was dry
+        ("a", 11, 7, 0.2, 0.9),
+        ("a", 12, 8, 0.2, 0.9),  # one pass of a over two cells
+        ("b", 20, 7, 0.2, 0.9),
+        ("c", 21, 7, 0.2, 0.1),  # c rolled over it
+        ("a", 40, 7, 0.2, 0.9),
+        ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
+    )
     patch = compare.newly_slippery(road, 10 * S) & (road["mu"].to_numpy() < 0.4)
     assert compare.delay_passes(road, patch, [(50 * S, alert(7))], 10 * S) == 3.0
 
@@ -144,14 +158,20 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
 ) -> None:
     """Count two warned passes and one unwarned pass since the first alert; earlier ones do not count."""
     driven = visits(
-        ("sim-001", 1.0, 7, 0.9, 0.5), ("sim-002", 11.0, 7, 0.2, 1.0), ("sim-001", 31.0, 7, 0.2, 0.6),
-        ("sim-001", 32.0, 7, 0.2, 0.99), ("sim-002", 33.0, 7, 0.2, 1.0), ("sim-004", 40.0, 7, 0.2, 0.7),
-    )  # fmt: skip
+        ("sim-001", 1.0, 7, 0.9, 0.5),
+        ("sim-002", 11.0, 7, 0.2, 1.0),
+        ("sim-001", 31.0, 7, 0.2, 0.6),
+        ("sim-001", 32.0, 7, 0.2, 0.99),
+        ("sim-002", 33.0, 7, 0.2, 1.0),
+        ("sim-004", 40.0, 7, 0.2, 0.7),
+    )
     alerts = [(20 * S, Alert(7, 0, True, 20 * S, 0.2, 0.1, 0.3, 0.95, 2, 0.0, 0.0, "ice"))]
     grip = compare.lost_grip(driven, alerts, 10 * S, 0.5)
     assert sorted(zip(grip.warned.tolist(), grip.lost.tolist(), strict=True)) == [
-        (False, True), (True, False), (True, True),
-    ]  # fmt: skip
+        (False, True),
+        (True, False),
+        (True, True),
+    ]
     assert (
         grip.line()
         == "Over the new ice, once it was known: 1 of 2 warned drivers lost grip, 1 of 1 who were not warned."
@@ -176,10 +196,17 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     assert (tmp_path / "map.png").read_bytes() != (tmp_path / "without.png").read_bytes()
 
 
-@pytest.mark.parametrize(("name", "value", "works"), [
-    (compare.COVERAGE, 0.95, True), (compare.COVERAGE, 0.995, True), (compare.COVERAGE, 0.79, False),
-    (compare.COVERAGE, float("nan"), False), (compare.DELAY, 6, True), ("demo.observations.duplicates", 1, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "value", "works"),
+    [
+        (compare.COVERAGE, 0.95, True),
+        (compare.COVERAGE, 0.995, True),
+        (compare.COVERAGE, 0.79, False),
+        (compare.COVERAGE, float("nan"), False),
+        (compare.DELAY, 6, True),
+        ("demo.observations.duplicates", 1, False),
+    ],
+)
 def test_a_demo_fails_by_what_breaks_a_promise(name: str, value: float, works: bool) -> None:
     among = Figure(name, value, "", 0)
     if name == compare.COVERAGE:

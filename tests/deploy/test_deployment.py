@@ -54,7 +54,8 @@ class Site:
     """The folders of a deployment below another root, with other ports."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self._ports = root, free_ports(len(PORTS))
+        self.root = root
+        self._ports = free_ports(len(PORTS))
         for name in ("etc", "lib", "cache"):
             (root / name).mkdir()
         for file in (DEPLOY / "secure").glob("*.json"):
@@ -112,9 +113,18 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
         str(folder / unit.name.replace("@.", f"@{instance}.")) for unit, instance in instances()
     ]
     done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", *names],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            "systemd-analyze",
+            "verify",
+            "--man=no",
+            "--generators=no",
+            "--recursive-errors=no",
+            *names,
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     ours = [line for line in done.stderr.splitlines() if "gripmap" in line]
     assert not ours, done.stderr
     assert done.returncode == 0, done.stderr
@@ -129,9 +139,18 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
     standby = folder / "gripmap-service.service.d" / "standby.conf"
     standby.write_text(site.placed((DEPLOY / "systemd" / "standby.conf").read_text()))
     done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", str(folder / unit.name)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            "systemd-analyze",
+            "verify",
+            "--man=no",
+            "--generators=no",
+            "--recursive-errors=no",
+            str(folder / unit.name),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert not [
         line for line in done.stderr.splitlines() if "gripmap" in line or "standby" in line
     ], done.stderr
@@ -150,9 +169,18 @@ def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
     file = tmp_path / unit.name.replace("@.", f"@{instance}.")
     file.write_text(unit.read_text())
     done = subprocess.run(
-        ["systemd-analyze", "security", "--offline=true", "--no-pager", f"--threshold={MOST_EXPOSED * 10:.0f}", file],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            "systemd-analyze",
+            "security",
+            "--offline=true",
+            "--no-pager",
+            f"--threshold={MOST_EXPOSED * 10:.0f}",
+            file,
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout
 
 
@@ -176,10 +204,8 @@ def test_no_unit_gives_up_or_invents_or_has_another_roles_user() -> None:
 
 def test_what_is_shipped_as_secure_keeps_persons_private() -> None:
     secure = DEPLOY / "secure"
-    agent, service = (
-        load(secure / "agent.json", AgentConfig),
-        load(secure / "service.json", ServiceConfig),
-    )
+    agent = load(secure / "agent.json", AgentConfig)
+    service = load(secure / "service.json", ServiceConfig)
     assert agent.trip_end_m > 0.0
     assert agent.trip_end_s > 0.0
     assert service.public_vehicles > 1

@@ -26,9 +26,10 @@ pytestmark = pytest.mark.skipif(
     shutil.which("kubectl") is None, reason="kubectl, which builds the manifests, is not here"
 )
 SECRETS = {  # the documented ones, by overlay
-    "one-node": set(), "secure": {"router-certs", "service-certs"},
+    "one-node": set(),
+    "secure": {"router-certs", "service-certs"},
     "three-regions": {"router-certs", "north-certs", "middle-certs", "south-certs", "bucket"},
-}  # fmt: skip
+}
 
 
 def templates(objects: list[Manifest]) -> list[Manifest]:
@@ -56,7 +57,8 @@ def test_the_schemas_of_kubernetes_find_nothing_wrong(overlay: str) -> None:
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
     objects = built(overlay)
-    labels, secrets = labels_of(objects), set()
+    labels = labels_of(objects)
+    secrets = set()
     configs = {one["metadata"]["name"] for one in of_kind(objects, "ConfigMap")}
     services = {one["metadata"]["name"]: one for one in of_kind(objects, "Service")}
     for one in of_kind(objects, "StatefulSet"):
@@ -180,10 +182,17 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(
         wanted = sorted({pod.name.rpartition("-")[0] for pod in services})
         until(lambda: sorted(serving()) == wanted, 120.0)
         with reader(running) as session:
-            until(lambda: len({token.region for token in tokens.active_tokens(session)}) == sum(
-                len(json.loads(settings(running, f"{name}-0"))["regions"]) if overlay == "three-regions" else 1
-                for name in wanted
-            ))  # fmt: skip
+            until(
+                lambda: (
+                    len({token.region for token in tokens.active_tokens(session)})
+                    == sum(
+                        len(json.loads(settings(running, f"{name}-0"))["regions"])
+                        if overlay == "three-regions"
+                        else 1
+                        for name in wanted
+                    )
+                )
+            )
     assert running.failed == []
 
 

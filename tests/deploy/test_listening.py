@@ -21,7 +21,8 @@ def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
         ListeningTown("test", 12, 3, listening=hears, rough=0.0) for hears in (True, False)
     )
     hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)
-    with_, without = hearing.run(40.0), deaf.run(40.0)
+    with_ = hearing.run(40.0)
+    without = deaf.run(40.0)
     assert hearing.heard.alerts
     assert len(with_.known_error) > 50, "cells that the map knew, and that it told"
     assert not deaf.heard.cells

@@ -22,7 +22,8 @@ def test_clients_of_a_router_hear_each_other() -> None:
     session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
     with session:
         settings = ZenohSettings(connect=endpoints)
-        first, second = open_session(settings), open_session(settings)
+        first = open_session(settings)
+        second = open_session(settings)
         assert first is not None
         assert second is not None
         with first, second:

@@ -24,7 +24,8 @@ from schemas.signals import CHANNELS, S
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
-LATITUDE, LONGITUDE = 57.70, 11.97
+LATITUDE = 57.70
+LONGITUDE = 11.97
 Lengths: TypeAlias = NDArray[np.floating[Any]]
 METRE = 1.0 / 111_320.0  # degrees of latitude
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01
@@ -56,12 +57,15 @@ def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
     """Random, or of one mu with a narrow interval; evidence everywhere."""
-    rng, shape = np.random.default_rng(seed), (samples, vehicles)
+    rng = np.random.default_rng(seed)
+    shape = (samples, vehicles)
     middle = rng.uniform(0.1, 1.0, shape) if mu is None else np.full(shape, mu)
     health = rng.integers(0, 4, shape).astype(np.int32)
     evidence = -rng.exponential(2.0, (*shape, mugrid.BINS))
     vx, vy, yaw_rate, sideslip = (rng.normal(10.0, 1.0, shape) for _ in range(4))
-    lower, upper, gripped = middle - 0.05, middle + 0.05, np.full(shape, used)
+    lower = middle - 0.05
+    upper = middle + 0.05
+    gripped = np.full(shape, used)
     return MadeUp(vx, vy, yaw_rate, sideslip, middle, lower, upper, gripped, health, evidence)
 
 
@@ -150,18 +154,39 @@ _LOST = np.full(5, np.nan)
 # what is wrong with a log -> how to write such a one, and the error that it gives
 BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such file": (lambda path: None, "^log: .* does not exist; give"),
-    "empty file": (lambda path: path.write_bytes(b""), "^log: .* is not a Parquet file .*; write the log as Parquet"),
+    "empty file": (
+        lambda path: path.write_bytes(b""),
+        "^log: .* is not a Parquet file .*; write the log as Parquet",
+    ),
     "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),
     "no rows": (lambda path: pq.write_table(pa.table(a_log(0)), path), "^log: .* has no rows; "),
     "no time": (_written(t=None), "^t: the log has neither t nor timestamp; add"),
     "no ax": (_written(ax=None), "^ax: the log has no such column; add"),
     "no omega_rr": (_written(omega_rr=None), "^omega_rr: the log has no such column; add"),
-    "no steering": (_written(delta_fl=None, delta_fr=None), "^delta_fl: .* no such column; add it or delta_fr"),
+    "no steering": (
+        _written(delta_fl=None, delta_fr=None),
+        "^delta_fl: .* no such column; add it or delta_fr",
+    ),
     "yaw_rate all NaN": (_written(yaw_rate=_LOST), "^yaw_rate: has no reading in any row; record"),
-    "omega_fl all null": (_written(omega_fl=pa.nulls(5, pa.float64())), "^omega_fl: has no reading in any row; record"),
-    "steering all NaN": (_written(delta_fl=_LOST, delta_fr=_LOST), "^delta_fl: has no reading in any row; record"),
-    "time goes back": (_written(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])), "^t: goes back at row 3; sort the log"),
-    "time missing": (_written(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])), "^t: row 1 has no time; give"),
+    "omega_fl all null": (
+        _written(omega_fl=pa.nulls(5, pa.float64())),
+        "^omega_fl: has no reading in any row; record",
+    ),
+    "steering all NaN": (
+        _written(delta_fl=_LOST, delta_fr=_LOST),
+        "^delta_fl: has no reading in any row; record",
+    ),
+    "time goes back": (
+        _written(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])),
+        "^t: goes back at row 3; sort the log",
+    ),
+    "time missing": (
+        _written(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])),
+        "^t: row 1 has no time; give",
+    ),
     "text for a number": (_written(ay=["a"] * 5), "^ay: is string, not a number; write"),
-    "text for a time": (_written(t=None, timestamp=["a"] * 5), "^timestamp: is string, not a time; write"),
-}  # fmt: skip
+    "text for a time": (
+        _written(t=None, timestamp=["a"] * 5),
+        "^timestamp: is string, not a time; write",
+    ),
+}

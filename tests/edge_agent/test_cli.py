@@ -101,14 +101,13 @@ def test_replay_writes_one_row_per_sample_as_the_contract_says(
 def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(
     drive: Path, tmp_path: Path
 ) -> None:
-    log, half = pq.read_table(drive / "log.parquet"), tmp_path / "half.parquet"
+    log = pq.read_table(drive / "log.parquet")
+    half = tmp_path / "half.parquet"
     pq.write_table(log.slice(0, 411), half)
     assert main(replay(drive, tmp_path / "whole.parquet")) == 0
     assert main(replay(drive, tmp_path / "half-out.parquet", log=half)) == 0
-    whole, first = (
-        pq.read_table(tmp_path / "whole.parquet"),
-        pq.read_table(tmp_path / "half-out.parquet"),
-    )
+    whole = pq.read_table(tmp_path / "whole.parquet")
+    first = pq.read_table(tmp_path / "half-out.parquet")
     assert first.num_rows == 411
     for name in whole.column_names:
         expected, found = (

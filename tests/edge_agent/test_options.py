@@ -49,31 +49,60 @@ SIMULATED = [
 ]
 SIMULATE = {
     "manoeuvre": ["sine", *SIMULATED[1:]],
-    **{name: [*SIMULATED, name, value] for name, value in (
-        ("--mu", "0.2"), ("--speed", "11"), ("--duration", "3"), ("--rate", "100"), ("--seed", "2"),
-        ("--sensors", "ideal"), ("--road", "hilly"), ("--slope", "0.03"),
-    )},
+    **{
+        name: [*SIMULATED, name, value]
+        for name, value in (
+            ("--mu", "0.2"),
+            ("--speed", "11"),
+            ("--duration", "3"),
+            ("--rate", "100"),
+            ("--seed", "2"),
+            ("--sensors", "ideal"),
+            ("--road", "hilly"),
+            ("--slope", "0.03"),
+        )
+    },
     "--no-torque": [*SIMULATED, "--no-torque"],
-}  # fmt: skip
+}
 # run, fleet, tune: option -> the words that are added to those of USUAL; `{0}` and `{1}` are two drives
 USUAL = {
-    "run": ["run"], "fleet": ["fleet", "--vehicles", "3"], "tune": ["tune", "--quick"],
-}  # fmt: skip
+    "run": ["run"],
+    "fleet": ["fleet", "--vehicles", "3"],
+    "tune": ["tune", "--quick"],
+}
 LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json", "--trust"]
 CHANGED: dict[tuple[str, str], list[str]] = {
-    ("run", "--source"): LOGGED, ("run", "--vehicle"): ["--vehicle", "{1}.json"],
-    **{(command, option): [option, value] for command in ("run", "fleet") for option, value in (
-        ("--memberships", "{0}.memberships"), ("--estimator", "ckf"),
-        ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
-        ("--duration", "7"),
-    )},
-    ("run", "--name"): ["--name", "car-one"], ("fleet", "--vehicles"): ["--vehicles", "4"],
-    ("fleet", "--rough"): ["--rough", "0.5"], ("fleet", "--truth"): ["--truth", "{0}.truth"],
-    **{("tune", option): [option, value] for option, value in (
-        ("--seed", "14"), ("--ants", "4"), ("--iterations", "3"), ("--objective", "innovation"), ("--out", "{0}.tuned"),
-        ("--repeats", "2"),
-    )},
-}  # fmt: skip
+    ("run", "--source"): LOGGED,
+    ("run", "--vehicle"): ["--vehicle", "{1}.json"],
+    **{
+        (command, option): [option, value]
+        for command in ("run", "fleet")
+        for option, value in (
+            ("--memberships", "{0}.memberships"),
+            ("--estimator", "ckf"),
+            ("--config", "{0}.agent"),
+            ("--scenario", "hills"),
+            ("--rate", "50"),
+            ("--seed", "1"),
+            ("--duration", "7"),
+        )
+    },
+    ("run", "--name"): ["--name", "car-one"],
+    ("fleet", "--vehicles"): ["--vehicles", "4"],
+    ("fleet", "--rough"): ["--rough", "0.5"],
+    ("fleet", "--truth"): ["--truth", "{0}.truth"],
+    **{
+        ("tune", option): [option, value]
+        for option, value in (
+            ("--seed", "14"),
+            ("--ants", "4"),
+            ("--iterations", "3"),
+            ("--objective", "innovation"),
+            ("--out", "{0}.tuned"),
+            ("--repeats", "2"),
+        )
+    },
+}
 REPLAYED = "test_replay_depends_on_log_vehicle_estimator_and_configuration"
 SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
 # what the other options of the commands do is told by the tests named here, in whose modules they are given
@@ -87,55 +116,111 @@ PLANNER = "test_limits_for_a_planner_without_listening_are_a_mistake"
 LISTENS = "test_a_car_that_listens_prints_its_warnings_and_heeds_its_route"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
-    "simulate": {"--list": "test_simulate_lists_the_manoeuvres", "--json": "test_simulate_lists_the_manoeuvres",
-                 "--out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
-                 "--vehicle-out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file"},
-    "import": {"source": REAL, "--profile": REAL, "--vehicle": REAL, "--out": REAL,
-               "--list": "test_the_shipped_profiles_are_listed", "--json": "test_the_shipped_profiles_are_listed",
-               "--dbc": "test_another_database_and_a_named_draft", "--draft": "test_another_database_and_a_named_draft",
-               "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
-    "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
-               "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
-               "--compare": "test_compared_estimators_stand_in_the_report",
-               "--jobs": "test_so_many_drives_are_under_way_at_once",
-               "--engine": "test_an_engine_is_for_several_logs_and_wants_no_jobs",
-               "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
-    "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX,
-              "--json": "test_what_the_doctor_found_is_json_for_a_program"},
+    "simulate": {
+        "--list": "test_simulate_lists_the_manoeuvres",
+        "--json": "test_simulate_lists_the_manoeuvres",
+        "--out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
+        "--vehicle-out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
+    },
+    "import": {
+        "source": REAL,
+        "--profile": REAL,
+        "--vehicle": REAL,
+        "--out": REAL,
+        "--list": "test_the_shipped_profiles_are_listed",
+        "--json": "test_the_shipped_profiles_are_listed",
+        "--dbc": "test_another_database_and_a_named_draft",
+        "--draft": "test_another_database_and_a_named_draft",
+        "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy",
+    },
+    "replay": {
+        "log": REPLAYED,
+        "--vehicle": REPLAYED,
+        "--estimator": REPLAYED,
+        "--out": REPLAYED,
+        "--config": REPLAYED,
+        "--publish": SENT_BY_REPLAY,
+        "--trust": UNFIT,
+        "--name": SENT_BY_REPLAY,
+        "--start": SENT_BY_REPLAY,
+        "--compare": "test_compared_estimators_stand_in_the_report",
+        "--jobs": "test_so_many_drives_are_under_way_at_once",
+        "--engine": "test_an_engine_is_for_several_logs_and_wants_no_jobs",
+        "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says",
+    },
+    "check": {
+        "log": FIX,
+        "--vehicle": FIX,
+        "--out": FIX,
+        "--fix": FIX,
+        "--json": "test_what_the_doctor_found_is_json_for_a_program",
+    },
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
-    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS,
-            "--autoware": PLANNER, "--autoware-hash": PLANNER,
-            "--vss": "test_the_command_prints_lines_of_the_drive"},
+    "run": {
+        "--trust": UNFIT,
+        "--profile": LIVE,
+        "--dbc": LIVE,
+        "--ahead": LISTENS,
+        "--route": LISTENS,
+        "--autoware": PLANNER,
+        "--autoware-hash": PLANNER,
+        "--vss": "test_the_command_prints_lines_of_the_drive",
+    },
     "fleet": {
         "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",
         "--winter": "test_a_share_of_winter_vehicles_beyond_one_is_refused",
     },
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
-    "tune": {"log": "test_drives_of_one_s_own_are_searched_on", "--vehicle": "test_drives_of_one_s_own_are_searched_on",
-             "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
-             "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
-    "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS, "--plots": CAMPAIGN,
-                 "--logs": "test_logs_of_a_folder_are_judged_and_reported",
-                 "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
-                 "--only": "test_only_the_inputs_are_evaluated_where_so_asked",
-                 "--paper": "test_paper_is_reproduced_and_written"},
-}  # fmt: skip
+    "tune": {
+        "log": "test_drives_of_one_s_own_are_searched_on",
+        "--vehicle": "test_drives_of_one_s_own_are_searched_on",
+        "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
+        "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file",
+    },
+    "evaluate": {
+        "--out": CAMPAIGN,
+        "--quick": CAMPAIGN,
+        "--seeds": SEEDS,
+        "--no-plots": SEEDS,
+        "--plots": CAMPAIGN,
+        "--logs": "test_logs_of_a_folder_are_judged_and_reported",
+        "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
+        "--only": "test_only_the_inputs_are_evaluated_where_so_asked",
+        "--paper": "test_paper_is_reproduced_and_written",
+    },
+}
 # agent configuration: setting -> another value; those of sending are shown where things are sent
 OBSERVED = {
-    "state_rate_hz": 5.0, "slippery_mu": 1.15, "position_std": 3.0, "yaw_std": 0.1, "trip_end_m": 30.0,
-    "trip_end_s": 3.0, "tyre_season": 2,
-}  # fmt: skip
+    "state_rate_hz": 5.0,
+    "slippery_mu": 1.15,
+    "position_std": 3.0,
+    "yaw_std": 0.1,
+    "trip_end_m": 30.0,
+    "trip_end_s": 3.0,
+    "tyre_season": 2,
+}
 # none by default; tested with the corrections (inputs/test_adopt.py) and with the prior (schemas/test_vehicle_axles.py)
 OPTIONAL = {
-    "wheel_radius_front", "wheel_radius_rear", "cornering_stiffness_front", "cornering_stiffness_rear",
-    "steering_compliance", "rear_axle_locked",
-}  # fmt: skip
+    "wheel_radius_front",
+    "wheel_radius_rear",
+    "cornering_stiffness_front",
+    "cornering_stiffness_rear",
+    "steering_compliance",
+    "rear_axle_locked",
+}
 NUMBERS = [
-    (estimator, name) for name in Vehicle.model_fields for estimator in ("aco-fckf", "compensated-wckf")
-    if name not in ("name", "steering_ratio", "calibration")  # read by `import`, and by what reads logs: test_learn
+    (estimator, name)
+    for name in Vehicle.model_fields
+    for estimator in ("aco-fckf", "compensated-wckf")
+    if name
+    not in (
+        "name",
+        "steering_ratio",
+        "calibration",
+    )  # read by `import`, and by what reads logs: test_learn
     and name not in OPTIONAL
     and (estimator, name) != ("compensated-wckf", "drive_split_front")
-]  # fmt: skip
+]
 SENT = {"zenoh", "spool", "spool_mb", "resend_s", "flush_s", "batch_rows", "estimator"}
 WATCHED = {"metrics_port", "metrics_host", "log"}  # shown by tests/schemas/test_monitor.py
 
@@ -198,10 +283,18 @@ def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> o
     seen: list[object] = []
 
     def note(
-        vehicles: Sequence[Vehicle], names: Sequence[str], source: Iterator[Block], config: AgentConfig,
-        estimator: str | None, duration_s: float, at_end: Callable[[], None] = lambda: None,
-        lookout: object | None = None, memberships: Memberships | None = None, *, vss: bool = False,
-    ) -> int:  # fmt: skip
+        vehicles: Sequence[Vehicle],
+        names: Sequence[str],
+        source: Iterator[Block],
+        config: AgentConfig,
+        estimator: str | None,
+        duration_s: float,
+        at_end: Callable[[], None] = lambda: None,
+        lookout: object | None = None,
+        memberships: Memberships | None = None,
+        *,
+        vss: bool = False,
+    ) -> int:
         assert lookout is None
         assert not vss
         first = [next(source) for _ in range(3)]
@@ -289,7 +382,8 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
         assert main(["replay", *files, *more]) == 0
         return np.asarray(pq.read_table(out)["mu"].to_numpy())
 
-    usual, configured = reported(), reported("one", "one", "--config", str(tmp_path / "agent.json"))
+    usual = reported()
+    configured = reported("one", "one", "--config", str(tmp_path / "agent.json"))
     named = reported("one", "one", "--estimator", "sr-ukf")
     for other in (reported("other"), reported("one", "other"), named):
         assert not np.array_equal(usual, other)
@@ -330,7 +424,8 @@ def test_every_setting_of_the_agent_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("name", OBSERVED)
 def test_every_setting_of_what_is_told_changes_what_is_told(name: str) -> None:
-    usual, other = AgentConfig(), AgentConfig.model_validate({name: OBSERVED[name]})
+    usual = AgentConfig()
+    other = AgentConfig.model_validate({name: OBSERVED[name]})
     assert getattr(usual, name) != OBSERVED[name]
     assert records(usual) != records(other)
 

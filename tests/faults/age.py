@@ -136,7 +136,9 @@ def _last_day(root: Path, to: Path, old: int) -> Path:
 
 def _states(root: Path, rows: int) -> None:
     """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the observations."""
-    writer, rng, at = Writer(root, "shard-1"), np.random.default_rng(1), 0
+    writer = Writer(root, "shard-1")
+    rng = np.random.default_rng(1)
+    at = 0
     model = next(synthetic.chunks(SyntheticFleet(SEGMENT, 1, vehicles=1000), 24))
     while at < rows:
         n = min(SEGMENT, rows - at)

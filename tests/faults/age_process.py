@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Do it, and say what it cost."""
-    what, root, began = sys.argv[1], Path(sys.argv[2]), time.perf_counter()
+    what = sys.argv[1]
+    root = Path(sys.argv[2])
+    began = time.perf_counter()
     limit_memory(*UNUSED)
     found = _past(root) if what == "past" else _begun(root, what == "checkpoint")
     print(json.dumps({"seconds": time.perf_counter() - began, "mb": _most_mb(), **found}))

@@ -37,11 +37,14 @@ Place = tuple[int, int]  # cell and sector
 
 def run(site: Site) -> list[Figure]:
     """Eight restarts of twenty alerts; one of ten in a quick run."""
-    each, missing, waits = site.of(20, 10), 0, []
+    each = site.of(20, 10)
+    missing = 0
+    waits = []
     with stage(site.folder) as there:
         beside = _beside(there)
         with _opened(there.endpoint) as driver, _opened(beside.command[-1]) as watcher:
-            fleet, heard = Fleet(driver).meet(), dict[Place, float]()
+            fleet = Fleet(driver).meet()
+            heard = dict[Place, float]()
             watched = watcher.declare_subscriber(
                 f"{keys.ROOT}/alert/**", lambda sample: _note(heard, sample)
             )
@@ -105,12 +108,17 @@ def _ice(turn: int, places: int) -> list[Batch]:
     assert {int(grid.region_of(cell)) for cell in cells} == {REGION}
     return [
         batch(
-            f"sim-{number:03}", 1 + turn * places + place, time.time_ns() - NS, [0.2],
-            latitude=[latitude], longitude=[longitudes[place]], cell=[cells[place]],
+            f"sim-{number:03}",
+            1 + turn * places + place,
+            time.time_ns() - NS,
+            [0.2],
+            latitude=[latitude],
+            longitude=[longitudes[place]],
+            cell=[cells[place]],
         )
         for place in range(places)
         for number in range(WITNESSES)
-    ]  # fmt: skip
+    ]
 
 
 def _stand(session: zenoh.Session, least: int) -> bool:

@@ -73,7 +73,8 @@ def stranger(ground: Ground) -> Path:
 @attempt
 def certificate_of_another_authority(ground: Ground) -> bool:
     folder = stranger(ground)
-    certificate, private = str(folder / "shard-0.pem"), str(folder / "shard-0.key")
+    certificate = str(folder / "shard-0.pem")
+    private = str(folder / "shard-0.key")
     return opens(ground, SERVICE, connect_certificate=certificate, connect_private_key=private)
 
 
@@ -117,8 +118,15 @@ def lures(ground: Ground, folder: Path, name: str) -> bool:
         "listen_private_key": str(folder / f"{name}.key"),
     }
     file = ground.folder / "false-router.json5"
-    file.write_text(json.dumps({"mode": "router", "scouting": {"delay": 0, "multicast": {"enabled": False}},
-                                "transport": {"link": {"tls": tls}}}))  # fmt: skip
+    file.write_text(
+        json.dumps(
+            {
+                "mode": "router",
+                "scouting": {"delay": 0, "multicast": {"enabled": False}},
+                "transport": {"link": {"tls": tls}},
+            }
+        )
+    )
     router, endpoints = open_router(file, FREE[ground.network.protocol])
     with router:
         try:
@@ -150,12 +158,25 @@ def spoofed(name: str) -> list[str]:
     """Keys that do not belong to a vehicle of this name."""
     other = HONEST if name != HONEST else ROGUE
     return [
-        key(other), keys.state_key(REGION, other), keys.ack_key(other), keys.ack_key(name), keys.map_key(TILE),
-        keys.alert_key(TILE), keys.weather_key(REGION), keys.alive_key(name), keys.shard_key(name),
-        f"{keys.ROOT}/obs/**", f"{keys.ROOT}/obs/*/*/*/*", f"{keys.ROOT}/*/*/*/*/{name}", f"{keys.ROOT}/**/{name}",
-        f"{keys.ROOT}/obs/0/{name}", f"{keys.ROOT}/obs/0/1/2/3/{name}", f"{keys.ROOT}/obs/0123/012/012/sim$*",
-        f"{keys.ROOT}/obs/0123/012/012/{name}/{name}", "gripmap/v2/obs/0123/012/012/" + name,
-    ]  # fmt: skip
+        key(other),
+        keys.state_key(REGION, other),
+        keys.ack_key(other),
+        keys.ack_key(name),
+        keys.map_key(TILE),
+        keys.alert_key(TILE),
+        keys.weather_key(REGION),
+        keys.alive_key(name),
+        keys.shard_key(name),
+        f"{keys.ROOT}/obs/**",
+        f"{keys.ROOT}/obs/*/*/*/*",
+        f"{keys.ROOT}/*/*/*/*/{name}",
+        f"{keys.ROOT}/**/{name}",
+        f"{keys.ROOT}/obs/0/{name}",
+        f"{keys.ROOT}/obs/0/1/2/3/{name}",
+        f"{keys.ROOT}/obs/0123/012/012/sim$*",
+        f"{keys.ROOT}/obs/0123/012/012/{name}/{name}",
+        "gripmap/v2/obs/0123/012/012/" + name,
+    ]
 
 
 @attempt
@@ -192,7 +213,8 @@ def declared_publisher_on_another_key(ground: Ground) -> bool:
 def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
     ground.judged()  # else the refusals of attacks before it are counted as its own
-    before, refused = ground.admitted, ground.service.engine.counts["refused.key"]
+    before = ground.admitted
+    refused = ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
     session.put(
         f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION]
@@ -257,10 +279,20 @@ def spoofed_reply(ground: Ground) -> bool:
 
 def overhears(ground: Ground, session: zenoh.Session) -> bool:
     """Return True if a session receives another vehicle's observations or acknowledgements."""
-    listener = Listener(session, (
-        f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/state/**", keys.ack_key(HONEST), f"{keys.ROOT}/ack/*",
-        key(HONEST), "**", "gripmap/**", f"{keys.ROOT}/*/**",
-    ))  # fmt: skip
+    listener = Listener(
+        session,
+        (
+            f"{keys.ROOT}/map/**",
+            ALL_OBSERVATIONS,
+            f"{keys.ROOT}/state/**",
+            keys.ack_key(HONEST),
+            f"{keys.ROOT}/ack/*",
+            key(HONEST),
+            "**",
+            "gripmap/**",
+            f"{keys.ROOT}/*/**",
+        ),
+    )
     ground.passed(session)
     ground.drive()
     ground.passed(session, listener)
@@ -422,7 +454,8 @@ def batch_that_is_too_large_travels(ground: Ground) -> bool:
 
 @attempt
 def question_with_a_payload_travels(ground: Ground) -> bool:
-    session, answered = ground.open(ROGUE, ROUTERS[1]), ground.service.engine.counts["queries"]
+    session = ground.open(ROGUE, ROUTERS[1])
+    answered = ground.service.engine.counts["queries"]
     asked: Any = session.get(keys.map_key(TILE), payload=SECRET + bytes(wire.MAX_BYTES))
     through = any(reply.ok is not None for reply in asked)
     return through or ground.service.engine.counts["queries"] > answered
@@ -441,8 +474,10 @@ def administration_of_the_routers(ground: Ground) -> bool:
 def revoked_vehicle(ground: Ground) -> bool:
     """After the routers were started with a list without it."""
     network = ground.network
-    lost = {f"connect_{part}": str(ground.folder / f"lost.{end}") for part, end in
-            (("certificate", "pem"), ("private_key", "key"))}  # fmt: skip
+    lost = {
+        f"connect_{part}": str(ground.folder / f"lost.{end}")
+        for part, end in (("certificate", "pem"), ("private_key", "key"))
+    }
     for end in ("pem", "key"):
         (ground.folder / f"lost.{end}").write_bytes((ground.folder / f"{ROGUE}.{end}").read_bytes())
     (ground.folder / "lost.pem").rename(ground.folder / "lost.crt")

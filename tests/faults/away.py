@@ -71,12 +71,21 @@ def _message(one: StoredBatch) -> Message:
 
 def _draft(car: int, now: float) -> tuple[Draft, int]:
     """Return the reports of a car for half a second, and their cell; each car has a road of its own."""
-    latitude, longitude = PLACE[0] + 2 * CELL_DEG * car, PLACE[1] + CELL_DEG * int(now)
+    latitude = PLACE[0] + 2 * CELL_DEG * car
+    longitude = PLACE[1] + CELL_DEG * int(now)
     cell = int(grid.cell_of(latitude, longitude))
-    region, time = int(grid.region_of(cell)), START + round(now * NS)
+    region = int(grid.region_of(cell))
+    time = START + round(now * NS)
     told = batch(
-        f"car-{car:03}", 1, time, [0.6], latitude=[latitude], longitude=[longitude], cell=[cell], position_std=[0.1]
-    )  # fmt: skip
+        f"car-{car:03}",
+        1,
+        time,
+        [0.6],
+        latitude=[latitude],
+        longitude=[longitude],
+        cell=[cell],
+        position_std=[0.1],
+    )
 
     def encoded(seq: int, first_held: int) -> bytes:
         return wire.encode(
@@ -93,10 +102,14 @@ def run(site: Site) -> list[Figure]:
 
 
 def _run(site: Site, engine: Engine) -> list[Figure]:
-    cars, away_s = site.of(20, 2), site.of(3600, 600)
+    cars = site.of(20, 2)
+    away_s = site.of(3600, 600)
     outboxes = [Outbox(site.folder / f"{n}.sqlite", boot=n + 1) for n in range(cars)]
-    service, made, now = Made(cars, engine), 0, 0.0
-    cells, stored = set[int](), 0
+    service = Made(cars, engine)
+    made = 0
+    now = 0.0
+    cells = set[int]()
+    stored = 0
 
     def step(driving: bool) -> int:
         nonlocal made, now, stored

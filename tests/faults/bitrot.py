@@ -28,10 +28,16 @@ from tests.faults.frame import Site
 from tests.fleet_service.archive.kept import ROUNDS, make, map_of, messages, now_of
 
 KINDS: Final = {
-    "inbox": "inbox/*.parquet", "states in the inbox": "inbox/states/*.parquet",
-    "observations": "observations/*/*/*.parquet", "states": "states/*/*/*.parquet", "weather": "weather/*.parquet",
-    "key": "keys/*", "checkpoint": "checkpoints/*/*", "roll-up": "rollup/*/*/*/*.parquet", "map": "map/*/*.parquet",
-}  # fmt: skip
+    "inbox": "inbox/*.parquet",
+    "states in the inbox": "inbox/states/*.parquet",
+    "observations": "observations/*/*/*.parquet",
+    "states": "states/*/*/*.parquet",
+    "weather": "weather/*.parquet",
+    "key": "keys/*",
+    "checkpoint": "checkpoints/*/*",
+    "roll-up": "rollup/*/*/*/*.parquet",
+    "map": "map/*/*.parquet",
+}
 BATCHES: Final = 40  # of a spool
 
 
@@ -39,11 +45,14 @@ def run(site: Site) -> list[Figure]:
     """Some bits of each kind of file."""
     logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
-    random_, each = random.Random(site.seed), site.of(40, 1)
+    random_ = random.Random(site.seed)
+    each = site.of(40, 1)
     whole = site.folder / "whole"
     make(whole)
     right = _found(whole, whole)
-    unnoticed, loops, tried = [], [], 0
+    unnoticed = []
+    loops = []
+    tried = 0
     for kind, pattern in KINDS.items():
         for _ in range(each):
             copy = site.folder / "copy"
@@ -117,7 +126,8 @@ def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
 
 def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
     """Bits of a spool; what was found wrong and not noticed."""
-    path, wrong = site.folder / "whole.sqlite", []
+    path = site.folder / "whole.sqlite"
+    wrong = []
     outbox = Outbox(path, boot=5)
     payloads = {seq: random_.randbytes(random_.choice((80, 400))) for seq in range(1, BATCHES + 1)}
     outbox.store(

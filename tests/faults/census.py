@@ -86,9 +86,14 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
     doubled = max(doubled, _doubled_outside(archive))
     missing = {name for name, (records, _) in stored.items() if held.get(name, 0) < records}
     return Census(
-        len(stored), len(settled.keys() & stored.keys()), len(missing & settled.keys()), len(missing), doubled, rows,
+        len(stored),
+        len(settled.keys() & stored.keys()),
+        len(missing & settled.keys()),
+        len(missing),
+        doubled,
+        rows,
         sum(records for records, _ in stored.values()),
-    )  # fmt: skip
+    )
 
 
 def _doubled_outside(archive: Path) -> int:
@@ -107,7 +112,8 @@ def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, i
         return {}, 0, 0
     whole = pa.concat_tables(tables)
     found = whole.group_by(ROW[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
-    pseudonyms, now = Pseudonyms(archive / "keys"), time.time_ns()
+    pseudonyms = Pseudonyms(archive / "keys")
+    now = time.time_ns()
     start_of = {
         (pseudonyms.of(vehicle, now - ago), pseudonyms.boot(vehicle, boot, now - ago)): (
             vehicle,

@@ -95,7 +95,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
-    machine, seq = Machine(time.time_ns()), 0
+    machine = Machine(time.time_ns())
+    seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
         """All report each second, and send what they sent before once more; then the service does its jobs."""

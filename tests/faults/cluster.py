@@ -46,7 +46,10 @@ from tests.waiting import until
 
 FULL: Final = 100  # failovers
 LEASE_S: Final = ServiceConfig().lease_s
-PROCESSES, VEHICLES, RATE = 2, 6, 25.0  # 300 observations/s
+# 300 observations/s
+PROCESSES = 2
+VEHICLES = 6
+RATE = 25.0
 EVERY: Final = 8  # failovers; in the middle and at the end of them the region is handed over
 HOLD_S: Final = (1.0, 5.0)  # in which all goes well, between two failovers
 # Often, so that the few seconds in which a service lives have some of each; a snapshot costs a second.
@@ -60,24 +63,38 @@ KILLED: Final = ("kill", TWO, COMPACTING, COPYING)
 FROZEN: Final = ("freeze", WAKES)
 NAMED: Final = {way: way.replace(" ", "_") for way in WAYS}
 OWES: Final = (
-    "cluster.lost", "cluster.doubled", "cluster.unacknowledged_lost", "cluster.takeover_s.kill",
-    "cluster.takeover_s.freeze", "cluster.failovers", "cluster.cells", "cluster.acknowledged", "cluster.ack_p50_s",
-    "cluster.handover.pause_s", "cluster.handover.map_difference", "cluster.handovers",
-    "cluster.empty_disk.rows_missing", "cluster.empty_disk.rows", "cluster.silent_regions", "cluster.unserved_answers",
+    "cluster.lost",
+    "cluster.doubled",
+    "cluster.unacknowledged_lost",
+    "cluster.takeover_s.kill",
+    "cluster.takeover_s.freeze",
+    "cluster.failovers",
+    "cluster.cells",
+    "cluster.acknowledged",
+    "cluster.ack_p50_s",
+    "cluster.handover.pause_s",
+    "cluster.handover.map_difference",
+    "cluster.handovers",
+    "cluster.empty_disk.rows_missing",
+    "cluster.empty_disk.rows",
+    "cluster.silent_regions",
+    "cluster.unserved_answers",
     *(f"cluster.failovers.{name}" for name in NAMED.values()),
-)  # fmt: skip
+)
 
 
 def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
     """So many failovers, of all kinds in turn."""
     random_ = random.Random(site.seed)
     happened: list[Failover] = []
-    pauses, differences = [], []
+    pauses = []
+    differences = []
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
         bucket = stack.enter_context(bucket_server(site.folder / "objects"))
-        module, names = "tests.faults.cluster_service", ["one", "two", "three"]
+        module = "tests.faults.cluster_service"
+        names = ["one", "two", "three"]
         there = stack.enter_context(
             hosts(
                 site.folder,
@@ -98,13 +115,12 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         parts = loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
         for part in parts:
             stack.callback(part.kill)
-        machines, asking = (
-            Machines(
-                there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_
-            ),
-            Asking(endpoint, box, site.say),
+        machines = Machines(
+            there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_
         )
-        ways, router_of = list(WAYS), ZenohSettings(connect=[endpoint])
+        asking = Asking(endpoint, box, site.say)
+        ways = list(WAYS)
+        router_of = ZenohSettings(connect=[endpoint])
         for number in range(failovers):
             way = ways[number % len(ways)]
             machines.ready(2 if way == TWO else 1)
@@ -132,14 +148,19 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         rows.append(rows_of(empty))
         census.append(take([part.log for part in parts], empty))
     site.say(f"rows {rows}; {census}")
-    return [*_counted(failovers, happened, census), *_told(happened), *ack_p50_s(),
-            figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
-            figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
-            _shown(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
-            figure("cluster.cells", cells), figure("cluster.silent_regions", asking.silent),
-            figure("cluster.unserved_answers", asking.unserved),
-            figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
-            figure("cluster.empty_disk.rows", rows[-1])]  # fmt: skip
+    return [
+        *_counted(failovers, happened, census),
+        *_told(happened),
+        *ack_p50_s(),
+        figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
+        figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
+        _shown(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
+        figure("cluster.cells", cells),
+        figure("cluster.silent_regions", asking.silent),
+        figure("cluster.unserved_answers", asking.unserved),
+        figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
+        figure("cluster.empty_disk.rows", rows[-1]),
+    ]
 
 
 def rows_of(root: Path) -> int:

@@ -12,11 +12,15 @@ from fleet_service.app import beside, jobs
 from fleet_service.cli import main
 from fleet_service.replication.replica import BucketReplica
 
-COMPACTING, COPYING = "compacting", "copying"
-BEGINS, ENDS = "begins", "ends"
+COMPACTING = "compacting"
+COPYING = "copying"
+BEGINS = "begins"
+ENDS = "ends"
 FOLLOW_S: Final = 3.0
 
-_run, _follow, _put_there = beside.run_module, BucketReplica.sync, BucketReplica._put_there
+_run = beside.run_module
+_follow = BucketReplica.sync
+_put_there = BucketReplica._put_there
 _copying = threading.local()
 
 
@@ -26,7 +30,7 @@ def _say(sign: str, what: str) -> None:
 
 def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
-) -> str | None:  # fmt: skip
+) -> str | None:
     """As `beside.run`."""
     _say(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)

@@ -66,7 +66,8 @@ class Journals:
     """Batches that the loads know to be acknowledged, updated as they arrive."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
-        self._paths, self._read = list(paths), Counter[Path]()
+        self._paths = list(paths)
+        self._read = Counter[Path]()
         self._times: list[float] = []
 
     def news(self) -> list[float]:
@@ -132,7 +133,8 @@ class Asking:
 
     def __init__(self, endpoint: str, box: str, say: Callable[[str], None]) -> None:
         self._say = say
-        self._router, self._box = ZenohSettings(connect=[endpoint]), box
+        self._router = ZenohSettings(connect=[endpoint])
+        self._box = box
         self.whole = self.unserved = self.silent = 0
         self._stop = threading.Event()
         self._known = self._cells()[0]
@@ -257,10 +259,13 @@ class Machines:
         journals: Journals,
         random_: random.Random,
     ) -> None:
-        self.serving, self._idle = hosts[0], hosts[1:]
-        self._leases, self._lease_s = leases, lease_s
+        self.serving = hosts[0]
+        self._idle = hosts[1:]
+        self._leases = leases
+        self._lease_s = lease_s
         self.waiting: list[Host] = []
-        self._journals, self._random = journals, random_
+        self._journals = journals
+        self._random = random_
 
     def ready(self, standbys: int) -> None:
         """So many wait."""
@@ -272,7 +277,8 @@ class Machines:
 
     def fail(self, name: str) -> Failover | None:
         """Let the service go; None if nobody had to follow it."""
-        gone, way = self.serving, WAYS[name]
+        gone = self.serving
+        way = WAYS[name]
         terms = self._terms()
         way.go(gone, self._random, self._lease_s)
         began = time.time()
@@ -305,7 +311,8 @@ class Machines:
 
     def hand_over(self, router: ZenohSettings) -> Host:
         """The service gives its region to the one that waits, and has left then; returns it."""
-        former, to = self.serving, self.waiting[0].root.parent.name
+        former = self.serving
+        to = self.waiting[0].root.parent.name
         with map_client.open_connected(router) as session:
             assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
         self._taken()
@@ -366,7 +373,8 @@ def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
         return float("inf")
     for name, table in one.items():
         for column in table.column_names:
-            ours, theirs = table[column], other[name][column]
+            ours = table[column]
+            theirs = other[name][column]
             if pa.types.is_floating(ours.type) and len(ours) == len(theirs):
                 apart = np.abs(np.asarray(ours.to_numpy()) - np.asarray(theirs.to_numpy()))
                 worst = max(worst, float(np.nanmax(apart, initial=0.0)))

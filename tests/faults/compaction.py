@@ -62,7 +62,8 @@ class Reading:
 
     def __init__(self, root: Path, writing: Writing) -> None:
         self.reads = self.incomplete = 0
-        self._root, self._writing = root, writing
+        self._root = root
+        self._writing = writing
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
@@ -98,7 +99,8 @@ def complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 def run(site: Site) -> list[Figure]:
     """50 kills; in a quick run, five."""
-    root, random_ = site.folder / "archive", random.Random(site.seed)
+    root = site.folder / "archive"
+    random_ = random.Random(site.seed)
     part = Part(
         "compaction", [sys.executable, "-m", "tests.faults.compaction", str(root)], site.folder
     )

@@ -39,7 +39,10 @@ class CrashDisk:
     """
 
     def __init__(self, live: Path, random_: random.Random, power: int | None, full: range) -> None:
-        self.live, self._random, self._power, self._full = live, random_, power, full
+        self.live = live
+        self._random = random_
+        self._power = power
+        self._full = full
         self.operations = 0
         self._number: dict[
             int, int
@@ -109,7 +112,8 @@ class CrashDisk:
 
     def _fsync(self, real: Callable[[int], None]) -> Callable[[int], None]:
         def fsync(handle: int) -> None:
-            path, found = Path(f"/proc/self/fd/{handle}").resolve(), os.fstat(handle)
+            path = Path(f"/proc/self/fd/{handle}").resolve()
+            found = os.fstat(handle)
             if self._ours(path):
                 self._operate(needs_room=not stat.S_ISDIR(found.st_mode))
                 if stat.S_ISDIR(found.st_mode):

@@ -30,7 +30,8 @@ class Lives(ABC, Generic[BatchType]):
     full_after: ClassVar[int]
 
     def __init__(self, number: int, folder: Path) -> None:
-        self.random, self.folder = random.Random(number), folder
+        self.random = random.Random(number)
+        self.folder = folder
         self.acknowledged: set[BatchType] = set()
         self.at_stake = 0
 

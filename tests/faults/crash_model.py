@@ -56,7 +56,8 @@ class Batch(NamedTuple):
 
 def rows_of(batches: list[Batch]) -> Rows:
     """Rows of batches of one kind as the log takes them."""
-    kind, n = batches[0].kind, ROWS * len(batches)
+    kind = batches[0].kind
+    n = ROWS * len(batches)
     rows: Rows = {
         "with_likelihood": np.ones(n, bool),
         "log_likelihood": np.zeros((n, 32), np.uint8),
@@ -64,10 +65,8 @@ def rows_of(batches: list[Batch]) -> Rows:
     for f in segments.SCHEMAS[kind]:
         if f.name not in rows:
             rows[f.name] = np.full(n, "") if f.type == pa.string() else np.zeros(n, np.int64)
-    seq, row = (
-        np.repeat([batch.seq for batch in batches], ROWS),
-        np.tile(np.arange(ROWS), len(batches)),
-    )
+    seq = np.repeat([batch.seq for batch in batches], ROWS)
+    row = np.tile(np.arange(ROWS), len(batches))
     rows |= {
         "seq": seq,
         "row": row,
@@ -83,7 +82,9 @@ def rows_of(batches: list[Batch]) -> Rows:
 class History(Lives[Batch]):
     """A history of the log."""
 
-    lives, operations, full_after = 3, 80, 60
+    lives = 3
+    operations = 80
+    full_after = 60
 
     def __init__(self, number: int, folder: Path) -> None:
         super().__init__(number, folder)
@@ -155,8 +156,11 @@ class History(Lives[Batch]):
                 if not rows[seq, row]
             ]
             stream = streams[VEHICLE, 1, kind, 1]
-            found += [f"{kind} {b.seq} only counts as held" for b in self.sent
-                      if b.kind is kind and stream.accepted(b.seq) and b.seq not in held]  # fmt: skip
+            found += [
+                f"{kind} {b.seq} only counts as held"
+                for b in self.sent
+                if b.kind is kind and stream.accepted(b.seq) and b.seq not in held
+            ]
         return found
 
 
@@ -194,8 +198,12 @@ def _memory() -> str | None:
 
 def run(site: Site) -> list[Figure]:
     """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of all."""
-    logs, outboxes, services = site.of(5000, 100), site.of(500, 10), site.of(600, 10)
-    first, bad, acknowledged = site.seed * 1_000_000, 0, Counter[str]()
+    logs = site.of(5000, 100)
+    outboxes = site.of(500, 10)
+    services = site.of(600, 10)
+    first = site.seed * 1_000_000
+    bad = 0
+    acknowledged = Counter[str]()
     kinds = (("log", _lived, logs), ("spool", _stored, outboxes), ("service", _served, services))
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
         for kind, one, count in kinds:

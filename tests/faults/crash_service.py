@@ -82,7 +82,9 @@ class ServiceHistory(Lives[Sent]):
         done: what was done before a power loss, to its end.
     """
 
-    lives, operations, full_after = 4, 250, 100
+    lives = 4
+    operations = 250
+    full_after = 100
 
     def __init__(self, number_: int, folder: Path) -> None:
         super().__init__(number_, folder)
@@ -118,7 +120,8 @@ class ServiceHistory(Lives[Sent]):
 
     def _forget(self, root: Path) -> None:
         """Nobody serves: a vehicle's month, or the whole month, is forgotten."""
-        one, whole = self.random.choice(self.sent), self.random.random() < 0.3
+        one = self.random.choice(self.sent)
+        whole = self.random.random() < 0.3
         key = root / "keys" / f"{one.month}.key"
         if not key.exists():
             return
@@ -183,7 +186,8 @@ class ServiceHistory(Lives[Sent]):
             snapshots.write(root, engine.queries.whole_map(self._now), self._now)
 
     def _batch(self) -> Sent:
-        vehicle, self._now = self.random.choice(VEHICLES), self._now + 5 * SECOND
+        vehicle = self.random.choice(VEHICLES)
+        self._now = self._now + 5 * SECOND
         seq = 1 + sum(one.vehicle == vehicle for one in self.sent)
         latitude = np.full(2, LATITUDE + NORTH * self.random.randrange(PLACES))
         mu = self.random.choice((0.15, 0.5, 0.85))
@@ -199,8 +203,12 @@ class ServiceHistory(Lives[Sent]):
         return self.sent[-1]
 
     def _take(self, engine: Engine, batches: list[Sent]) -> None:
-        wanted = [Message(Kind.OBSERVATION, key(one.vehicle), one.payload, wire.ENCODING[Kind.OBSERVATION])
-                  for one in batches]  # fmt: skip
+        wanted = [
+            Message(
+                Kind.OBSERVATION, key(one.vehicle), one.payload, wire.ENCODING[Kind.OBSERVATION]
+            )
+            for one in batches
+        ]
         engine.intake.ingest(wanted, self._now)
 
     def _flush(self, engine: Engine) -> None:
@@ -244,8 +252,11 @@ class ServiceHistory(Lives[Sent]):
             if table is not None
             for time in nanoseconds(table["time"]).tolist()
         }
-        found += [f"the weather of {time} is lost" for time in sorted(self.weather - there)
-                  if time // layout.DAY_NS > self.retired]  # fmt: skip
+        found += [
+            f"the weather of {time} is lost"
+            for time in sorted(self.weather - there)
+            if time // layout.DAY_NS > self.retired
+        ]
         found += self._known(root, rows)
         return found
 
@@ -254,8 +265,11 @@ class ServiceHistory(Lives[Sent]):
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
         ]
-        return [f"{one.vehicle} {one.seq} is lost" for one in owed
-                if not self._given_up(one) and not all(rows[time] for time in one.rows)]  # fmt: skip
+        return [
+            f"{one.vehicle} {one.seq} is lost"
+            for one in owed
+            if not self._given_up(one) and not all(rows[time] for time in one.rows)
+        ]
 
     def _may_come(self, one: Sent) -> bool:
         return self._now - one.time < CONFIG.oldest_s * SECOND - layout.DAY_NS

@@ -36,7 +36,8 @@ class Files(NamedTuple):
 
 def spool_history(number: int) -> list[str]:
     """Violations of one history."""
-    random_, folder = random.Random(number), Path(tempfile.mkdtemp(prefix="spool-"))
+    random_ = random.Random(number)
+    folder = Path(tempfile.mkdtemp(prefix="spool-"))
     try:
         return _history(random_, folder)
     finally:
@@ -44,12 +45,16 @@ def spool_history(number: int) -> list[str]:
 
 
 def _history(random_: random.Random, folder: Path) -> list[str]:
-    path, boot = folder / "spool.sqlite", 5
+    path = folder / "spool.sqlite"
+    boot = 5
     outbox = Outbox(path, boot=boot, capacity_bytes=CAPACITY)
-    stream, held, found = Stream("car-a", boot, Kind.OBSERVATION, 1), {0: b""}, []
+    stream = Stream("car-a", boot, Kind.OBSERVATION, 1)
+    held = {0: b""}
+    found = []
     held.clear()
     for _ in range(COMMITS):
-        before, sure = Files.of(path), set(held)
+        before = Files.of(path)
+        sure = set(held)
         settled = {seq for seq in held if random_.random() < 0.3}
         outbox.settle(stream, [(seq, seq) for seq in settled])
         payload = random_.randbytes(random_.choice((50, 3000, 400_000)))

@@ -100,13 +100,18 @@ def _refused(*names: str) -> Iterator[None]:
 
 def run(site: Site) -> list[Figure]:
     """Full several times, at other moments of the jobs."""
-    false, stuck, refused, room, runs = 0, 0, 0, 0, Counter[str]()
+    false = 0
+    stuck = 0
+    refused = 0
+    room = 0
+    runs = Counter[str]()
     with small_disk(site.folder / "disk") as mounted:
         root = site.folder / "disk" / "archive"
         with closing(Engine(CONFIG, root)) as engine:
             jobs = archive_jobs(engine, CONFIG, root, SteadyClock().moment)
             with BackgroundJobs(jobs, engine.counts, lambda _: None):
-                acknowledged, seq = 0, 0
+                acknowledged = 0
+                seq = 0
                 for _ in range(site.of(10, 3)):
                     acknowledged += _drive(engine, seq, 3)
                     seq += 3
@@ -167,7 +172,8 @@ def _acked(acks: list[tuple[str, bytes]]) -> int:
 
 
 def _until_settled(engine: Engine) -> int:
-    got, deadline = 0, time.monotonic() + STUCK_S
+    got = 0
+    deadline = time.monotonic() + STUCK_S
     while engine.settlement.unsettled and time.monotonic() < deadline:
         got += _acked(engine.settlement.flush())
         threading.Event().wait(0.05)
@@ -176,7 +182,8 @@ def _until_settled(engine: Engine) -> int:
 
 def _until_done(engine: Engine) -> int:
     """Wait until each job has gone well once, with room again; returns what was acknowledged meanwhile."""
-    got, deadline = 0, time.monotonic() + STUCK_S
+    got = 0
+    deadline = time.monotonic() + STUCK_S
     while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:
         got += _acked(engine.settlement.flush())
         threading.Event().wait(0.05)
@@ -195,10 +202,8 @@ def _room_made(engine: Engine, folder: Path) -> int:
         disk_reserve.allocate(root)
         assert (root / disk_reserve.NAME).exists()
         jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
-        retention, before = (
-            next(job for job in jobs if job.name == "retention"),
-            len(old_days(root)),
-        )
+        retention = next(job for job in jobs if job.name == "retention")
+        before = len(old_days(root))
         with full(folder, mounted=True):
             retention.work(threading.Event())
             return before - len(old_days(root))

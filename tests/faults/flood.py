@@ -84,9 +84,11 @@ class Honest:
 
     def _put(self, one: Batch) -> None:
         self.session.put(
-            key(self.name), wire.encode(one), encoding=wire.ENCODING[Kind.OBSERVATION],
+            key(self.name),
+            wire.encode(one),
+            encoding=wire.ENCODING[Kind.OBSERVATION],
             congestion_control=zenoh.CongestionControl.BLOCK,
-        )  # fmt: skip
+        )
 
     def drive(self) -> None:
         """Send the next one."""
@@ -154,7 +156,8 @@ def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
     config = ServiceConfig(
         zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
     )
-    file, log = folder / "service.json", folder / "service.log"
+    file = folder / "service.json"
+    log = folder / "service.log"
     file.write_text(config.model_dump_json())
     command = [
         str(Path(sys.executable).with_name("fleet-service")),
@@ -171,7 +174,8 @@ def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
 
 
 def _drive(honest: Sequence[Honest], seconds: float) -> None:
-    end, pause = time.monotonic() + seconds, threading.Event()
+    end = time.monotonic() + seconds
+    pause = threading.Event()
     while time.monotonic() < end:
         for one in honest:
             one.drive()

@@ -25,23 +25,32 @@ ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the larg
 def main() -> None:
     """Send until the time is over."""
     told = json.loads(sys.stdin.readline())
-    name, cells = told["name"], told["cells"]
+    name = told["name"]
+    cells = told["cells"]
     messages = [
-        pb.ObservationBatch.FromString(wire.encode(batch(
-            name, 1, time.time_ns(), [told["mu"]] * rows, cell=[cell] * rows, latitude=[latitude] * rows,
-            longitude=[longitude] * rows,
-        )))
+        pb.ObservationBatch.FromString(
+            wire.encode(
+                batch(
+                    name,
+                    1,
+                    time.time_ns(),
+                    [told["mu"]] * rows,
+                    cell=[cell] * rows,
+                    latitude=[latitude] * rows,
+                    longitude=[longitude] * rows,
+                )
+            )
+        )
         for cell, latitude, longitude in cells
         for rows in ROWS
-    ]  # fmt: skip
+    ]
     session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), name))
-    place, encoding, block = (
-        key(name),
-        wire.ENCODING[Kind.OBSERVATION],
-        zenoh.CongestionControl.BLOCK,
-    )
+    place = key(name)
+    encoding = wire.ENCODING[Kind.OBSERVATION]
+    block = zenoh.CongestionControl.BLOCK
     print("ready", flush=True)
-    end, sent = time.monotonic() + told["seconds"], 0
+    end = time.monotonic() + told["seconds"]
+    sent = 0
     while time.monotonic() < end:
         message = messages[sent % len(messages)]
         sent += 1

@@ -91,7 +91,8 @@ def leave(run: Callable[[], int]) -> NoReturn:
 
 
 def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:
-    folder, began = out / campaign.name, time.monotonic()
+    folder = out / campaign.name
+    began = time.monotonic()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
 

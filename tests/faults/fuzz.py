@@ -34,16 +34,40 @@ HONEST: Final = ("honest-0", "honest-1", "honest-2")
 ASKED_EVERY: Final = 10  # a query for so many messages
 # What a row of the archive may hold, by its column: bounds that hold for any car on any road.
 POSSIBLE: Final = {
-    "latitude": (-85.06, 85.06), "longitude": (-180.0, 180.0), "mu": (0.0, 2.0), "mu_lower": (0.0, 2.0),
-    "mu_upper": (0.0, 2.0), "mu_utilised": (0.0, 2.0), "speed": (0.0, 100.0), "sector": (0, 3), "tyre_season": (0, 3),
-    "abs_active": (-1, 1), "esc_active": (-1, 1), "tcs_active": (-1, 1), "wiper": (0.0, 1.0),
-    "used_longitudinal": (-2.0, 2.0), "used_lateral": (-2.0, 2.0),
-    "air_temperature": (-90.0, 80.0), "position_std": (0.0, 100.0), "vx": (-100.0, 100.0),
-    "vy": (-100.0, 100.0), "yaw_rate": (-20.0, 20.0), "sideslip": (-4.0, 4.0), "yaw": (-1000.0, 1000.0),
-    "yaw_std": (0.0, 10.0), "health": (0, 2**31 - 1), "boot": (0, 2**63 - 1), "seq": (1, 2**63 - 1),
-    "row": (0, 49), "first_held": (1, 2**63 - 1), "weight": (0.0, 1.2), "bias": (-0.2, 0.2), "bias_std": (0.0, 0.1),
-    "spread": (0.0, 4.0), "slope": (0.0, 1.0),
-}  # fmt: skip
+    "latitude": (-85.06, 85.06),
+    "longitude": (-180.0, 180.0),
+    "mu": (0.0, 2.0),
+    "mu_lower": (0.0, 2.0),
+    "mu_upper": (0.0, 2.0),
+    "mu_utilised": (0.0, 2.0),
+    "speed": (0.0, 100.0),
+    "sector": (0, 3),
+    "tyre_season": (0, 3),
+    "abs_active": (-1, 1),
+    "esc_active": (-1, 1),
+    "tcs_active": (-1, 1),
+    "wiper": (0.0, 1.0),
+    "used_longitudinal": (-2.0, 2.0),
+    "used_lateral": (-2.0, 2.0),
+    "air_temperature": (-90.0, 80.0),
+    "position_std": (0.0, 100.0),
+    "vx": (-100.0, 100.0),
+    "vy": (-100.0, 100.0),
+    "yaw_rate": (-20.0, 20.0),
+    "sideslip": (-4.0, 4.0),
+    "yaw": (-1000.0, 1000.0),
+    "yaw_std": (0.0, 10.0),
+    "health": (0, 2**31 - 1),
+    "boot": (0, 2**63 - 1),
+    "seq": (1, 2**63 - 1),
+    "row": (0, 49),
+    "first_held": (1, 2**63 - 1),
+    "weight": (0.0, 1.2),
+    "bias": (-0.2, 0.2),
+    "bias_std": (0.0, 0.1),
+    "spread": (0.0, 4.0),
+    "slope": (0.0, 1.0),
+}
 METRES_PER_DEGREE: Final = 111_195.0
 DAY: Final = 86_400 * SECOND
 TWO_CELLS_M: Final = 45.0
@@ -53,12 +77,17 @@ NEEDED: Final = {"latitude", "longitude"}
 def run(site: Site) -> list[Figure]:
     """A million of them, or some thousands."""
     count = site.of(1_000_000, 10_000)
-    began, crashes, answers = time.time_ns(), 0, 0
+    began = time.time_ns()
+    crashes = 0
+    answers = 0
     mutants = Mutants(site.seed, began)
     engine = Engine(ServiceConfig(), site.folder / "archive")
-    honest, pasts = 0, site.of(50, 3)  # that are rebuilt: each takes a process and a second
+    # that are rebuilt: each takes a process and a second
+    honest = 0
+    pasts = site.of(50, 3)
     for turn in range(count // TURN):
-        messages, queries = [], []
+        messages = []
+        queries = []
         now = mutants.now = began + turn * SECOND
         for place in range(TURN):
             if place % ASKED_EVERY:
@@ -70,7 +99,9 @@ def run(site: Site) -> list[Figure]:
         crashes += _turn(site, engine, messages, now)
         for asked in queries:
             failed, answered, past = _ask(site, engine, asked, now, pasts > 0)
-            crashes, answers, pasts = crashes + failed, answers + answered, pasts - past
+            crashes = crashes + failed
+            answers = answers + answered
+            pasts = pasts - past
         if not turn % 200:
             site.say(
                 f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted"
@@ -137,7 +168,9 @@ def _ask(
 
 def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
     """Damaged tiles as a client reads them: how many, and how many crashes."""
-    r, crashes, count = np.random.default_rng(site.seed), 0, site.of(50_000, 1_000)
+    r = np.random.default_rng(site.seed)
+    crashes = 0
+    count = site.of(50_000, 1_000)
     (_, good), *_ = engine.queries.answer(
         query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now
     )
@@ -177,7 +210,8 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
         for name in columns.keys() & {"enter_time", "leave_time", "time"}:
             times = columns[name].cast(pa.timestamp("ns", tz="UTC")).cast(pa.int64()).to_numpy()
             bad |= (times < began - 31 * DAY) | (times > now + 30 * SECOND)
-        cell, latitude = columns["cell"].to_numpy(), columns["latitude"].to_numpy()
+        cell = columns["cell"].to_numpy()
+        latitude = columns["latitude"].to_numpy()
         middle, across = grid.centre(cell)
         north = (middle - latitude) * METRES_PER_DEGREE
         east = (
@@ -188,7 +222,8 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
         bad |= (grid.region_of(cell) != columns["region"].to_numpy()) | (
             np.hypot(north, east) > TWO_CELLS_M
         )
-        rows, impossible = rows + table.num_rows, impossible + int(bad.sum())
+        rows = rows + table.num_rows
+        impossible = impossible + int(bad.sum())
         found += sum(vehicle in honest for vehicle in columns["vehicle"].to_pylist())
     return rows, impossible, found
 

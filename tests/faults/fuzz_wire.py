@@ -45,7 +45,9 @@ ASKED: Final = (
 
 def run(site: Site) -> list[Figure]:
     """Two hundred thousand of them, or four thousand in a quick run."""
-    r, sent, answers = random.Random(site.seed), 0, 0
+    r = random.Random(site.seed)
+    sent = 0
+    answers = 0
     with stage(site.folder, metrics_port=0) as there:
         there.load(HONEST, RATE, flush_s=0.5).start()
         there.loads[0].line_with("ready: ")
@@ -88,7 +90,8 @@ def run(site: Site) -> list[Figure]:
 
 def _message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
     """Key, payload and encoding of the next."""
-    message, what = mutants.message(), r.random()
+    message = mutants.message()
+    what = r.random()
     if what < 0.02:
         return (
             keys.weather_key(REGION),

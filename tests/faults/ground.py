@@ -56,7 +56,9 @@ class Ground:
     """Environment of an attack; the rogue is enrolled as a vehicle and connected to the second router."""
 
     def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
-        self.network, self.service, self._stack = network, service, stack
+        self.network = network
+        self.service = service
+        self._stack = stack
         self.folder = network.folder
         self.monitor = Listener(self.open(SERVICE), ("gripmap/**",))
         self.reader = Listener(
@@ -133,10 +135,8 @@ def ground(network: Network) -> Iterator[Ground]:
         segment_s=0.05,
     )
     lines: list[str] = []
-    service, stop = (
-        Service(config, Path(network.folder, "archive"), lines.append),
-        threading.Event(),
-    )
+    service = Service(config, Path(network.folder, "archive"), lines.append)
+    stop = threading.Event()
     thread = threading.Thread(target=service.run, args=(stop,))
     thread.start()
     try:

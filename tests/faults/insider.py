@@ -46,14 +46,15 @@ def _growth(grown: float, seconds: int, *, quick: bool) -> Figure:
 
 def run(site: Site) -> list[Figure]:
     """An hour, or four minutes in a quick run."""
-    seconds, counts = site.of(3600, 240), Counter[str]()
-    random_, start, longest, sent = (
-        np.random.default_rng(site.seed),
-        time.time_ns() - 4000 * NS,
-        0.0,
-        0,
-    )
-    at, replayed, said = 0.0, 0, deque[Message](maxlen=100)
+    seconds = site.of(3600, 240)
+    counts = Counter[str]()
+    random_ = np.random.default_rng(site.seed)
+    start = time.time_ns() - 4000 * NS
+    longest = 0.0
+    sent = 0
+    at = 0.0
+    replayed = 0
+    said = deque[Message](maxlen=100)
     config = ServiceConfig()
     limits = RateLimiter(
         config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at
@@ -63,7 +64,8 @@ def run(site: Site) -> list[Figure]:
         for first in range(6):  # what is compiled at first use is no harm that it does
             engine.intake.ingest([_attack(first, 0, start - NS, random_)], start - NS)
         for second in range(seconds):
-            at, now = float(second), start + second * NS
+            at = float(second)
+            now = start + second * NS
             honest = [_message(_visit(name, second + 1, now, second)) for name in HONEST]
             attack: list[Message] = []
             while True:
@@ -77,7 +79,8 @@ def run(site: Site) -> list[Figure]:
                     break
                 attack.append(one)
                 said.append(one)
-                sent, replayed = sent + 1, replayed + again
+                sent = sent + 1
+                replayed = replayed + again
             began = time.perf_counter()
             engine.intake.ingest(attack + honest, now)
             engine.settlement.flush()
@@ -103,7 +106,8 @@ def run(site: Site) -> list[Figure]:
 
 def _attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
     """The next of what it may do, in turn."""
-    seq, what = number + 1, number % 6
+    seq = number + 1
+    what = number % 6
     if what == 0:  # places all over the region
         return _message(_scattered(seq, now, random_, 0.05))
     if what == 1:  # ... and over the world
@@ -149,7 +153,8 @@ def _visit(name: str, seq: int, now: int, second: int) -> Batch:
 def _scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
     """Visits of fifty cells anywhere near a place; a batch has the region of its first."""
     spread = random_.uniform(-degrees, degrees, (2, 50))
-    latitude, longitude = np.clip(LATITUDE + spread[0], -80.0, 80.0), LONGITUDE + spread[1]
+    latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)
+    longitude = LONGITUDE + spread[1]
     cell = grid.cell_of(latitude, longitude)
     region = grid.region_of(cell)
     mine = region == region[0]
@@ -168,10 +173,16 @@ def _message(one: Batch) -> Message:
 def _text(one: Batch) -> Message:
     """A batch as a person would write it."""
     text = {
-        "vehicle": one.vehicle, "boot": str(one.boot), "seq": str(one.seq), "region": str(one.region),
+        "vehicle": one.vehicle,
+        "boot": str(one.boot),
+        "seq": str(one.seq),
+        "region": str(one.region),
         "enter_time": [str(t) for t in one.columns["enter_time"].tolist()],
-        **{name: one.columns[name].tolist() for name in ("latitude", "longitude", "yaw", "mu", "mu_utilised")},
-    }  # fmt: skip
+        **{
+            name: one.columns[name].tolist()
+            for name in ("latitude", "longitude", "yaw", "mu", "mu_utilised")
+        },
+    }
     place = keys.observation_key(one.region, one.vehicle)
     return Message(one.kind, place, json.dumps(text).encode(), "application/json")
 

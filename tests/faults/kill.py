@@ -69,7 +69,12 @@ class Load(NamedTuple):
 def run(site: Site) -> list[Figure]:
     """200 kills in ten rounds; in a quick run, five in one with six agents, and bars that it can reach."""
     random_ = random.Random(site.seed)
-    kills, offered, seconds, whole_s, difference, found = 0, 0, 0.0, 0.0, 0.0, []
+    kills = 0
+    offered = 0
+    seconds = 0.0
+    whole_s = 0.0
+    difference = 0.0
+    found = []
     upkeep: frozenset[str] = frozenset()
     for number in range(site.of(10, 1)):
         began = time.monotonic()
@@ -79,7 +84,8 @@ def run(site: Site) -> list[Figure]:
         upkeep = upkeep.union(_done(there.archive), {"retention"} if load.retired else ())
         difference = max(difference, map_difference(there.archive))
         kills += sum(part.starts - 1 for part in there.parts)
-        offered, seconds = offered + load.observations, seconds + load.seconds
+        offered = offered + load.observations
+        seconds = seconds + load.seconds
         whole_s += time.monotonic() - began
         found.append(census)
         site.say(f"round {number}: {kills} killed so far, {census}")
@@ -156,7 +162,9 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
         part.line_with("ready: ")
     words = ["retention", "--archive", str(there.archive), "--raw-days", str(LEAST_DAYS), "--yes"]
     retention = Part("retention", [sys.executable, "-m", "fleet_service.cli", *words], there.folder)
-    killed, began, old = 0, time.time(), len(old_days(there.archive))
+    killed = 0
+    began = time.time()
+    old = len(old_days(there.archive))
     assert old
     while killed < kills:
         if killed % RETIRED_EVERY == 1 and not retention.alive:
@@ -172,7 +180,8 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
         for part in victims:
             part.start()
     there.service.line_with("ready: ")
-    end, retired = time.time(), len(old_days(there.archive)) < old
+    end = time.time()
+    retired = len(old_days(there.archive)) < old
     there.drain(DRAIN_S)
     there.service.stop()
     retention.kill()

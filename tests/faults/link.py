@@ -49,7 +49,8 @@ class Namespaces:
     """Network namespaces of one run, the routers in `road`, and the links of cars to it."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self.folder, self._stack = folder, stack
+        self.folder = folder
+        self._stack = stack
         self._tag = f"gm{os.getpid()}"
         self.certificates = folder / "certificates"
         routers = {
@@ -73,7 +74,8 @@ class Namespaces:
         self, name: str, terms: LinkTerms, net: str = "10.77.0"
     ) -> tuple[str, subprocess.Popen[str]]:
         """Return a new namespace of cars, linked to the road, and the process of the link."""
-        car, device = self._add(name), f"{DEVICE}{net[3:5]}"
+        car = self._add(name)
+        device = f"{DEVICE}{net[3:5]}"
         given = {"left": car, "right": self.road, "device": device, "terms": asdict(terms)}
         link = self.start("", "tests.faults.link_relay", given)
         read_line(link)
@@ -223,7 +225,8 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
     with namespaces(site.folder / f"lossy-{protocol}") as there:
         there.router()
         car, _ = there.connect("car", LOSSY)
-        alert, tile = keys.alert_key(TILE), keys.map_key(TILE)
+        alert = keys.alert_key(TILE)
+        tile = keys.map_key(TILE)
         reader = there.end("receive", car, READER, (protocol,), keys=[alert, tile])
         used = json.loads(read_line(reader))["protocols"]
         assert used == [protocol], used
@@ -320,7 +323,9 @@ def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
 
 def measure(site: Site) -> list[Figure]:
     """Run all parts of the campaign."""
-    address_s, lossy_s, flood_s = site.of(15, 6), site.of(60, 12), site.of(20, 5)
+    address_s = site.of(15, 6)
+    lossy_s = site.of(60, 12)
+    flood_s = site.of(20, 5)
     put, lost, gap = change_address(site, "quic", address_s)
     _, tls_lost, tls_gap = change_address(site, "tls", address_s)
     site.say(

@@ -63,11 +63,14 @@ def send(given: dict[str, Any]) -> None:
     Each stream has a key, a size in bytes and a rate; its quality of service is that of its topic. A rate of 0 puts as
     fast as the session takes it.
     """
-    over, counts = threading.Event(), dict[str, int]()
+    over = threading.Event()
+    counts = dict[str, int]()
 
     def drive(session: zenoh.Session, stream: dict[str, Any]) -> None:
         quality = quality_of(keys.TOPICS[stream["key"].split("/")[2]])
-        filling, number, due = bytes(stream["size"] - HEAD.size), 0, time.monotonic()
+        filling = bytes(stream["size"] - HEAD.size)
+        number = 0
+        due = time.monotonic()
         while not over.is_set():
             session.put(stream["key"], HEAD.pack(number, time.monotonic()) + filling, **quality)
             number += 1

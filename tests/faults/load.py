@@ -98,7 +98,10 @@ def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: 
 def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
     """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and the longest lag [s]."""
     rng = np.random.default_rng(plan.seed)
-    per_block, owed, late, longest = plan.rate * BLOCK_S * len(plan.names), 0.0, 0, 0.0
+    per_block = plan.rate * BLOCK_S * len(plan.names)
+    owed = 0.0
+    late = 0
+    longest = 0.0
     due = time.monotonic()
     while not quiet.is_set():
         owed += per_block
@@ -123,7 +126,8 @@ def _set(*events: threading.Event) -> None:
 def main(path: str) -> int:
     """Run one generator."""
     plan = Plan(**json.loads(Path(path).read_text()))
-    quiet, leave = threading.Event(), threading.Event()
+    quiet = threading.Event()
+    leave = threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: _set(leave, quiet))

@@ -22,9 +22,25 @@ _MESSAGE: Final[dict[Kind, Any]] = {
     Kind.STATE: pb.StateBatch,
 }
 _NUMBERS: Final = (
-    float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1.0, 1e-320, 0.049, 1.21, 2.0001, 90.0, 180.0, 181.0, 400.0,
-    1e9, 1e38, 1e308, 3.15,
-)  # fmt: skip
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    0.0,
+    -0.0,
+    -1.0,
+    1e-320,
+    0.049,
+    1.21,
+    2.0001,
+    90.0,
+    180.0,
+    181.0,
+    400.0,
+    1e9,
+    1e38,
+    1e308,
+    3.15,
+)
 _WHOLE: Final = (
     0,
     -1,
@@ -43,20 +59,42 @@ _WHOLE: Final = (
     REGION + 1,
 )
 _TEXT: Final = (
-    "", "*", "**", "$*", "../../etc/passwd", "<script>alert(1)</script>", "sim-000\n", "\0", "é", "a" * 4000, "0123",
-    "rogue-1/../x", "'; drop table", "{name}", "@/**",
-)  # fmt: skip
+    "",
+    "*",
+    "**",
+    "$*",
+    "../../etc/passwd",
+    "<script>alert(1)</script>",
+    "sim-000\n",
+    "\0",
+    "é",
+    "a" * 4000,
+    "0123",
+    "rogue-1/../x",
+    "'; drop table",
+    "{name}",
+    "@/**",
+)
 _ENCODINGS: Final = (
-    "", wire.JSON, wire.ARROW, "application/protobuf", "zenoh/bytes", "text/html", wire.ACK_ENCODING,
-    *wire.ENCODING.values(), "x" * 300,
-)  # fmt: skip
+    "",
+    wire.JSON,
+    wire.ARROW,
+    "application/protobuf",
+    "zenoh/bytes",
+    "text/html",
+    wire.ACK_ENCODING,
+    *wire.ENCODING.values(),
+    "x" * 300,
+)
 
 
 class Mutants:
     """A source of malformed messages of the vehicles `rogue-NN`, as at the time `now` [ns], which may be set."""
 
     def __init__(self, seed: int, now: int) -> None:
-        self._random, self.now, self._seq = random.Random(seed), now, 0
+        self._random = random.Random(seed)
+        self.now = now
+        self._seq = 0
 
     def message(self) -> Message:
         """The next one."""
@@ -89,7 +127,9 @@ class Mutants:
         self._seq += 1
         message = _MESSAGE[kind]()
         message.CopyFrom(self._random.choice(_VALID[kind]))
-        message.vehicle, message.seq, message.boot = name, self._seq, self._random.choice((5, 6, 7))
+        message.vehicle = name
+        message.seq = self._seq
+        message.boot = self._random.choice((5, 6, 7))
         rows = len(message.latitude)
         if kind is Kind.OBSERVATION:
             message.leave_time[:] = [self.now] * rows
@@ -125,7 +165,8 @@ class Mutants:
 
 def _states() -> Any:  # noqa: ANN401
     state = pb.StateBatch.FromString(wire.encode(whole_batch(Kind.STATE)))
-    state.region, state.first_held = REGION, 1
+    state.region = REGION
+    state.first_held = 1
     state.latitude[:], state.longitude[:] = [57.7] * len(state.time), [11.97] * len(state.time)
     return state
 
@@ -151,9 +192,13 @@ _VALID: Final = {
     Kind.STATE: [_states()],
 }
 _QUERY: Final = {
-    "bbox": "11.9,57.6,12.0,57.8", "route": "11.96,57.7|11.98,57.7", "min_vehicles": "2", "format": "json",
-    "at": "2026-01-31T07:00:00Z", "basis": "borrowed",
-}  # fmt: skip
+    "bbox": "11.9,57.6,12.0,57.8",
+    "route": "11.96,57.7|11.98,57.7",
+    "min_vehicles": "2",
+    "format": "json",
+    "at": "2026-01-31T07:00:00Z",
+    "basis": "borrowed",
+}
 
 
 def changed_bytes(r: Random, data: bytes) -> bytes:
@@ -181,7 +226,8 @@ def changed_bytes(r: Random, data: bytes) -> bytes:
 
 def _change_field(r: Random, message: Any) -> None:  # noqa: ANN401
     field = r.choice(message.DESCRIPTOR.fields)
-    many, kinds = field.is_repeated, type(field)
+    many = field.is_repeated
+    kinds = type(field)
     pool: Callable[[], Any]
     if field.type == kinds.TYPE_STRING:
         setattr(message, field.name, r.choice(_TEXT))

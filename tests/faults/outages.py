@@ -33,7 +33,8 @@ def router_down(site: Site) -> list[Figure]:
         back = time.time()
         census = _at_rest(there)
         known = told(there.journals)
-        recovery, amid = known.longest_wait(back), known.stored_between(down, back)
+        recovery = known.longest_wait(back)
+        amid = known.stored_between(down, back)
     site.say(f"{census}")
     return [
         figure("faults.router_down.lost", census.lost),
@@ -45,7 +46,8 @@ def router_down(site: Site) -> list[Figure]:
 
 def frozen(site: Site) -> list[Figure]:
     """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose nothing."""
-    frozen_s, spans = site.of(20, 3), []
+    frozen_s = site.of(20, 3)
+    spans = []
     with stage(site.folder) as there:
         _agents(there, site.of(3, 1))
         for part in (there.router, there.service):
@@ -73,7 +75,9 @@ def frozen(site: Site) -> list[Figure]:
 
 def leaving(site: Site) -> list[Figure]:
     """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone soon, and lose nothing."""
-    longest, lost, acknowledged = 0.0, 0, 0
+    longest = 0.0
+    lost = 0
+    acknowledged = 0
     for freeze in (False, True):
         with stage(site.folder / str(freeze)) as there:
             _agents(there, 1)
@@ -87,7 +91,8 @@ def leaving(site: Site) -> list[Figure]:
                 longest = max(longest, time.monotonic() - began)
             there.router.send(signal.SIGCONT)
             census = take(there.journals, there.archive)
-            lost, acknowledged = lost + census.acknowledged_lost, acknowledged + census.settled
+            lost = lost + census.acknowledged_lost
+            acknowledged = acknowledged + census.settled
     site.say(f"gone after {longest:.1f} s at the most")
     return [
         figure("faults.leaving.longest_s", longest),
@@ -133,7 +138,8 @@ def _agents(there: Stage, processes: int) -> None:
 
 def _settles(there: Stage) -> bool:
     """Return True if everything stored by now gets settled in time."""
-    since, deadline = time.time(), time.monotonic() + DRAIN_S
+    since = time.time()
+    deadline = time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:
         if told(there.journals).longest_wait(since) < float("inf"):
             return True

@@ -30,7 +30,9 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
 Numbers = NDArray[np.floating[Any]]
 KINDS: Final = ("row", "batch", "boot", "region", "before", "between", "walk")
 FAR_M: Final = 6_000.0  # at the least, from the car's way; LEAP_M and 20 s at FASTEST are 3.4 km
-STEP_M, SPEED = 1_900.0, 65.0  # between two places, and of two cars whose path is plausible
+# between two places, and of two cars whose path is plausible
+STEP_M = 1_900.0
+SPEED = 65.0
 PLACES: Final = 210
 ICY_PLACES: Final = 20  # of three honest cars
 METRES_PER_DEGREE: Final = 111_195.0
@@ -68,9 +70,12 @@ def _visits(
     for region in np.unique(regions).tolist():
         mine = regions == region
         columns = {
-            "latitude": place[0][mine], "longitude": place[1][mine], "cell": cell[mine], "leave_time": when[mine],
+            "latitude": place[0][mine],
+            "longitude": place[1][mine],
+            "cell": cell[mine],
+            "leave_time": when[mine],
             "enter_time": when[mine] - SECOND,
-        }  # fmt: skip
+        }
         one = batch(name, seq, int(when[-1]), [mu] * int(mine.sum()))
         out.append(replace(one, region=int(region), columns=one.columns | columns))
     return out
@@ -87,17 +92,21 @@ def _messages(batches: Sequence[Batch]) -> list[Message]:
 
 def _teleport(site: Site, count: int) -> tuple[int, int]:
     """Return how many of the teleports were fused, and how many honest rows were not."""
-    rng, start = np.random.default_rng(site.seed), time.time_ns() - 7200 * SECOND
+    rng = np.random.default_rng(site.seed)
+    start = time.time_ns() - 7200 * SECOND
     fused = excluded = 0
     with closing(Engine(ServiceConfig(), site.folder / "teleports")) as engine:
         for number in range(count):
-            name, kind = f"car-{number:04}", KINDS[number % len(KINDS)]
+            name = f"car-{number:04}"
+            kind = KINDS[number % len(KINDS)]
             north = np.arange(30) * 15.0
             when = start + np.arange(30) * SECOND
             way = _visits(name, 1, when, _at(north, np.zeros(30)), 0.8)
-            wrong, before = _far_away(kind, name, start, rng), engine.counts["implausible_moves"]
+            wrong = _far_away(kind, name, start, rng)
+            before = engine.counts["implausible_moves"]
             if kind == "row":
-                one, (other,) = way[0], wrong
+                one = way[0]
+                (other,) = wrong
                 columns = {k: np.concatenate([v, other.columns[k]]) for k, v in one.columns.items()}
                 engine.intake.ingest(
                     _messages([replace(one, columns=columns)]), start + 100 * SECOND
@@ -109,10 +118,8 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
                 engine.intake.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
             else:
                 engine.intake.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
-            found, most = (
-                engine.counts["implausible_moves"] - before,
-                sum(len(b.columns["mu"]) for b in wrong),
-            )
+            found = engine.counts["implausible_moves"] - before
+            most = sum(len(b.columns["mu"]) for b in wrong)
             if found < most:
                 site.say(f"{kind}: {most - found} of {most} accepted")
             fused += max(most - found, 0)
@@ -148,7 +155,8 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
 
 def _two_cars(site: Site, way: str) -> int:
     """Return at how many places two cars raise an alert where nobody else drives."""
-    start, raised = time.time_ns() - 9000 * SECOND, set[int]()
+    start = time.time_ns() - 9000 * SECOND
+    raised = set[int]()
     apart = SECOND // 1000 if way == "leaps" else int(STEP_M / SPEED * SECOND)
     end = start + PLACES * apart
     with closing(Engine(ServiceConfig(), site.folder / way)) as engine:
@@ -171,7 +179,8 @@ def _two_cars(site: Site, way: str) -> int:
 
 def _honest(site: Site, cars: int) -> int:
     """Return at how many icy places of a lonely road this many honest cars raise an alert."""
-    start, raised = time.time_ns() - 3600 * SECOND, set[int]()
+    start = time.time_ns() - 3600 * SECOND
+    raised = set[int]()
     with closing(Engine(ServiceConfig(), site.folder / f"honest-{cars}")) as engine:
         for place in range(ICY_PLACES):
             for car in range(cars):

@@ -26,7 +26,9 @@ class Part:
     """One process under test, by its command; `start` it as often as you like."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
-        self.name, self.command, self.log = name, list(command), folder / f"{name}.log"
+        self.name = name
+        self.command = list(command)
+        self.log = folder / f"{name}.log"
         self.starts = 0
         self._since = 0
         self._process: subprocess.Popen[bytes] | None = None
@@ -106,7 +108,8 @@ class Stage:
     """A router and a service, and the load that is added to them."""
 
     def __init__(self, folder: Path, **service: object) -> None:
-        self.folder, self.archive = folder, folder / "archive"
+        self.folder = folder
+        self.archive = folder / "archive"
         folder.mkdir(parents=True, exist_ok=True)
         self.router = Part("router", self._router("tcp/127.0.0.1:0"), folder)
         self.router.start()

@@ -85,7 +85,8 @@ def _lane(name: str, number: int, now: int) -> list[Message]:
     out = []
     for seq in range(1, 6):
         at = np.arange(50) + 50 * (seq - 1)
-        latitude, longitude = np.full(50, PLACE[0] + 2e-4 * number), PLACE[1] + 2e-4 * at
+        latitude = np.full(50, PLACE[0] + 2e-4 * number)
+        longitude = PLACE[1] + 2e-4 * at
         cell = grid.cell_of(latitude, longitude)
         leave = now - (250 - at) * 10**9
         for region in np.unique(grid.region_of(cell)).tolist():
@@ -111,7 +112,9 @@ def _wait(session: zenoh.Session) -> None:
 
 def _light(session: zenoh.Session, seconds: float) -> list[float]:
     """Return the time of each query for one tile."""
-    waits, end, pause = [], time.monotonic() + seconds, threading.Event()
+    waits = []
+    end = time.monotonic() + seconds
+    pause = threading.Event()
     while time.monotonic() < end:
         began = time.perf_counter()
         assert any(reply.ok for reply in session.get(keys.map_key(_tile()), timeout=30.0))

@@ -18,7 +18,10 @@ from tests.faults.census import take
 from tests.faults.frame import Campaign, Site, conduct, leave
 from tests.faults.processes import Part, stage
 
-PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
+# 2 000 observations/s
+PROCESSES = 2
+VEHICLES = 20
+RATE = 50.0
 # few, so that every vehicle has soon been everywhere: a map that grows is no leak
 CELLS_ACROSS: Final = 12
 EVERY_S: Final = 5.0
@@ -79,7 +82,8 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
         there.service.stop()
         census = take(there.journals, there.archive)
     first = int(len(times) * SETTLED)
-    slopes, grown = {}, {}
+    slopes = {}
+    grown = {}
     for name, rows in seen.items():
         kept = np.array(rows[first:])
         slopes[name] = slope(np.array(times[first:]), kept[:, 0])

@@ -39,7 +39,8 @@ def run(site: Site) -> list[Figure]:
     """Cut at every byte, changed at every fifth; in a quick run, some hundred."""
     logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
     batches, newest = _archive(site.folder)
-    whole, rng = newest.read_bytes(), np.random.default_rng(site.seed)
+    whole = newest.read_bytes()
+    rng = np.random.default_rng(site.seed)
     lost = tried = 0
     for damaged in _damages(whole, rng, site.of(1, 97)):
         newest.write_bytes(damaged)
@@ -102,12 +103,11 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
     streams = SequenceTrackers()
     restore_streams(root, streams)
-    pseudonyms, first, at = (
-        Pseudonyms(root / "keys"),
-        batches[0],
-        int(batches[0].columns["enter_time"][0]),
-    )
-    vehicle, boot = number(pseudonyms.of("sim-001", at)), pseudonyms.boot("sim-001", first.boot, at)
+    pseudonyms = Pseudonyms(root / "keys")
+    first = batches[0]
+    at = int(batches[0].columns["enter_time"][0])
+    vehicle = number(pseudonyms.of("sim-001", at))
+    boot = pseudonyms.boot("sim-001", first.boot, at)
     assert (vehicle, boot, Kind.OBSERVATION, first.region) in streams
     stream = streams[vehicle, boot, Kind.OBSERVATION, first.region]
     owed = [

@@ -30,7 +30,8 @@ from tests.fleet_service.archive.test_version import rewritten, with_columns
 
 def run(site: Site) -> list[Figure]:
     """Both, before and after a compaction, with and without a checkpoint."""
-    old, new = site.folder / "old", site.folder / "new"
+    old = site.folder / "old"
+    new = site.folder / "new"
     shutil.copytree(DATA / "v1.0" / "archive", old)
     made_old = json.loads((DATA / "v1.0" / "map.json").read_text())
     made_new = make(new)

@@ -82,7 +82,8 @@ class Receiver:
 
     def __init__(self, kind: str) -> None:
         self.heard: set[str] = set()
-        self._break, self._left = BREAKS[kind], 10**9 if kind in FOREVER else BROKEN
+        self._break = BREAKS[kind]
+        self._left = 10**9 if kind in FOREVER else BROKEN
         self._server = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._server.getsockname()[1]}/hook"
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -128,15 +129,31 @@ def _request(client: socket.socket) -> tuple[bytes, bytes]:
 def stretch(number: int) -> StretchAlert:
     """Return an alert with a number as its id."""
     return StretchAlert(
-        id=f"id-{number}", state="raised", since=0, time=0, length_m=12.0, direction="north-south", headings=("north",),
-        latitude=57.7, longitude=11.97, bbox=(11.9, 57.6, 12.0, 57.8), cells=1, mu=0.2, mu_lower=0.1, mu_upper=0.3,
-        p_slippery=0.95, vehicles=3, reason="P(mu < 0.4) = 0.95 > 0.9", points=((57.7, 11.97),),
-    )  # fmt: skip
+        id=f"id-{number}",
+        state="raised",
+        since=0,
+        time=0,
+        length_m=12.0,
+        direction="north-south",
+        headings=("north",),
+        latitude=57.7,
+        longitude=11.97,
+        bbox=(11.9, 57.6, 12.0, 57.8),
+        cells=1,
+        mu=0.2,
+        mu_lower=0.1,
+        mu_upper=0.3,
+        p_slippery=0.95,
+        vehicles=3,
+        reason="P(mu < 0.4) = 0.95 > 0.9",
+        points=((57.7, 11.97),),
+    )
 
 
 def run_kind(folder: Path, kind: str) -> tuple[int, int]:
     """Send alerts to one kind of receiver; return how many arrived, and how many were lost without a word."""
-    receiver, said = Receiver(kind), list[str]()
+    receiver = Receiver(kind)
+    said = list[str]()
     queue = AlertQueue(folder / f"{kind}.sqlite", FEW if kind == "overflow" else 1000)
     hook = Webhook(receiver.url, said.append, queue, TIMEOUT_S)
     for number in range(ALERTS):

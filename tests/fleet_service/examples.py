@@ -16,7 +16,8 @@ from schemas import grid, keys, mugrid, wire
 from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
 
-LATITUDE, LONGITUDE = 57.7, 11.97
+LATITUDE = 57.7
+LONGITUDE = 11.97
 CELL = int(grid.cell_of(LATITUDE, LONGITUDE))
 REGION = int(grid.region_of(CELL))
 TILE = int(grid.tile_of(CELL))
@@ -49,13 +50,21 @@ def observations(
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
     vehicle = np.asarray(vehicles, np.int64)
     return Observations(
-        time=time, cell=whole + np.asarray(cell, np.int64),
-        sector=np.zeros(n, np.int8), second=np.full(n, second, np.int8),
-        vehicle=vehicle, boot=vehicle * 7 + 1, region=whole + REGION, sequence=np.arange(n),
-        evidence=mugrid.encode_log_likelihood(log_likelihood), reported=np.full((n, 3), np.nan, np.float32),
-        used=np.full(n, 0.9, np.float32), manoeuvre=np.full(n, -1, np.int8),
-        other=np.full((n, 4), -1), other_share=np.zeros((n, 4), np.float32),
-    )  # fmt: skip
+        time=time,
+        cell=whole + np.asarray(cell, np.int64),
+        sector=np.zeros(n, np.int8),
+        second=np.full(n, second, np.int8),
+        vehicle=vehicle,
+        boot=vehicle * 7 + 1,
+        region=whole + REGION,
+        sequence=np.arange(n),
+        evidence=mugrid.encode_log_likelihood(log_likelihood),
+        reported=np.full((n, 3), np.nan, np.float32),
+        used=np.full(n, 0.9, np.float32),
+        manoeuvre=np.full(n, -1, np.int8),
+        other=np.full((n, 4), -1),
+        other_share=np.zeros((n, 4), np.float32),
+    )
 
 
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
@@ -105,12 +114,20 @@ def batch(
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
     columns: dict[str, NDArray[Any]] = {
-        "enter_time": leave - SECOND, "leave_time": leave, "latitude": np.full(n, LATITUDE),
-        "longitude": np.full(n, LONGITUDE), "cell": np.full(n, CELL), "sector": np.zeros(n, np.int8),
-        "yaw": np.zeros(n, np.float32), "position_std": np.ones(n, np.float32), "speed": np.full(n, 15.0, np.float32),
-        "mu": np.array(mu, np.float32), "mu_lower": np.array(mu, np.float32) - 0.1,
-        "mu_upper": np.array(mu, np.float32) + 0.1, "mu_utilised": np.array(mu) if used is None else np.full(n, used),
-    }  # fmt: skip
+        "enter_time": leave - SECOND,
+        "leave_time": leave,
+        "latitude": np.full(n, LATITUDE),
+        "longitude": np.full(n, LONGITUDE),
+        "cell": np.full(n, CELL),
+        "sector": np.zeros(n, np.int8),
+        "yaw": np.zeros(n, np.float32),
+        "position_std": np.ones(n, np.float32),
+        "speed": np.full(n, 15.0, np.float32),
+        "mu": np.array(mu, np.float32),
+        "mu_lower": np.array(mu, np.float32) - 0.1,
+        "mu_upper": np.array(mu, np.float32) + 0.1,
+        "mu_utilised": np.array(mu) if used is None else np.full(n, used),
+    }
     if told:
         columns["log_likelihood"] = mugrid.encode_log_likelihood(value(mu))
     columns.update({name: np.asarray(column) for name, column in changed.items()})
@@ -130,6 +147,8 @@ def key(vehicle: str) -> str:
 def send(session: zenoh.Session, sent: Batch, place: str | None = None) -> None:
     """Put a batch on its vehicle's key, or another. By default Zenoh drops what waits a millisecond for a busy link."""
     session.put(
-        place or key(sent.vehicle), wire.encode(sent), encoding=wire.ENCODING[sent.kind],
+        place or key(sent.vehicle),
+        wire.encode(sent),
+        encoding=wire.ENCODING[sent.kind],
         congestion_control=zenoh.CongestionControl.BLOCK,
-    )  # fmt: skip
+    )

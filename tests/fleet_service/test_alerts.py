@@ -33,7 +33,9 @@ from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
 from tests.waiting import until
 
-X, Y = 1_118_000, 630_000  # of cells near Gothenburg
+# of cells near Gothenburg
+X = 1_118_000
+Y = 630_000
 
 
 def alert(
@@ -42,9 +44,19 @@ def alert(
     cell = int(grid.interleave(np.array([X + x]), np.array([Y + y]))[0])
     latitude, longitude = grid.centre(cell)
     return Alert(
-        cell, sector, raised, (1_800_000_000 + at) * SECOND, mu, mu - 0.1, mu + 0.1, 0.95, 2, float(latitude),
-        float(longitude), "P(mu < 0.4) = 0.95 > 0.9" if raised else "later visits found grip",
-    )  # fmt: skip
+        cell,
+        sector,
+        raised,
+        (1_800_000_000 + at) * SECOND,
+        mu,
+        mu - 0.1,
+        mu + 0.1,
+        0.95,
+        2,
+        float(latitude),
+        float(longitude),
+        "P(mu < 0.4) = 0.95 > 0.9" if raised else "later visits found grip",
+    )
 
 
 def told(stretches: Stretches, *alerts: Alert) -> list[Any]:
@@ -129,7 +141,8 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
 
 
 def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Path) -> None:
-    road, said = Stretches(), list[str]()
+    road = Stretches()
+    said = list[str]()
     with receiver(refuse=1) as (url, heard):
         hook = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
         for one in (*told(road, alert(0)), *told(road, alert(0, raised=False, at=5))):

@@ -67,32 +67,63 @@ USUAL: Final = {
 BOX: Final = "11,57,13,59"  # around one of two towns
 # command -> option -> another value; or the words with which, and those without which, it is to be seen
 CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
-    "compact": {"--archive": "{b}", "--put-to": "file://{out}/there", "--round-rows": "10", "--json": ""},
+    "compact": {
+        "--archive": "{b}",
+        "--put-to": "file://{out}/there",
+        "--round-rows": "10",
+        "--json": "",
+    },
     "retention": {"--archive": "{b}", "--raw-days": "100000", "--dry-run": "", "--json": ""},
-    "forget": {"--archive": "{b}", "--period": "2024-09", "--vehicle": "sim-003", "--dry-run": "", "--json": ""},
+    "forget": {
+        "--archive": "{b}",
+        "--period": "2024-09",
+        "--vehicle": "sim-003",
+        "--dry-run": "",
+        "--json": "",
+    },
     "export": {
-        "what": (["export", "rollup", *USUAL["export"][2:]], USUAL["export"]), "--archive": "{b}",
-        "--out": "{out}/a.geojson", "--from": "2024-10-05", "--to": "2024-10-04", "--bbox": BOX, "--json": "",
-        "--snapshot": ([*MAP, "--snapshot"], MAP), "--min-vehicles": ([*MAP, "--min-vehicles", "3"], MAP),
+        "what": (["export", "rollup", *USUAL["export"][2:]], USUAL["export"]),
+        "--archive": "{b}",
+        "--out": "{out}/a.geojson",
+        "--from": "2024-10-05",
+        "--to": "2024-10-04",
+        "--bbox": BOX,
+        "--json": "",
+        "--snapshot": ([*MAP, "--snapshot"], MAP),
+        "--min-vehicles": ([*MAP, "--min-vehicles", "3"], MAP),
     },
     "analyze": {
-        "question": (["analyze", "grip", *ANALYZE[2:]], ANALYZE), "--archive": "{b}", "--out": "{out}/a.html",
-        "--from": "2024-10-04T23:58", "--to": "2024-10-04T23:57", "--bbox": BOX, "--min-vehicles": "5",
-        "--engine": "spark", "--at": ([*REPLAY, "--at", "2024-10-04T23:57"], REPLAY),
+        "question": (["analyze", "grip", *ANALYZE[2:]], ANALYZE),
+        "--archive": "{b}",
+        "--out": "{out}/a.html",
+        "--from": "2024-10-04T23:58",
+        "--to": "2024-10-04T23:57",
+        "--bbox": BOX,
+        "--min-vehicles": "5",
+        "--engine": "spark",
+        "--at": ([*REPLAY, "--at", "2024-10-04T23:57"], REPLAY),
         "--step": ([*REPLAY, "--step", "60"], REPLAY),
-        "--json": "", "--as-it-lies": "",
+        "--json": "",
+        "--as-it-lies": "",
         "--stations": ([*WEATHER, "--stations", "{warm}"], [*WEATHER, "--stations", "{cold}"]),
     },
     "rebuild": {
-        "--archive": "{b}", "--out": "{out}/other", "--to": "2024-10-04T23:57", "--engine": "spark", "--as-it-lies": "",
+        "--archive": "{b}",
+        "--out": "{out}/other",
+        "--to": "2024-10-04T23:57",
+        "--engine": "spark",
+        "--as-it-lies": "",
         "--json": "",
     },
     "certs": {
-        "--fleet": "{fleet2}", "--out": "{out}/others", "--at": "/etc/gripmap/certs",
-        "--days": "100", "--ca-days": "1000",
+        "--fleet": "{fleet2}",
+        "--out": "{out}/others",
+        "--at": "/etc/gripmap/certs",
+        "--days": "100",
+        "--ca-days": "1000",
         "--ca": ([*CERTS, "--ca", "next"], CERTS),
     },
-}  # fmt: skip
+}
 SHOWN_BELOW: Final = {
     "retention": {"--yes"},
     "forget": {
@@ -166,14 +197,21 @@ SHOWN_BELOW: Final = {
 }
 # command -> the modules in which these options are given, beside this one
 GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
-    "retention": ("../test_commands",), "forget": ("../test_commands", "archive/test_retention", "app/test_copy"),
-    "completion": ("../test_commands",), "certs": ("enrolment/test_certificates",), "run": (),
+    "retention": ("../test_commands",),
+    "forget": ("../test_commands", "archive/test_retention", "app/test_copy"),
+    "completion": ("../test_commands",),
+    "certs": ("enrolment/test_certificates",),
+    "run": (),
     "export": ("client/test_datex", "archive/test_iceberg", "test_refused_files"),
     "roads": ("analytics/roads/test_join",),
     "analyze": ("analytics/roads/test_contract", "test_refused_files"),
-    "router": ("test_refused_files",), "query": (), "watch": ("test_alerts",),
-    "page": ("page/test_server",), "cits": ("client/cits/test_command",), "hand-over": ("shards/test_moving",),
-}  # fmt: skip
+    "router": ("test_refused_files",),
+    "query": (),
+    "watch": ("test_alerts",),
+    "page": ("page/test_server",),
+    "cits": ("client/cits/test_command",),
+    "hand-over": ("shards/test_moving",),
+}
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
 
@@ -301,7 +339,8 @@ def test_the_end_to_end_part_of_a_campaign_is_left_out_or_run_alone(
 def test_every_option_of_a_command_changes_what_it_does(
     command: str, option: str, tmp_path: Path, capsys: Capture
 ) -> None:
-    change, usual = CHANGES[command][option], USUAL[command]
+    change = CHANGES[command][option]
+    usual = USUAL[command]
     if isinstance(change, tuple):
         other, usual = change
     elif option in usual:
@@ -342,7 +381,8 @@ def test_service_weather_archive_and_configuration_are_those_given(
     rain = pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]})
     pq.write_table(rain, tmp_path / "rain.parquet")
     for name, more in (("shard-1", []), ("shard-2", ["--weather", str(tmp_path / "rain.parquet")])):
-        config, archive = tmp_path / f"{name}.json", tmp_path / name
+        config = tmp_path / f"{name}.json"
+        archive = tmp_path / name
         config.write_text(json.dumps({"name": name, "zenoh": router.model_dump()}))
         words = ["run", "--config", str(config), "--archive", str(archive), *more]
         part = Part(name, [sys.executable, "-m", "fleet_service.cli", *words], tmp_path)
@@ -379,10 +419,12 @@ def fed(service: Running, session: zenoh.Session) -> Fleet:
 def test_every_option_of_a_query_changes_the_answer(
     router: ZenohSettings, tmp_path: Path, capsys: Capture
 ) -> None:
-    out, config = tmp_path / "a", tmp_path / "config.json"
+    out = tmp_path / "a"
+    config = tmp_path / "config.json"
     config.write_text(json.dumps({"zenoh": router.model_dump()}))
     usual = {"--connect": router.connect[0], "--format": "json", "--out": str(out)}
-    here, far = CELL, int(grid.cell_of(*FAR))
+    here = CELL
+    far = int(grid.cell_of(*FAR))
 
     def cells(**changed: str | None) -> set[int]:
         given = usual | {f"--{name.replace('_', '-')}": value for name, value in changed.items()}

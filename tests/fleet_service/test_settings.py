@@ -94,7 +94,8 @@ def queued(made: Service) -> int:
 
 def turns(made: Service) -> tuple[int, int]:
     """Count segments and rounds of tiles in ten turns of .3 s each."""
-    clock, calls = [time.monotonic()], {"begin_flush": 0, "take_dirty": 0}
+    clock = [time.monotonic()]
+    calls = {"begin_flush": 0, "take_dirty": 0}
 
     def counted(name: str) -> Callable[..., list[Any]]:
         def call(*_: object) -> list[Any]:
@@ -176,8 +177,12 @@ def test_every_setting_of_the_service_changes_what_it_does(name: str, tmp_path: 
             pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]}),
             tmp_path / "rain",
         )
-        value = value.format(**{file: tmp_path / "2" / file if file == "there" else tmp_path / file
-                                for file in ("fleet", "rain", "there")})  # fmt: skip
+        value = value.format(
+            **{
+                file: tmp_path / "2" / file if file == "there" else tmp_path / file
+                for file in ("fleet", "rain", "there")
+            }
+        )
     assert getattr(ServiceConfig(), name) != value
     usual, again, other = (
         show(ServiceConfig.model_validate(given), tmp_path / str(k) / "archive")

@@ -16,10 +16,19 @@ from schemas.signals import CHANNELS, WHEELS, S
 from schemas.vehicle import Vehicle, load_vehicle
 
 VEHICLE = {
-    "name": "saloon", "mass": 1643.0, "yaw_inertia": 1954.0, "cg_to_front_axle": 1.287, "cg_to_rear_axle": 1.403,
-    "track_front": 1.581, "track_rear": 1.586, "cg_height": 0.545, "wheel_radius": 0.359, "wheel_inertia": 1.2,
-    "longitudinal_stiffness": 90000.0, "cornering_stiffness": 70000.0,
-}  # fmt: skip
+    "name": "saloon",
+    "mass": 1643.0,
+    "yaw_inertia": 1954.0,
+    "cg_to_front_axle": 1.287,
+    "cg_to_rear_axle": 1.403,
+    "track_front": 1.581,
+    "track_rear": 1.586,
+    "cg_height": 0.545,
+    "wheel_radius": 0.359,
+    "wheel_inertia": 1.2,
+    "longitudinal_stiffness": 90000.0,
+    "cornering_stiffness": 70000.0,
+}
 
 
 @given(
@@ -41,10 +50,20 @@ def test_a_tile_key_extends_the_key_of_its_region(tile: int) -> None:
 
 @pytest.mark.parametrize(
     "key",
-    ["gripmap/v1/obs/1200/320/230/*", "gripmap/v1/obs/**", "gripmap/v1/obs/1200/320/23/anna", "gripmap/v1/ack/Anna",
-     "gripmap/v1/obs/1200/320/234/anna", "gripmap/v2/ack/anna", "gripmap/v1/what/anna", "gripmap/v1/map/1200/320/230",
-     "gripmap/v1/ack/1200/anna", "gripmap/v1/ack/../../etc", ""],
-)  # fmt: skip
+    [
+        "gripmap/v1/obs/1200/320/230/*",
+        "gripmap/v1/obs/**",
+        "gripmap/v1/obs/1200/320/23/anna",
+        "gripmap/v1/ack/Anna",
+        "gripmap/v1/obs/1200/320/234/anna",
+        "gripmap/v2/ack/anna",
+        "gripmap/v1/what/anna",
+        "gripmap/v1/map/1200/320/230",
+        "gripmap/v1/ack/1200/anna",
+        "gripmap/v1/ack/../../etc",
+        "",
+    ],
+)
 def test_a_key_that_is_not_concrete_or_not_ours_is_refused(key: str) -> None:
     with pytest.raises(InputError, match="^key: "):
         keys.parse(key)
@@ -106,9 +125,13 @@ def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
-    [({"mass": -5.0}, "^mass: input should be greater than 0"), ({"mass": None}, "^mass: "),
-     ({"track_front": "wide"}, "^track_front: "), ({"wheel_radius": float("nan")}, "^wheel_radius: ")],
-)  # fmt: skip
+    [
+        ({"mass": -5.0}, "^mass: input should be greater than 0"),
+        ({"mass": None}, "^mass: "),
+        ({"track_front": "wide"}, "^track_front: "),
+        ({"wheel_radius": float("nan")}, "^wheel_radius: "),
+    ],
+)
 def test_a_wrong_vehicle_field_is_named(
     tmp_path: Path, change: dict[str, object], complaint: str
 ) -> None:
@@ -165,12 +188,21 @@ def test_what_is_no_time_is_refused_by_name(text: str) -> None:
 
 @pytest.mark.parametrize(
     ("parameters", "field"),
-    [({"bbox": "1,2,3"}, "bbox"), ({"bbox": "3,2,1,4"}, "bbox"), ({"bbox": "a,b,c,d"}, "bbox"),
-     ({"bbox": "nan,0,1,1"}, "bbox"), ({"min_vehicles": "0"}, "min_vehicles"), ({"format": "xml"}, "format"),
-     ({"at": "1970-12-31T07:00:00"}, "at"),
-     ({"at": "yesterday"}, "at"), ({"route": "1,2"}, "route"), ({"route": "1,2|3"}, "route"), ({"box": "1"}, "box"),
-     ({"basis": "guessed"}, "basis")],
-)  # fmt: skip
+    [
+        ({"bbox": "1,2,3"}, "bbox"),
+        ({"bbox": "3,2,1,4"}, "bbox"),
+        ({"bbox": "a,b,c,d"}, "bbox"),
+        ({"bbox": "nan,0,1,1"}, "bbox"),
+        ({"min_vehicles": "0"}, "min_vehicles"),
+        ({"format": "xml"}, "format"),
+        ({"at": "1970-12-31T07:00:00"}, "at"),
+        ({"at": "yesterday"}, "at"),
+        ({"route": "1,2"}, "route"),
+        ({"route": "1,2|3"}, "route"),
+        ({"box": "1"}, "box"),
+        ({"basis": "guessed"}, "basis"),
+    ],
+)
 def test_a_broken_query_names_the_parameter_and_the_fix(
     parameters: dict[str, str], field: str
 ) -> None:

@@ -30,9 +30,14 @@ BOTH = pytest.mark.parametrize(
 )
 SERVICE = ServiceConfig()
 ENCODINGS = (
-    *wire.ENCODING.values(), wire.ACK_ENCODING, wire.ALERT_ENCODING, wire.STANDING_ENCODING, wire.WEATHER_ENCODING,
-    wire.ARROW, wire.JSON,
-)  # fmt: skip
+    *wire.ENCODING.values(),
+    wire.ACK_ENCODING,
+    wire.ALERT_ENCODING,
+    wire.STANDING_ENCODING,
+    wire.WEATHER_ENCODING,
+    wire.ARROW,
+    wire.JSON,
+)
 
 
 @BOTH

@@ -65,7 +65,8 @@ def test_it_loads_nothing_but_the_contract_and_its_libraries(found: dict[str, An
 def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(
     found: dict[str, Any],
 ) -> None:
-    sent, (first, second) = found["sent"], found["sent"]["vehicles"]
+    sent = found["sent"]
+    (first, second) = found["sent"]["vehicles"]
     durable = [[1, 1]]
     acks = {
         vehicle: [stream[:4] for stream in streams] for vehicle, streams in found["acks"].items()
@@ -89,7 +90,8 @@ def test_it_reads_the_tile_and_the_alert_that_its_reports_brought_about(
     found: dict[str, Any],
 ) -> None:
     assert {encoding for encoding, _ in found["tiles"]} == {"application/vnd.apache.arrow.stream"}
-    alert, cell = found["alerts"][0], found["sent"]["cell"]
+    alert = found["alerts"][0]
+    cell = found["sent"]["cell"]
     assert (alert["cell"], alert["sector"], alert["raised"], alert["vehicles"]) == (
         cell,
         1,

@@ -41,13 +41,18 @@ from schemas.wire import Batch, Kind  # noqa: E402
 from schemas.wire.tile import decode_tile  # noqa: E402
 from tests.waiting import matched, until  # noqa: E402
 
-LATITUDE, LONGITUDE, NORTH = 57.7, 11.97, np.pi / 2
+LATITUDE = 57.7
+LONGITUDE = 11.97
+NORTH = np.pi / 2
 CELL = int(grid.cell_of(LATITUDE, LONGITUDE))
-REGION, TILE = int(grid.region_of(CELL)), int(grid.tile_of(CELL))
-ICE, STD = 0.2, 0.05
+REGION = int(grid.region_of(CELL))
+TILE = int(grid.tile_of(CELL))
+ICE = 0.2
+STD = 0.05
 VISITS = 6
 SECOND = 10**9
-JSON_SENDER, PROTOBUF_SENDER = "berta", "anna"
+JSON_SENDER = "berta"
+PROTOBUF_SENDER = "anna"
 
 
 def protobuf_batch(now: int) -> bytes:
@@ -55,12 +60,19 @@ def protobuf_batch(now: int) -> bytes:
     leave = now - SECOND * np.arange(VISITS)[::-1]
     log_likelihood = -0.5 * np.square((mugrid.CENTRES - ICE) / STD)
     columns: dict[str, Any] = {
-        "enter_time": leave - SECOND // 2, "leave_time": leave, "latitude": np.full(VISITS, LATITUDE),
-        "longitude": np.full(VISITS, LONGITUDE), "yaw": np.full(VISITS, NORTH), "mu": np.full(VISITS, ICE),
-        "mu_lower": np.full(VISITS, 0.12), "mu_upper": np.full(VISITS, 0.28), "mu_utilised": np.full(VISITS, 0.19),
-        "cell": np.full(VISITS, CELL), "sector": np.ones(VISITS, np.int8),
+        "enter_time": leave - SECOND // 2,
+        "leave_time": leave,
+        "latitude": np.full(VISITS, LATITUDE),
+        "longitude": np.full(VISITS, LONGITUDE),
+        "yaw": np.full(VISITS, NORTH),
+        "mu": np.full(VISITS, ICE),
+        "mu_lower": np.full(VISITS, 0.12),
+        "mu_upper": np.full(VISITS, 0.28),
+        "mu_utilised": np.full(VISITS, 0.19),
+        "cell": np.full(VISITS, CELL),
+        "sector": np.ones(VISITS, np.int8),
         "log_likelihood": mugrid.encode_log_likelihood(np.tile(log_likelihood, (VISITS, 1))),
-    }  # fmt: skip
+    }
     return wire.encode(
         Batch(Kind.OBSERVATION, PROTOBUF_SENDER, 41, REGION, 1, 1, columns, "third-party")
     )
@@ -69,8 +81,15 @@ def protobuf_batch(now: int) -> bytes:
 def json_batch(now: int) -> bytes:
     """The same visits as a person would write them: cell, sector and region follow from the pose."""
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
-    numbers = {"latitude": LATITUDE, "longitude": LONGITUDE, "yaw": NORTH, "mu": ICE, "mu_lower": 0.12,
-               "mu_upper": 0.28, "mu_utilised": 0.19}  # fmt: skip
+    numbers = {
+        "latitude": LATITUDE,
+        "longitude": LONGITUDE,
+        "yaw": NORTH,
+        "mu": ICE,
+        "mu_lower": 0.12,
+        "mu_upper": 0.28,
+        "mu_utilised": 0.19,
+    }
     columns = {name: [value] * VISITS for name, value in numbers.items()}
     return json.dumps(
         {"vehicle": JSON_SENDER, "boot": "42", "seq": "1", "enter_time": times, **columns}
@@ -98,11 +117,9 @@ class Heard:
         session.declare_subscriber(f"{keys.ROOT}/*/**", self._hear)
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        key, payload, encoding = (
-            str(sample.key_expr),
-            sample.payload.to_bytes(),
-            str(sample.encoding),
-        )
+        key = str(sample.key_expr)
+        payload = sample.payload.to_bytes()
+        encoding = str(sample.encoding)
         try:
             topic = keys.parse(key).topic.name
             if topic == "ack":
@@ -165,21 +182,33 @@ def main(endpoint: str) -> None:
         ((_, features),) = asked(session, f"{keys.map_key(TILE)}?{box};format=geojson")
         ((standing, alerts),) = asked(session, keys.alert_key(TILE))
         ((_, refusal),) = asked(session, f"{keys.ROOT}/map/**?bbox=1,2,3")
-    print(json.dumps({
-        "errors": heard.errors,
-        "acks": {vehicle: [stream[:1] + stream[2:] for stream in streams] for vehicle, streams in heard.acks.items()},
-        "batches": [[batch.vehicle, batch.rows, batch.region] for batch in heard.batches],
-        "tiles": heard.tiles,
-        "alerts": [asdict(alert) for alert in heard.alerts],
-        "standing": [standing, [alert.cell for alert in wire.decode_standing(alerts)]],
-        "arrow": [arrow, decode_tile(tile).drop(["first_time", "last_time"]).to_pylist()],
-        "json": json.loads(document),
-        "geojson": json.loads(features),
-        "refusal": refusal.decode(),
-        "sent": {"cell": CELL, "region": REGION, "visits": VISITS, "vehicles": [PROTOBUF_SENDER, JSON_SENDER]},
-        "loaded": sorted({name.partition(".")[0] for name in sys.modules} & set(FORBIDDEN)),
-        "blocked": blocked(),
-    }))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "errors": heard.errors,
+                "acks": {
+                    vehicle: [stream[:1] + stream[2:] for stream in streams]
+                    for vehicle, streams in heard.acks.items()
+                },
+                "batches": [[batch.vehicle, batch.rows, batch.region] for batch in heard.batches],
+                "tiles": heard.tiles,
+                "alerts": [asdict(alert) for alert in heard.alerts],
+                "standing": [standing, [alert.cell for alert in wire.decode_standing(alerts)]],
+                "arrow": [arrow, decode_tile(tile).drop(["first_time", "last_time"]).to_pylist()],
+                "json": json.loads(document),
+                "geojson": json.loads(features),
+                "refusal": refusal.decode(),
+                "sent": {
+                    "cell": CELL,
+                    "region": REGION,
+                    "visits": VISITS,
+                    "vehicles": [PROTOBUF_SENDER, JSON_SENDER],
+                },
+                "loaded": sorted({name.partition(".")[0] for name in sys.modules} & set(FORBIDDEN)),
+                "blocked": blocked(),
+            }
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -56,7 +56,8 @@ class House:
     """A folder with an archive, and what is said on the way."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.archive = folder, folder / "archive"
+        self.folder = folder
+        self.archive = folder / "archive"
         synthetic.write(self.archive, WORLD, 2000)
         compact(self.archive)
         mistakes.prepare(folder)
@@ -208,7 +209,8 @@ def install_to_first_map_s(house: House) -> float:
     build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = built.glob("*.whl")
-    began, place = time.monotonic(), house.folder / "venv"
+    began = time.monotonic()
+    place = house.folder / "venv"
     venv.create(place, with_pip=True)
     pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
     subprocess.run(
@@ -309,7 +311,8 @@ def main() -> int:
     FOLDER.mkdir(exist_ok=True)
     place = Path(tempfile.mkdtemp())
     try:
-        house, found = House(place), []
+        house = House(place)
+        found = []
         for name in args.only:
             measure, unit, bar, better = PARTS[name]
             print(f"-- {name}", flush=True)

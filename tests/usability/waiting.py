@@ -51,7 +51,9 @@ def longest(command: list[str], cache: Path, ready: bytes | None = None) -> floa
     here, there = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}
     environment.pop("NUMBA_CACHE_DIR", None)
-    last, worst, said = time.monotonic(), 0.0, b""
+    last = time.monotonic()
+    worst = 0.0
+    said = b""
     began = last
     program = [str(Path(sys.executable).parent / command[0]), *command[1:]]
     with subprocess.Popen(
@@ -65,7 +67,8 @@ def longest(command: list[str], cache: Path, ready: bytes | None = None) -> floa
             except OSError:  # it has left
                 break
             if heard:
-                worst, last = max(worst, time.monotonic() - last), time.monotonic()
+                worst = max(worst, time.monotonic() - last)
+                last = time.monotonic()
             said += heard
             if ready is not None and ready in said:
                 process.send_signal(signal.SIGINT)

@@ -17,9 +17,19 @@ from schemas.signals import CHANNELS
 
 TONNES: Final = "mass in tonnes"
 WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence once, and three more
-    "steering in deg", "steering wheel", "both in g", "wheels in km/h", "a_y flipped", "yaw rate in deg/s", TONNES,
-    "latitude and longitude", "compass for yaw", "time in ms", "wheels in rpm", "a_x flipped",
-)  # fmt: skip
+    "steering in deg",
+    "steering wheel",
+    "both in g",
+    "wheels in km/h",
+    "a_y flipped",
+    "yaw rate in deg/s",
+    TONNES,
+    "latitude and longitude",
+    "compass for yaw",
+    "time in ms",
+    "wheels in rpm",
+    "a_x flipped",
+)
 
 
 def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:

@@ -41,7 +41,8 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
     else:
         ring.used[place] = max(ring.used[place], used)
     if ring.used[place] >= ring.largest:
-        ring.largest, ring.largest_time = ring.used[place], ring.time[place]
+        ring.largest = ring.used[place]
+        ring.largest_time = ring.time[place]
     elif not ring.largest_time > time - UTILISED_WINDOW_S:
         _search(ring, time)
 
@@ -52,4 +53,5 @@ def _search(ring: Excitation, time: float) -> None:
     ring.largest = 0.0
     for k in range(SLOTS):
         if ring.time[k] > time - UTILISED_WINDOW_S and ring.used[k] >= ring.largest:
-            ring.largest, ring.largest_time = ring.used[k], ring.time[k]
+            ring.largest = ring.used[k]
+            ring.largest_time = ring.time[k]

@@ -27,7 +27,10 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-REFUSED, BEGUN, STEPPED = 0, 1, 2  # what became of a sample
+# what became of a sample
+REFUSED = 0
+BEGUN = 1
+STEPPED = 2
 
 
 class InputTrack:
@@ -92,7 +95,8 @@ def _remember(track: InputTrack) -> None:
 @compiled
 def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
     """Fill `inputs`; anew: what they were before counts no more."""
-    now, use = track.now, track.inputs
+    now = track.now
+    use = track.inputs
     for k in range(S.YAW_RATE, S.OMEGA):
         value = now[k] if now[k] == now[k] else 0.0 if anew else use[k]
         if k >= S.DELTA and value != use[k]:
@@ -116,7 +120,8 @@ def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
     """Grip used by the hardest-working wheel now [1]: hypot of torque over radius and load, and lateral g."""
     use = track.inputs
-    loads, most = wheel_loads(body(row), use[S.AX], use[S.AY]), 0.0
+    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
+    most = 0.0
     for wheel in range(4):
         most = max(most, abs(use[S.TORQUE + wheel]) / loads[wheel])
     return math.sqrt((most / row[Parameter.RADIUS]) ** 2 + (use[S.AY] / GRAVITY) ** 2)

@@ -32,7 +32,8 @@ def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 @compiled
 def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
     """The health flag of a wheel past its peak by longitudinal slip, at the inputs in use."""
-    health, yaw_rate = 0, track.inputs[S.YAW_RATE]
+    health = 0
+    yaw_rate = track.inputs[S.YAW_RATE]
     for wheel in range(4):
         along = along_wheel(
             row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel]

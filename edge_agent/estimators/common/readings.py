@@ -42,10 +42,12 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 @compiled
 def believe(sample: FloatArray, now: FloatArray) -> int:
     """now (15,) = the readings of a sample (18,), NaN where missing, infinite or unbelievable; returns health flags."""
-    odd, missing = 0, 0
+    odd = 0
+    missing = 0
     for channel in range(INPUTS):
         value = sample[channel]
-        there, believed = value == value, abs(value) <= LIMITS[channel]
+        there = value == value
+        believed = abs(value) <= LIMITS[channel]
         now[channel] = value if believed else math.nan
         odd |= flags.OUTLIER if there and not believed else 0
         missing |= 0 if believed else MISSING[channel]

@@ -52,9 +52,13 @@ def kernel_of(
 
     @nogil
     def advance(
-        filters: Records[Memory], contexts: Records[Context], t: FloatArray, signals: FloatArray, outputs: FloatArray,
+        filters: Records[Memory],
+        contexts: Records[Context],
+        t: FloatArray,
+        signals: FloatArray,
+        outputs: FloatArray,
         part: Part,
-    ) -> None:  # fmt: skip
+    ) -> None:
         share, first, last = part
         context = contexts[share]
         for n in range(first, last):
@@ -64,9 +68,12 @@ def kernel_of(
                 memory.log_likelihood = 0.0
                 health, kind, dt = take(memory.track, memory.row, t[k, n], signals[k, n])
                 if kind == STEPPED and not step(memory, context, dt):
-                    health, kind = health | flags.RESET, BEGUN
+                    health = health | flags.RESET
+                    kind = BEGUN
                 if kind == BEGUN:
-                    memory.nis, memory.log_likelihood, memory.adaptation = 0.0, 0.0, 1.0
+                    memory.nis = 0.0
+                    memory.log_likelihood = 0.0
+                    memory.adaptation = 1.0
                     begin(memory, context)
                 if memory.track.started:
                     mu = report(memory, context, output)

@@ -55,12 +55,19 @@ def mixture_bank(
 
 @nogil
 def _advance(
-    filters: Records[MixtureMemory], contexts: Records[MixtureContext], t: FloatArray, signals: FloatArray,
-    outputs: FloatArray, visits: tuple[BoolArray, FloatArray], part: Part,
-) -> None:  # fmt: skip
-    (closes, evidence), (share, first, last) = visits, part
+    filters: Records[MixtureMemory],
+    contexts: Records[MixtureContext],
+    t: FloatArray,
+    signals: FloatArray,
+    outputs: FloatArray,
+    visits: tuple[BoolArray, FloatArray],
+    part: Part,
+) -> None:
+    (closes, evidence) = visits
+    (share, first, last) = part
     context = contexts[share]
-    design, scratch = context.design, context.scratch
+    design = context.design
+    scratch = context.scratch
     for n in range(first, last):
         memory = filters[n]
         for k in range(t.shape[0]):
@@ -103,7 +110,8 @@ def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> 
         return
     last = memory.last
     vx, vy = velocity(memory)
-    constants, var_x = design.constants, memory.overall_covariance[NodeState.VX, NodeState.VX]
+    constants = design.constants
+    var_x = memory.overall_covariance[NodeState.VX, NodeState.VX]
     var_x += (constants.radius_std * vx) ** 2 + (
         constants.common_lag * last.ax
     ) ** 2  # what no sensor tells

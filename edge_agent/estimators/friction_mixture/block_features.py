@@ -41,10 +41,14 @@ LIKELY = 2.0  # and of what is unknown of the radii
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
     """Fill `features` but for duration and speed, which are given; returns health flags."""
-    row, last, block, constants = memory.row, memory.last, memory.block, design.constants
+    row = memory.row
+    last = memory.last
+    block = memory.block
+    constants = design.constants
     _kinematics(block, features)
     features.yaw_rate = mean_or(block, S.YAW_RATE, last.yaw_rate)
-    ax, ay = mean_or(block, S.AX, 0.0), mean_or(block, S.AY, 0.0)
+    ax = mean_or(block, S.AX, 0.0)
+    ay = mean_or(block, S.AY, 0.0)
     loads = features.loads
     loads[0], loads[1], loads[2], loads[3] = wheel_loads(body(row), ax, ay)
     for wheel in range(4):
@@ -76,7 +80,8 @@ def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
     share = 1.0 / block.samples
     features.cos = block.cos_sum * share
     features.sin = block.sin_sum * share
-    mean, total = features.gain, block.gain_sum
+    mean = features.gain
+    total = block.gain_sum
     mean.measured.x, mean.measured.y = total.measured.x * share, total.measured.y * share
     mean.leak_y.x, mean.leak_y.y = total.leak_y.x * share, total.leak_y.y * share
     mean.unit.x, mean.unit.y = total.unit.x * share, total.unit.y * share
@@ -85,14 +90,18 @@ def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
 @compiled
 def _steer_rate(memory: MixtureMemory, duration: float) -> float:
     """Rate of the mean front steering angle [rad/s]."""
-    now, before = memory.last.delta, memory.last.delta_before
+    now = memory.last.delta
+    before = memory.last.delta_before
     return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)
 
 
 @compiled
 def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> int:
     """Force, and the part of noise_std that comes from it, of the four wheels; returns health flags."""
-    health, loads, row, block = 0, features.loads, memory.row, memory.block
+    health = 0
+    loads = features.loads
+    row = memory.row
+    block = memory.block
     ax = mean_or(block, S.AX, math.nan)
     front, front_std = front_share(row, memory.drive_odds, features.change)
     for wheel in range(4):
@@ -113,7 +122,8 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
             apart = math.hypot(constants.no_torque_share * force, 0.5 * front_std * known)
             spread = math.hypot(apart, 0.25 * row[Parameter.MASS] * constants.no_torque_floor)
             if math.isnan(ax):
-                unit, spread = 0.0, NO_FORCE_SHARE * loads[wheel]
+                unit = 0.0
+                spread = NO_FORCE_SHARE * loads[wheel]
         features.force[wheel], features.force_unit[wheel] = (
             force / loads[wheel],
             unit / loads[wheel],
@@ -125,7 +135,9 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
 @compiled
 def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
     """side with its derivatives, and load_share of both axles; NaN without a_y."""
-    row, loads, delta = memory.row, features.loads, memory.last.delta
+    row = memory.row
+    loads = features.loads
+    delta = memory.last.delta
     ay = mean_or(memory.block, S.AY, math.nan)
     yaw_acceleration = (memory.last.yaw_rate - memory.block.start_yaw_rate) / features.duration
     moment = 0.0
@@ -135,7 +147,8 @@ def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
     front, rear = axle_lateral_forces(row, ay, yaw_acceleration, moment)
     leak_front, leak_rear = axle_lateral_forces(row, -ay, 0.0, 0.0)
     for axle in range(2):
-        left, right = 2 * axle, 2 * axle + 1
+        left = 2 * axle
+        right = 2 * axle + 1
         load = loads[left] + loads[right]
         along = features.force[left] * loads[left] + features.force[right] * loads[right]
         angle = 0.5 * (delta[left] + delta[right])
@@ -151,7 +164,8 @@ def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
     """Side forces whose slip or moment nobody has measured become NaN; returns health flags."""
-    health, counts = 0, memory.block.counts
+    health = 0
+    counts = memory.block.counts
     if (
         counts[S.DELTA] + counts[S.DELTA + 1] == 0
     ):  # without steering the front axle's slip is unknown
@@ -168,7 +182,9 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 @compiled
 def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
     """Slip noise and force noise meet under the total-least-squares residual with half the variance each."""
-    row, constants, before = memory.row, design.constants, memory.last_side
+    row = memory.row
+    constants = design.constants
+    before = memory.last_side
     speed = max(features.speed, SLOWEST_M_S)
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
@@ -229,7 +245,8 @@ def abruptness(
 
     A wheel that spins up or locks goes on for some blocks, a bump is over within one or two.
     """
-    now, usual = at_centre(memory.row, features, wheel), memory.usual_rolling
+    now = at_centre(memory.row, features, wheel)
+    usual = memory.usual_rolling
     expected = usual[wheel] + features.change * features.duration
     share = 1.0 - math.exp(-features.duration / constants.abrupt_time)
     usual[wheel] = now if math.isnan(expected) else expected + share * (now - expected)
@@ -266,17 +283,20 @@ def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatur
 
     Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be is allowed for.
     """
-    row, block, radius, first = memory.row, memory.block, memory.overall_mean, NodeState.RADIUS
-    most, speed, covariance = (
-        0.0,
-        max(features.speed, SLOWEST_COMPARED_M_S),
-        memory.overall_covariance,
-    )
+    row = memory.row
+    block = memory.block
+    radius = memory.overall_mean
+    first = NodeState.RADIUS
+    most = 0.0
+    speed = max(features.speed, SLOWEST_COMPARED_M_S)
+    covariance = memory.overall_covariance
     for axle in range(2):
-        left, right = 2 * axle, 2 * axle + 1
+        left = 2 * axle
+        right = 2 * axle + 1
         track = row[Parameter.TRACK_FRONT] if axle == 0 else row[Parameter.TRACK_REAR]
         turning = track * features.yaw_rate * features.steer_cos[left]
-        i, j = first + left, first + right
+        i = first + left
+        j = first + right
         faster = features.rolling[right] * (1.0 + radius[j]) - features.rolling[left] * (
             1.0 + radius[i]
         )

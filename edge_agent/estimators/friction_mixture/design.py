@@ -47,8 +47,11 @@ class MixtureDesign(NamedTuple):
 
 def nominal_states(constants: Constants) -> Nominal:
     """Prior of the states of a node."""
-    mean, std, time = np.zeros(STATES), np.ones(STATES), np.full(STATES, np.inf)
-    c, x = constants, NodeState
+    mean = np.zeros(STATES)
+    std = np.ones(STATES)
+    time = np.full(STATES, np.inf)
+    c = constants
+    x = NodeState
     for state, spread, back in (
         (x.LN_KX, c.stiffness_x_std, c.stiffness_time),
         (x.LN_KY, c.stiffness_y_std, c.stiffness_time),

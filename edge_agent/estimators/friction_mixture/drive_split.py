@@ -25,10 +25,9 @@ DRIVES = (
 ALL_WHEELS = 1  # of these kinds
 FIRST_ODDS = (0.35, 0.3, 0.35)
 SHARE_STD = 0.03  # of a car of a known kind
-BRAKES_FRONT, BRAKES_STD = (
-    0.64,
-    0.06,
-)  # share of the front in braking, and how it differs between cars
+# share of the front in braking, and how it differs between cars
+BRAKES_FRONT = 0.64
+BRAKES_STD = 0.06
 ENGINE_BRAKE = 1.5  # [m/s^2] to twice this a car may slow by its engine, on the driven axle alone
 PULLS = 0.05  # a_x over g from which the driven axle shows
 FAST_M_S = 3.0  # slip is told above this speed
@@ -42,7 +41,8 @@ LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
     """Share of the front axle in the force along at a_x [m/s^2], and its spread."""
-    front, spread = row[Parameter.DRIVE_FRONT], SHARE_STD
+    front = row[Parameter.DRIVE_FRONT]
+    spread = SHARE_STD
     if math.isnan(front):
         front = square = 0.0
         for kind in range(3):
@@ -60,16 +60,17 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 @compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Renew the odds of the three kinds by the slip of the axles in the block."""
-    row, odds, rolling = memory.row, memory.drive_odds, features.rolling
-    pull, speed = (
-        features.change / GRAVITY,
-        0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3]),
-    )
+    row = memory.row
+    odds = memory.drive_odds
+    rolling = features.rolling
+    pull = features.change / GRAVITY
+    speed = 0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3])
     if not (pull > PULLS and speed > FAST_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
         return
     apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
     rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
-    per_force, look = pull / row[Parameter.SLOPE_X], min(features.duration / LOOK_S, 1.0)
+    per_force = pull / row[Parameter.SLOPE_X]
+    look = min(features.duration / LOOK_S, 1.0)
     total = 0.0
     for kind in range(3):
         asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))

@@ -116,7 +116,8 @@ def visit_evidence(
         while j < count - 1 and mu[j + 1] < centres[i]:
             j += 1
         k = min(j + 1, count - 1)
-        first, last = math.log(w[j] / prior[j]), math.log(w[k] / prior[k])
+        first = math.log(w[j] / prior[j])
+        last = math.log(w[k] / prior[k])
         share = 0.0 if k == j else min(max((centres[i] - mu[j]) / (mu[k] - mu[j]), 0.0), 1.0)
         out[i] = (1.0 - share) * first + share * last
         top = max(top, out[i])

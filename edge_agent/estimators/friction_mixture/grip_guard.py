@@ -10,7 +10,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-SLOW_S, FAST_S = 0.15, 0.06  # smoothing: of the noise of accelerometers and of what a body shakes
+# smoothing: of the noise of accelerometers and of what a body shakes
+SLOW_S = 0.15
+FAST_S = 0.06
 HELD_S = 1.0  # the largest grip holds so long,
 FORGOTTEN = 0.5  # [1/s] and then fades: roads change
 ABOVE = 0.02  # what smoothing takes from the top of a hard stop
@@ -27,7 +29,8 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
     grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
     grip.age += dt
     if grip.fast >= grip.held:
-        grip.held, grip.age = grip.fast, 0.0
+        grip.held = grip.fast
+        grip.age = 0.0
     elif grip.age > HELD_S:
         grip.held = max(grip.fast, grip.held - FORGOTTEN * dt)
 

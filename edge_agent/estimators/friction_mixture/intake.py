@@ -62,7 +62,8 @@ def take_sample(
     _filter_yaw_rate(memory, dt)
     ax = _believed(now[S.AX], last.ax, last.read_ax)
     ay = _believed(now[S.AY], last.ay, last.read_ay)
-    last.read_ax, last.read_ay = now[S.AX], now[S.AY]
+    last.read_ax = now[S.AX]
+    last.read_ay = now[S.AY]
     if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
         health |= flags.OUTLIER
     _move(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
@@ -74,8 +75,10 @@ def take_sample(
 @compiled
 def begin_block(memory: MixtureMemory) -> None:
     """Empty the sums; the block begins at the last sample."""
-    last, block = memory.last, memory.block
-    block.time, block.samples = last.time, 0
+    last = memory.last
+    block = memory.block
+    block.time = last.time
+    block.samples = 0
     block.angle = block.cos_sum = block.sin_sum = 0.0
     _clear(block.gain)
     _clear(block.gain_sum)
@@ -96,12 +99,17 @@ def _clear(gain: VelocityGain) -> None:
 @compiled
 def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
     """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
-    last, now, row = memory.last, memory.last.now, memory.row
+    last = memory.last
+    now = memory.last.now
+    row = memory.row
     variance = last.yaw_rate_var + YAW_WALK**2 * dt
-    value, noise = now[S.YAW_RATE], YAW_STD
+    value = now[S.YAW_RATE]
+    noise = YAW_STD
     if math.isnan(value):
-        left, right = now[S.OMEGA + 2], now[S.OMEGA + 3]
-        value, noise = row[Parameter.RADIUS] * (right - left) / row[Parameter.TRACK_REAR], REAR_STD
+        left = now[S.OMEGA + 2]
+        right = now[S.OMEGA + 3]
+        value = row[Parameter.RADIUS] * (right - left) / row[Parameter.TRACK_REAR]
+        noise = REAR_STD
     if math.isnan(value):
         last.yaw_rate_var = min(variance, UNKNOWN_YAW_VAR)
         return
@@ -120,13 +128,15 @@ def _believed(value: float, used: float, read: float) -> float:
 @compiled
 def _move(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
-) -> None:  # fmt: skip
+) -> None:
     """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
 
     ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
     """
-    last, block = memory.last, memory.block
-    rate, time = last.yaw_rate, last.time + dt
+    last = memory.last
+    block = memory.block
+    rate = last.yaw_rate
+    time = last.time + dt
     if not math.isnan(ax + ay):
         last.inertial_time = time
     elif time - last.inertial_time < HOLD_S:
@@ -139,10 +149,13 @@ def _move(
     if math.isnan(ay) or not turning:
         block.missing_y = LOST_AY**2
     if math.isnan(ay):
-        ay, leak_y = rate * memory.overall_mean[NodeState.VX], 0.0
-    last.ax, last.ay = ax, ay
+        ay = rate * memory.overall_mean[NodeState.VX]
+        leak_y = 0.0
+    last.ax = ax
+    last.ay = ay
     note_grip(memory.grip, ax, ay, dt)
-    gain, total = block.gain, block.gain_sum
+    gain = block.gain
+    total = block.gain_sum
     _advance(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)
     _advance(gain.leak_y, 0.0, leak_y, rate, dt)
     _advance(gain.unit, 1.0, 0.0, rate, dt)
@@ -168,7 +181,9 @@ def _accumulate(total: PlanarVector, part: PlanarVector) -> None:
 
 @compiled
 def _add(memory: MixtureMemory, ax: float, ay: float) -> None:
-    last, now, block = memory.last, memory.last.now, memory.block
+    last = memory.last
+    now = memory.last.now
+    block = memory.block
     for channel in range(INPUTS):
         value = ax if channel == S.AX else ay if channel == S.AY else now[channel]
         if not math.isnan(value):

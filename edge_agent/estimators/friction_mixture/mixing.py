@@ -45,7 +45,9 @@ def awake(memory: MixtureMemory) -> int:
 @compiled
 def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Split nodes take part from the first sign of such a road until they have become improbable."""
-    weight, visit, constants = memory.weight, memory.visit_weight, design.constants
+    weight = memory.weight
+    visit = memory.visit_weight
+    constants = design.constants
     sign = scratch.features.asymmetry > constants.split_asymmetry
     if memory.split:
         total = 0.0
@@ -68,7 +70,8 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 @compiled
 def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float) -> None:
     """Road change over `metres`: probabilities flow, and each node is mixed with what came to it."""
-    count, constants = awake(memory), design.constants
+    count = awake(memory)
+    constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
     hazard = 1.0 - math.exp(-metres * constants.hazard)
     doubt = 1.0 - credence(memory.trust, constants)
@@ -77,11 +80,9 @@ def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, met
     hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
-    predicted, weight, visit = (
-        scratch.predicted[:count],
-        memory.weight[:count],
-        memory.visit_weight[:count],
-    )
+    predicted = scratch.predicted[:count]
+    weight = memory.weight[:count]
+    visit = memory.visit_weight[:count]
     change_road(visit, prior, NODES, hazard, leaving, drift, predicted)
     put(visit, predicted)
     change_road(weight, prior, NODES, hazard, leaving, drift, predicted)
@@ -129,7 +130,8 @@ def match_moments(
     overall_covariance: FloatArray,
 ) -> None:
     """Mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
-    count, n = weight.shape[0], mean.shape[1]
+    count = weight.shape[0]
+    n = mean.shape[1]
     clear(overall_mean)
     clear_rows(overall_covariance)
     for k in range(count):

@@ -68,14 +68,14 @@ def update_node(
 
     Writes its innovation and its theoretical variance without the inflation.
     """
-    constants, nominal, features, node = (
-        design.constants,
-        memory.nominal,
-        scratch.features,
-        scratch.node,
-    )
-    mean, root = memory.mean[j], scratch.root[j]
-    innovation, theoretical = scratch.innovation[j], scratch.theoretical[j]
+    constants = design.constants
+    nominal = memory.nominal
+    features = scratch.features
+    node = scratch.node
+    mean = memory.mean[j]
+    root = scratch.root[j]
+    innovation = scratch.innovation[j]
+    theoretical = scratch.theoretical[j]
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
     price = linearize(memory, design, scratch, j)
     spread(memory, design, scratch, j)
@@ -115,9 +115,15 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
 
     Leak and offset of a_y move the same forces, so that one derivative tells the other.
     """
-    constants, curve, side_mu = design.constants, design.curve, design.sides.mu[j]
-    row, mean, features, node = memory.row, memory.mean[j], scratch.features, scratch.node
-    price, all_torques = 0.0, True
+    constants = design.constants
+    curve = design.curve
+    side_mu = design.sides.mu[j]
+    row = memory.row
+    mean = memory.mean[j]
+    features = scratch.features
+    node = scratch.node
+    price = 0.0
+    all_torques = True
     for wheel in range(4):
         all_torques = all_torques and features.force_unit[wheel] == 0.0
     for i in range(STATES):
@@ -167,8 +173,11 @@ def _by_wheel_speeds(
 
     All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force is as at the mean.
     """
-    row, mean, side_mu = memory.row, memory.mean[j], design.sides.mu[j]
-    features, node = scratch.features, scratch.node
+    row = memory.row
+    mean = memory.mean[j]
+    side_mu = design.sides.mu[j]
+    features = scratch.features
+    node = scratch.node
     step = design.nominal.std[NodeState.RADIUS]
     for wheel in range(4):
         node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel] + step
@@ -197,11 +206,14 @@ def weigh_slopes(
     The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread
     thin.
     """
-    slip, price = node.slip, 0.0
+    slip = node.slip
+    price = 0.0
     for axle in range(2):
         across = 0.0
         for wheel in range(2 * axle, 2 * axle + 2):
-            mu, g_x, g_y = side_mu[wheel % 2], slip.along[wheel], slip.across[wheel]
+            mu = side_mu[wheel % 2]
+            g_x = slip.along[wheel]
+            g_y = slip.across[wheel]
             along = slope_along(curve, g_x, g_y, mu)
             across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
             node.noise[wheel] = (
@@ -234,8 +246,13 @@ def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: in
 
     scratch.root[j] is lower triangular.
     """
-    row, mean, root, side_mu = memory.row, memory.mean[j], scratch.root[j], design.sides.mu[j]
-    features, node, scale = scratch.features, scratch.node, math.sqrt(CURVED)
+    row = memory.row
+    mean = memory.mean[j]
+    root = scratch.root[j]
+    side_mu = design.sides.mu[j]
+    features = scratch.features
+    node = scratch.node
+    scale = math.sqrt(CURVED)
     for r in range(ROWS):
         node.residual[r] = node.nonlinearity[r] = 0.0
     for column in range(CURVED):
@@ -292,7 +309,8 @@ def take_rows(
 
     What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
     """
-    loss, used = 0.0, 0
+    loss = 0.0
+    used = 0
     for r in range(ROWS):
         if math.isnan(node.residual[r]):
             continue
@@ -313,13 +331,15 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 
     Radii are told against each other only: what all share scales the speed, and no sensor here knows that scale.
     """
-    far, common = constants.farthest, 0.0
+    far = constants.farthest
+    common = 0.0
     for wheel in range(4):
         common += 0.25 * mean[NodeState.RADIUS + wheel]
     for wheel in range(4):
         mean[NodeState.RADIUS + wheel] -= common
     for i in range(NodeState.LN_KX, mean.shape[0]):
-        middle, reach = nominal.mean[i], far * nominal.std[i]
+        middle = nominal.mean[i]
+        reach = far * nominal.std[i]
         mean[i] = min(max(mean[i], middle - reach), middle + reach)
 
 
@@ -332,18 +352,25 @@ def predict_node(
     The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).
     What is a property of vehicle or sensor returns to its prior by scratch.keep. scratch.root[j] is changed to F*L.
     """
-    nominal, keep, noise, gain = memory.nominal, scratch.keep, scratch.process, memory.block.gain
-    mean, root, covariance = memory.mean[j], scratch.root[j], memory.covariance[j]
+    nominal = memory.nominal
+    keep = scratch.keep
+    noise = scratch.process
+    gain = memory.block.gain
+    mean = memory.mean[j]
+    root = scratch.root[j]
+    covariance = memory.covariance[j]
     n = mean.shape[0]
     for k in range(n):
         column = root[:, k]
-        vx, vy = column[NodeState.VX], column[NodeState.VY]
+        vx = column[NodeState.VX]
+        vy = column[NodeState.VY]
         gained_x, gained_y = gained_velocity(gain, column)
         column[NodeState.VX] = turn_cos * vx + turn_sin * vy + (gained_x - gain.measured.x)
         column[NodeState.VY] = turn_cos * vy - turn_sin * vx + (gained_y - gain.measured.y)
         for i in range(NodeState.LN_KX, n):
             column[i] *= keep[i]
-    vx, vy = mean[NodeState.VX], mean[NodeState.VY]
+    vx = mean[NodeState.VX]
+    vy = mean[NodeState.VY]
     gained_x, gained_y = gained_velocity(gain, mean)
     mean[NodeState.VX] = turn_cos * vx + turn_sin * vy + gained_x
     mean[NodeState.VY] = turn_cos * vy - turn_sin * vx + gained_y

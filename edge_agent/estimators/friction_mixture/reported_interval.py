@@ -26,7 +26,8 @@ LEARNED = 0.05  # [nat] divergence at which most of it is
 DRAWN_IN = 0.085  # [1] most by which the upper end comes nearer: a belief that leans to ice has a long upper tail
 # How much nearer it comes in a car that is as its file says, by level and at the most: what else is wrong of it is
 # small as well. On level drives one truth in eighty had lain above. The lower end stays: safe deceleration rests on it.
-NEARER, DRAWN_NEARER = 0.15, 0.15
+NEARER = 0.15
+DRAWN_NEARER = 0.15
 # Ice ends without a sign: of what .95 called slippery for sure in towns .08 lay beyond it
 SURE_END = 0.99
 

@@ -54,11 +54,10 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
     An offset of a_y gains what one of a_x does, turned by a quarter.
     """
     leak_y = x[NodeState.LEAK_Y]
-    bias_x, bias_y = (
-        x[NodeState.BIAS_X] + x[NodeState.SLOPE],
-        x[NodeState.BIAS_Y] + x[NodeState.BANK],
-    )
-    measured, unit = gain.measured, gain.unit
+    bias_x = x[NodeState.BIAS_X] + x[NodeState.SLOPE]
+    bias_y = x[NodeState.BIAS_Y] + x[NodeState.BANK]
+    measured = gain.measured
+    unit = gain.unit
     return (
         measured.x - leak_y * gain.leak_y.x - bias_x * unit.x + bias_y * unit.y,
         measured.y - leak_y * gain.leak_y.y - bias_x * unit.y - bias_y * unit.x,
@@ -91,10 +90,12 @@ def find_slips(
 
     A log stiffness is drawn towards the node's mean where the force is too small to tell it from noise of the slip.
     """
-    x, slip = node.point, node.slip
+    x = node.point
+    slip = node.slip
     vx = features.cos * x[NodeState.VX] + features.sin * x[NodeState.VY] + node.gained.x
     vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
-    mean_kx, mean_ky = mean[NodeState.LN_KX], mean[NodeState.LN_KY]
+    mean_kx = mean[NodeState.LN_KX]
+    mean_ky = mean[NodeState.LN_KY]
     for axle in range(2):
         blind = math.isnan(
             features.side[axle]
@@ -102,17 +103,18 @@ def find_slips(
         offset = steering_offset(x, features) if axle == 0 and not blind else 0.0
         ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
-        slope_x, slope_y = (
-            row[Parameter.SLOPE_X] * math.exp(ln_kx),
-            row[Parameter.SLOPE_Y] * math.exp(ln_ky),
-        )
+        slope_x = row[Parameter.SLOPE_X] * math.exp(ln_kx)
+        slope_y = row[Parameter.SLOPE_Y] * math.exp(ln_ky)
         slip.scale_x[axle] = math.exp(-constants.stiffness_power_x * ln_kx)
         slip.scale_y[axle] = math.exp(-constants.stiffness_power_y * ln_ky)
         for wheel in range(2 * axle, 2 * axle + 2):
             px, py = wheel_position(row, wheel)
-            ahead, left = vx - py * features.yaw_rate, vy + px * features.yaw_rate
-            cos, sin = features.steer_cos[wheel], features.steer_sin[wheel]
-            along, across = cos * ahead + sin * left, cos * left - sin * ahead
+            ahead = vx - py * features.yaw_rate
+            left = vy + px * features.yaw_rate
+            cos = features.steer_cos[wheel]
+            sin = features.steer_sin[wheel]
+            along = cos * ahead + sin * left
+            across = cos * left - sin * ahead
             speed = max(abs(along), SLOWEST_M_S)
             rolling = features.rolling[wheel] * (1.0 + x[NodeState.RADIUS + wheel])
             rolling += x[NodeState.LAG_WHEEL] * features.change
@@ -142,11 +144,13 @@ def find_shape_force(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
     """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right wheels."""
-    slip, out = node.slip, node.shape_force
+    slip = node.slip
+    out = node.shape_force
     out[4] = out[5] = 0.0
     for wheel in range(4):
         mu = side_mu[wheel % 2]
-        g_x, g_y = slip.along[wheel], slip.across[wheel]
+        g_x = slip.along[wheel]
+        g_y = slip.across[wheel]
         size = math.sqrt(g_x * g_x + g_y * g_y)
         theta = size / mu
         change = (
@@ -169,17 +173,18 @@ def correct_forces(
     Without torque only the sum of both sides is measured; on a split road the slippery side gives SPLIT_LIMIT of its
     friction at most, and the other side the rest. The unlike forces turn the car, which the axles' side forces hold.
     """
-    leak, shape, gain = (
-        node.point[NodeState.LEAK_Y],
-        node.point[NodeState.SHAPE],
-        node.point[NodeState.GAIN],
-    )
-    bias_x, bias_y = node.point[NodeState.BIAS_X], node.point[NodeState.BIAS_Y]
-    force, slip_at_force = node.force, node.slip_at_force
+    leak = node.point[NodeState.LEAK_Y]
+    shape = node.point[NodeState.SHAPE]
+    gain = node.point[NodeState.GAIN]
+    bias_x = node.point[NodeState.BIAS_X]
+    bias_y = node.point[NodeState.BIAS_Y]
+    force = node.force
+    slip_at_force = node.slip_at_force
     moment = 0.0
     for wheel in range(4):
         along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
-        mu, other = side_mu[wheel % 2], side_mu[1 - wheel % 2]
+        mu = side_mu[wheel % 2]
+        other = side_mu[1 - wheel % 2]
         force[wheel] = along
         if other != mu and features.force_unit[wheel] != 0.0:
             force[wheel] = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
@@ -187,7 +192,8 @@ def correct_forces(
             moment -= lever * features.loads[wheel] * (force[wheel] - along)
     turning = moment / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     for axle in range(2):
-        left, right = 2 * axle, 2 * axle + 1
+        left = 2 * axle
+        right = 2 * axle + 1
         side = (
             features.side[axle]
             + leak * features.side_leak[axle]
@@ -198,7 +204,8 @@ def correct_forces(
         across = 0.0 if math.isnan(side) else side
         mean_along = mean_mu = 0.0
         for wheel in range(left, right + 1):
-            mu, share = side_mu[wheel % 2], features.load_share[wheel]
+            mu = side_mu[wheel % 2]
+            share = features.load_share[wheel]
             mean_along += share * force[wheel]
             mean_mu += share * mu
             force[wheel] -= shape * node.shape_force[wheel]
@@ -241,11 +248,14 @@ def find_residuals(
     out: FloatArray,
 ) -> None:
     """out (6,) = e of each row at node.slip and node.force; NaN where its readings are missing."""
-    slip, force, slip_at_force = node.slip, node.force, node.slip_at_force
+    slip = node.slip
+    force = node.force
+    slip_at_force = node.slip_at_force
     for axle in range(2):
         side_model = side_slip = 0.0
         for wheel in range(2 * axle, 2 * axle + 2):
-            g_x, g_y = slip.along[wheel], slip.across[wheel]
+            g_x = slip.along[wheel]
+            g_y = slip.across[wheel]
             theta = math.sqrt(g_x * g_x + g_y * g_y) / side_mu[wheel % 2]
             ratio = ratio_at(curve, theta)
             share = features.load_share[wheel]

@@ -21,10 +21,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-REST_M_S, REST_V_STD = (
-    0.1,
-    0.05,
-)  # [m/s] wheels that turn slower at the first sample are those of a car at rest
+# [m/s] wheels that turn slower at the first sample are those of a car at rest
+REST_M_S = 0.1
+REST_V_STD = 0.05
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
@@ -34,11 +33,10 @@ ALIKE = 0.03  # relative difference of their speeds
 FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
 LEAST_ROLLING_M_S = 0.5  # slower wheels may be locked
 LOST_SPREAD_M_S = 5.0
-FAR_M_S, FAR_SHARE, FAR_SPREADS = (
-    0.7,
-    0.04,
-    2.0,
-)  # of the speed that agreeing wheels tell: beyond, the motion is lost
+# of the speed that agreeing wheels tell: beyond, the motion is lost
+FAR_M_S = 0.7
+FAR_SHARE = 0.04
+FAR_SPREADS = 2.0
 # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 SLOWEST_M_S = 1.5
 
@@ -50,7 +48,9 @@ def start(
     """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
     if not math.isfinite(time):
         return flags.TIME_GAP
-    last, now, block = memory.last, memory.last.now, memory.block
+    last = memory.last
+    now = memory.last.now
+    block = memory.block
     believe(sample, now)
     refuse_jumps(memory.row, now)
     last.time = block.time = time
@@ -81,7 +81,9 @@ def start(
         memory.drive_odds[kind] = FIRST_ODDS[kind]
     rolling = memory.rolling
     rolling.moved_time = -math.inf if speed == 0.0 else time
-    rolling.disagreed_time, rolling.ahead, rolling.left = time, math.nan, math.nan
+    rolling.disagreed_time = time
+    rolling.ahead = math.nan
+    rolling.left = math.nan
     rolling.resting_ax = now[S.AX]
     begin_excitation(memory.excitation)
     memory.trust.strain = 1.0
@@ -92,7 +94,8 @@ def start(
 @compiled
 def forget_vehicle(memory: MixtureMemory) -> None:
     """The overall moments of what is a property of vehicle or sensor become those of its prior."""
-    nominal, covariance = memory.nominal, memory.overall_covariance
+    nominal = memory.nominal
+    covariance = memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         memory.overall_mean[i] = nominal.mean[i]
         for j in range(i + 1):
@@ -137,7 +140,9 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 @compiled
 def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the motion starts anew."""
-    last, now, prior = memory.last, memory.last.now, design.prior
+    last = memory.last
+    now = memory.last.now
+    prior = design.prior
     hazard = 1.0 - math.exp(-abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.hazard)
     put_split_to_sleep(memory)
     for j in range(NODES):
@@ -148,7 +153,8 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     )
     rate = now[S.YAW_RATE]
     if not math.isnan(rate):
-        last.yaw_rate, last.yaw_rate_var = rate, YAW_STD**2
+        last.yaw_rate = rate
+        last.yaw_rate_var = YAW_STD**2
     for wheel in range(4):
         last.omega[wheel] = now[S.OMEGA + wheel]
     return flags.RESET

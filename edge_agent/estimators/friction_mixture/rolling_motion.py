@@ -43,16 +43,25 @@ FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to fo
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Renew memory.rolling by the block."""
-    rolling, row, time = memory.rolling, memory.row, memory.last.time
+    rolling = memory.rolling
+    row = memory.row
+    time = memory.last.time
     rolling.ahead = rolling.left = math.nan
-    least, most, total, seen, step = math.inf, -math.inf, 0.0, 0, 0.0
+    least = math.inf
+    most = -math.inf
+    total = 0.0
+    seen = 0
+    step = 0.0
     fastest = 0.0
     for wheel in range(4):
         speed = features.rolling[wheel]
         if math.isnan(speed):
             continue
         ahead = at_centre(row, features, wheel)
-        least, most, total, seen = min(least, ahead), max(most, ahead), total + ahead, seen + 1
+        least = min(least, ahead)
+        most = max(most, ahead)
+        total = total + ahead
+        seen = seen + 1
         fastest = max(fastest, abs(speed))
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
     still = seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
@@ -78,7 +87,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
 def _stand(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, still: bool
 ) -> None:
-    rolling, time = memory.rolling, memory.last.time
+    rolling = memory.rolling
+    time = memory.last.time
     if not still or math.isnan(rolling.resting_ax):
         rolling.resting_ax = features.change
     if not still:
@@ -97,7 +107,8 @@ def _tell(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
 ) -> None:
     """Velocities that wheels at `middle` [m/s] tell, and their spreads."""
-    rolling, row = memory.rolling, memory.row
+    rolling = memory.rolling
+    row = memory.row
     pull = features.change / GRAVITY
     slip = pull / row[Parameter.SLOPE_X]
     share = (
@@ -123,14 +134,18 @@ def _tell(
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
     """Take what the wheels tell of the motion into node j; returns what its disagreement costs it [nat]."""
-    rolling, constants, features = memory.rolling, design.constants, scratch.features
+    rolling = memory.rolling
+    constants = design.constants
+    features = scratch.features
     mean = memory.mean[j]
     if rolling.stands:
         variance = STANDING_STD**2
         _take_velocity(memory, scratch, j, (1.0, 0.0), (-mean[NodeState.VX], variance, math.inf))
         _take_velocity(memory, scratch, j, (0.0, 1.0), (-mean[NodeState.VY], variance, math.inf))
         return 0.0
-    cost, cos, sin = 0.0, features.cos, features.sin
+    cost = 0.0
+    cos = features.cos
+    sin = features.sin
     look = max(constants.agreeing_look / features.duration, 1.0)
     if not math.isnan(rolling.ahead):
         now = (
@@ -160,7 +175,8 @@ def _take_velocity(
     reading: tuple[float, float, float],
 ) -> float:
     """Take in a velocity along `direction` (x, y): (innovation, variance, huber); half its normalised square."""
-    root, row = scratch.root[j], scratch.velocity_row
+    root = scratch.root[j]
+    row = scratch.velocity_row
     innovation, variance, huber = reading
     own = 0.0
     for k in range(row.shape[0]):

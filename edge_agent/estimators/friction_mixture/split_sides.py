@@ -44,7 +44,8 @@ class Triangle(NamedTuple):
 def triangles(edges: tuple[float, ...]) -> list[Triangle]:
     """One per cell, about its middle; the outermost end at the outer edges."""
     middles = [0.5 * (a + b) for a, b in pairwise(edges)]
-    lefts, rights = [edges[0], *middles[:-1]], [*middles[1:], edges[-1]]
+    lefts = [edges[0], *middles[:-1]]
+    rights = [*middles[1:], edges[-1]]
     widths = [b - a for a, b in pairwise(edges)]
     return [Triangle(*row) for row in zip(lefts, middles, rights, widths, strict=True)]
 
@@ -52,7 +53,9 @@ def triangles(edges: tuple[float, ...]) -> list[Triangle]:
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
     """All nodes, where a share `split_prior` of the roads has unlike sides; mu and prior (K,)."""
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
-    pairs, mass, share = [], [], []
+    pairs = []
+    mass = []
+    share = []
     for low, high in (
         (a, b) for a in triangles(LOW) for b in triangles(HIGH) if b.middle > LEAST_RATIO * a.middle
     ):

@@ -84,8 +84,12 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 @compiled
 def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Predict all nodes to the end of the block, and renew the moments of the mixture."""
-    block, constants, nominal = memory.block, design.constants, memory.nominal
-    duration, process, keep = scratch.features.duration, scratch.process, scratch.keep
+    block = memory.block
+    constants = design.constants
+    nominal = memory.nominal
+    duration = scratch.features.duration
+    process = scratch.process
+    keep = scratch.keep
     leak = constants.leak_wander * abs(memory.last.ax)
     gyro = constants.gyro_wander * scratch.features.speed
     process[NodeState.VX] = (constants.drift_x**2 + leak**2 + block.missing_x) * duration
@@ -93,7 +97,8 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     process[NodeState.VY] = (
         constants.drift_y**2 + gyro**2 + unsure**2 + block.missing_y
     ) * duration
-    forgets, speed = memory.trust.distrust / constants.distrust_forget, scratch.features.speed
+    forgets = memory.trust.distrust / constants.distrust_forget
+    speed = scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         pace = 1.0 / nominal.time[i] + forgets
         if i == NodeState.SLOPE:
@@ -104,7 +109,8 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
             pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
-    cos, sin = math.cos(block.angle), math.sin(block.angle)
+    cos = math.cos(block.angle)
+    sin = math.sin(block.angle)
     count = awake(memory)
     for j in range(count):
         predict_node(memory, scratch, j, cos, sin)
@@ -152,13 +158,15 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         )
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
-            side.median, side.lower, side.upper = both.median, both.lower, both.upper
+            side.median = both.median
+            side.lower = both.lower
+            side.upper = both.upper
 
 
 @compiled
 def _find_side(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
-) -> None:  # fmt: skip
+) -> None:
     project(memory.weight, design.sides.share[side], scratch.projected)
     alike = likeness(memory.trust, design.constants)
     find_interval(design, scratch.projected, memory.patch, scratch.blended, alike, friction)
@@ -167,8 +175,10 @@ def _find_side(
 @compiled
 def velocity(memory: MixtureMemory) -> tuple[float, float]:
     """(v_x, v_y) [m/s] of the mixture now."""
-    x, angle = memory.overall_mean, memory.block.angle
-    cos, sin = math.cos(angle), math.sin(angle)
+    x = memory.overall_mean
+    angle = memory.block.angle
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     gained_x, gained_y = gained_velocity(memory.block.gain, x)
     return (
         cos * x[NodeState.VX] + sin * x[NodeState.VY] + gained_x,

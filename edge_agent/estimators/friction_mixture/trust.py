@@ -38,10 +38,9 @@ LONGEST_PATIENCE = 600.0  # [s]
 RELAPSE = 4.0  # times as long as the last time
 FORGIVEN_S = 300.0  # in which that is forgotten
 STRAIGHT = 0.6  # [m/s^2] a_y up to which it is tried again: there the wheels tell the motion
-SLOW_FOOT, SLOW_PEAK = (
-    3.0,
-    6.0,
-)  # [m/s] tight turns of parking lie outside the model's range, and test nothing
+# [m/s] tight turns of parking lie outside the model's range, and test nothing
+SLOW_FOOT = 3.0
+SLOW_PEAK = 6.0
 
 
 @compiled
@@ -54,7 +53,8 @@ def judge(
     """
     if not design.adaptive:
         return
-    trust, constants = memory.trust, design.constants
+    trust = memory.trust
+    constants = design.constants
     # by what any car may be: a calibration makes the belief of this one narrower, and contradicts nothing
     cost = belief_cost(memory.overall_mean, design.nominal)
     trust.strain = strain(
@@ -66,7 +66,9 @@ def judge(
     if trust.distrust > 0.0:
         trust.left -= duration
         if trust.left <= 0.0 and abs(memory.last.ay) < STRAIGHT:
-            trust.distrust, trust.odd, trust.ratio = 0.0, 0.0, 0.0
+            trust.distrust = 0.0
+            trust.odd = 0.0
+            trust.ratio = 0.0
             memory.actual[1] = memory.theoretical[1] = 0.0
             memory.factor[1] = 1.0
         return
@@ -80,7 +82,9 @@ def judge(
         trust.odd += CALLED_BACK * constants.odd_least
     if trust.odd >= constants.odd_least:
         trust.patience = min(max(RELAPSE * trust.patience, constants.patience), LONGEST_PATIENCE)
-        trust.left, trust.distrust, trust.odd = trust.patience, 1.0, constants.odd_least
+        trust.left = trust.patience
+        trust.distrust = 1.0
+        trust.odd = constants.odd_least
 
 
 @compiled

@@ -44,8 +44,11 @@ def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray)
     """Keep the surest belief; where friction has jumped, write what the part that ends told (32,) and begin another."""
     if memory.split:
         return
-    w, s, p = memory.visit_weight[:NODES], memory.surest, design.prior
-    known, most = 0.0, 0.0
+    w = memory.visit_weight[:NODES]
+    s = memory.surest
+    p = design.prior
+    known = 0.0
+    most = 0.0
     for j in range(NODES):
         known += w[j] * math.log(w[j] / p[j])
         most = max(most, s[j] / p[j])

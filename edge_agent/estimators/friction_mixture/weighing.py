@@ -47,9 +47,13 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     count = awake(memory)
     for group in range(2):
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
-    scratch.stated_sum, surplus = 0.0, 1.0 - 1.0 / scratch.features.axle_scale
-    top, nis, rows = -math.inf, 0.0, 0
-    features, steady = scratch.features, design.constants.steady_share
+    scratch.stated_sum = 0.0
+    surplus = 1.0 - 1.0 / scratch.features.axle_scale
+    top = -math.inf
+    nis = 0.0
+    rows = 0
+    features = scratch.features
+    steady = design.constants.steady_share
     features.new = novelty(memory.usual_force, features, design.constants)
     features.novelty = steady + (1.0 - steady) * features.new
     for j in range(count):
@@ -58,7 +62,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
         scratch.log_likelihood[j] = found.log_likelihood - take_rolling(memory, design, scratch, j)
         scratch.moved[j] = found.moved
         scratch.joint[j] = found.plain + math.log(memory.weight[j])
-        top, rows = max(top, scratch.joint[j]), found.rows
+        top = max(top, scratch.joint[j])
+        rows = found.rows
         nis += memory.weight[j] * found.square
         for r in range(6):
             if not math.isnan(scratch.innovation[j, r]):
@@ -82,7 +87,8 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
     What falls short of the grip in use pays whatever the demand; nothing is concluded at full distrust. Without
     accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
     """
-    constants, features = design.constants, scratch.features
+    constants = design.constants
+    features = scratch.features
     count = awake(memory)
     best = -math.inf
     for j in range(count):
@@ -157,6 +163,9 @@ def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> Non
             )
             if design.adaptive:
                 memory.factor[group] = adapted(
-                    memory.factor[group], memory.actual[group], memory.theoretical[group],
-                    design.fuzzy_inputs, design.fuzzy_outputs,
-                )  # fmt: skip
+                    memory.factor[group],
+                    memory.actual[group],
+                    memory.theoretical[group],
+                    design.fuzzy_inputs,
+                    design.fuzzy_outputs,
+                )

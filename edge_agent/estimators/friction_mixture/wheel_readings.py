@@ -14,7 +14,9 @@ from schemas.signals import S
 SPINS_M_S = 20.0  # faster than the second slowest wheel by more is a decoding error (512 km/h were met), not a spin
 SAME_RAD_S = 0.02  # a reading that changes by less is the same
 HELD = 3  # readings that were the same before a change is a step, and not noise
-STEP_LEAST, STEP_MOST = 0.05, 2.0  # [rad/s] steps that are met: 1 km/h is .9
+# [rad/s] steps that are met: 1 km/h is .9
+STEP_LEAST = 0.05
+STEP_MOST = 2.0
 STEP_PACE = 0.1  # share of a new step in the mean
 
 

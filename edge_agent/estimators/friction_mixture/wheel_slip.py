@@ -18,8 +18,12 @@ from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 
 SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like slip
-APART_FOOT, APART_PEAK = 0.04, 0.08  # of the speed, between two wheels: may slide, slides
-SPIN_FOOT, SPIN_PEAK = 6.0, 12.0  # [m/s^2] of a wheel beyond the car's: may slide, slides
+# of the speed, between two wheels: may slide, slides
+APART_FOOT = 0.04
+APART_PEAK = 0.08
+# [m/s^2] of a wheel beyond the car's: may slide, slides
+SPIN_FOOT = 6.0
+SPIN_PEAK = 12.0
 SEEN = 0.3  # membership from which slip counts as having begun
 # [s] beside the time that the rear axle needs to reach the place of the front axle
 REAR_LAG_S = 0.1

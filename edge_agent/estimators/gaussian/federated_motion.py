@@ -33,19 +33,20 @@ from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
 from schemas.signals import S
 
-STATES, ROWS = 6, 4
+STATES = 6
+ROWS = 4
 RULE = cubature(STATES)
-XI, WEIGHT = RULE.xi, RULE.w_cov
+XI = RULE.xi
+WEIGHT = RULE.w_cov
 STEP_S = 0.02  # process variances are per so much time
 # variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque does not know, and the
 # error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
 PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
 START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
-SPEED_STD, SPEED_SHARE, SLIP_SHARE = (
-    0.03,
-    0.003,
-    0.3,
-)  # [m/s], radius, and how wrong the slip of a force is
+# [m/s], radius, and how wrong the slip of a force is
+SPEED_STD = 0.03
+SPEED_SHARE = 0.003
+SLIP_SHARE = 0.3
 FARTHEST = 2.0  # innovations in standard deviations beyond which the wheels' speed is trusted less
 LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
 
@@ -111,8 +112,10 @@ def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
 @compiled
 def begin_motion(memory: FederatedMemory) -> None:
     """Begin at the speed of the wheels."""
-    motion, use = memory.motion, memory.track.inputs
-    mean, root = motion.mean, motion.root
+    motion = memory.motion
+    use = memory.track.inputs
+    mean = motion.mean
+    root = motion.root
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
     mean[:] = 0.0
@@ -130,10 +133,16 @@ def begin_motion(memory: FederatedMemory) -> None:
 @compiled
 def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> None:
     """Share, predict by `dt` [s] and update in both sub-filters, and fuse; friction (4,) is given."""
-    motion, track, row = memory.motion, memory.track, memory.row
-    root, process = np.empty((STATES, STATES)), np.zeros((STATES, STATES))
-    mean, first_mean, first_root = np.empty(STATES), np.empty(STATES), np.empty((STATES, STATES))
-    points, work = np.empty((2 * STATES, STATES)), np.empty((2 * STATES, 4 * STATES))
+    motion = memory.motion
+    track = memory.track
+    row = memory.row
+    root = np.empty((STATES, STATES))
+    process = np.zeros((STATES, STATES))
+    mean = np.empty(STATES)
+    first_mean = np.empty(STATES)
+    first_root = np.empty((STATES, STATES))
+    points = np.empty((2 * STATES, STATES))
+    work = np.empty((2 * STATES, 4 * STATES))
     columns = np.empty((STATES, POINTS))
     memory.nis = memory.log_likelihood = 0.0
     for sub in range(2):
@@ -155,10 +164,18 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
 
 @compiled
 def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
-    motion, track, row, sub = memory.motion, memory.track, memory.row, at.number
-    points, mean, root = at.points, at.mean, at.root
-    outcomes, predicted, std = np.empty((2 * STATES, ROWS)), np.empty(ROWS), np.empty(ROWS)
-    state, measured = np.empty((STATES, 2 * STATES)), np.empty((ROWS, 2 * STATES))
+    motion = memory.motion
+    track = memory.track
+    row = memory.row
+    sub = at.number
+    points = at.points
+    mean = at.mean
+    root = at.root
+    outcomes = np.empty((2 * STATES, ROWS))
+    predicted = np.empty(ROWS)
+    std = np.empty(ROWS)
+    state = np.empty((STATES, 2 * STATES))
+    measured = np.empty((ROWS, 2 * STATES))
     axis_points(mean, root, XI, points)
     for p in range(points.shape[0]):
         for r in range(3):
@@ -195,7 +212,9 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
 @compiled
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
     """Mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x, v_y, ..., x[yaw_rate]."""
-    total, count, use = 0.0, 0, track.inputs
+    total = 0.0
+    count = 0
+    use = track.inputs
     for wheel in range(4):
         if not math.isnan(use[S.OMEGA + wheel]):
             total += wheel_velocity(row, wheel, x[0], x[1], x[yaw_rate], use[S.DELTA + wheel])[0]
@@ -214,7 +233,9 @@ def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[floa
     """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN without any wheel."""
     use = track.inputs
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
-    total, most, count = 0.0, 0.0, 0
+    total = 0.0
+    most = 0.0
+    count = 0
     for wheel in range(4):
         omega = use[S.OMEGA + wheel]
         if math.isnan(omega):

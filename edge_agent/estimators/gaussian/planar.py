@@ -85,11 +85,14 @@ def carry(
     if by_motor:
         force_x = _motor_forces(row, track, dt)
     mu = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if by_torque else unknown
-    before, use = track.inputs_before, track.inputs
-    cos, sin = four(track.steering_before[0]), four(track.steering_before[1])
+    before = track.inputs_before
+    use = track.inputs
+    cos = four(track.steering_before[0])
+    sin = four(track.steering_before[1])
     begin = WheelInputs(cos, sin, four(before[S.OMEGA : S.TORQUE]), force_x, mu)
     for k in range(times):
-        cos, sin = four(track.steering[0]), four(track.steering[1])
+        cos = four(track.steering[0])
+        sin = four(track.steering[1])
         end = WheelInputs(cos, sin, four(use[S.OMEGA : S.TORQUE]), force_x, mu)
         if k + 1 < times:
             end = _between(track, (k + 1) / times, force_x, mu)
@@ -103,23 +106,28 @@ def carry(
 def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs) -> None:
     """One of Heun's steps of the columns [first, last), in place. Arithmetic alone: the points go side by side."""
     begin, end, step, by_torque = drive
-    column_v, column_u, column_x, column_y = columns[0], columns[1], columns[2], columns[3]
-    column_r, column_z = columns[4], columns[5]
+    column_v = columns[0]
+    column_u = columns[1]
+    column_x = columns[2]
+    column_y = columns[3]
+    column_r = columns[4]
+    column_z = columns[5]
     for p in range(first, last):
-        v, u, ax, ay, r, z = (
-            column_v[p],
-            column_u[p],
-            column_x[p],
-            column_y[p],
-            column_r[p],
-            column_z[p],
-        )
+        v = column_v[p]
+        u = column_u[p]
+        ax = column_x[p]
+        ay = column_y[p]
+        r = column_r[p]
+        z = column_z[p]
         one = min(max(z, LOWER), UPPER)
         mu = begin.mu if by_torque else (one, one, one, one)
         _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with(begin, mu))
         turn = z if by_torque else turn
-        slope_x, slope_y = ax + r * u, ay - r * v
-        ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
+        slope_x = ax + r * u
+        slope_y = ay - r * v
+        ahead = v + step * slope_x
+        aside = u + step * slope_y
+        rate = r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
         felt_x, felt_y, again = response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu)
@@ -150,16 +158,15 @@ def _with(wheels: WheelInputs, mu: Four) -> WheelInputs:
 @inlined
 def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
     """Inputs at a share of the way from the sample before to this one."""
-    before, use = track.inputs_before, track.inputs
-    keep, delta, omega = 1.0 - share, S.DELTA, S.OMEGA
-    fl, fr = (
-        keep * before[delta] + share * use[delta],
-        keep * before[delta + 1] + share * use[delta + 1],
-    )
-    rl, rr = (
-        keep * before[delta + 2] + share * use[delta + 2],
-        keep * before[delta + 3] + share * use[delta + 3],
-    )
+    before = track.inputs_before
+    use = track.inputs
+    keep = 1.0 - share
+    delta = S.DELTA
+    omega = S.OMEGA
+    fl = keep * before[delta] + share * use[delta]
+    fr = keep * before[delta + 1] + share * use[delta + 1]
+    rl = keep * before[delta + 2] + share * use[delta + 2]
+    rr = keep * before[delta + 3] + share * use[delta + 3]
     return WheelInputs(
         (math.cos(fl), math.cos(fr), math.cos(rl), math.cos(rr)),
         (math.sin(fl), math.sin(fr), math.sin(rl), math.sin(rr)),
@@ -185,7 +192,9 @@ def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
 @inlined
 def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
     """Half of the force [N] of the axle whose left wheel is `first`."""
-    use, before, omega = track.inputs, track.inputs_before, S.OMEGA + first
+    use = track.inputs
+    before = track.inputs_before
+    omega = S.OMEGA + first
     now = midpoint_speed(use[omega], use[omega + 1])
     then = midpoint_speed(before[omega], before[omega + 1])
     turning = (now - then) / dt
@@ -198,6 +207,8 @@ def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
 def _forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
     """Longitudinal forces [N] from the wheels' torque."""
     return (
-        wheel_force(row, track, 0, dt), wheel_force(row, track, 1, dt),
-        wheel_force(row, track, 2, dt), wheel_force(row, track, 3, dt),
-    )  # fmt: skip
+        wheel_force(row, track, 0, dt),
+        wheel_force(row, track, 1, dt),
+        wheel_force(row, track, 2, dt),
+        wheel_force(row, track, 3, dt),
+    )

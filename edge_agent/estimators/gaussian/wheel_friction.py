@@ -26,10 +26,16 @@ SIDE_CORRELATION = 0.9
 
 def prior_root() -> FloatArray:
     """Factor (4, 4) of P_0: wheels of a side alike but for a trace, sides correlated; wheel order fl, fr, rl, rr."""
-    same, other = 0.99, SIDE_CORRELATION
-    correlation = np.array([
-        [1.0, other, same, other], [other, 1.0, other, same], [same, other, 1.0, other], [other, same, other, 1.0],
-    ])  # fmt: skip
+    same = 0.99
+    other = SIDE_CORRELATION
+    correlation = np.array(
+        [
+            [1.0, other, same, other],
+            [other, 1.0, other, same],
+            [same, other, 1.0, other],
+            [other, same, other, 1.0],
+        ]
+    )
     return np.asarray(PRIOR_MU_STD * np.linalg.cholesky(correlation))
 
 
@@ -71,7 +77,8 @@ def visible_share(demand: float) -> float:
 @compiled
 def mean_friction(mean: FloatArray, root: FloatArray, first: int) -> tuple[float, float]:
     """(mean of the four frictions from state `first` on, its standard deviation)."""
-    total, square = 0.0, 0.0
+    total = 0.0
+    square = 0.0
     for j in range(first + 4):
         column = 0.0
         for i in range(first, first + 4):

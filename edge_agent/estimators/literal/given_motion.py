@@ -61,7 +61,8 @@ class GivenMotion:
         """Return the loads of the wheels [N], (T, 4), at the measured accelerations (9)."""
         row = self.row
         p = Parameter
-        ax, ay = self.signals[:, S.AX], self.signals[:, S.AY]
+        ax = self.signals[:, S.AX]
+        ay = self.signals[:, S.AY]
         base = row[p.TO_FRONT] + row[p.TO_REAR]
         weight = row[p.MASS] * GRAVITY
         pitch = row[p.MASS] * row[p.CG_HEIGHT] / base * ax

@@ -43,9 +43,12 @@ class WheelForces:
     def of(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
         """Prepare the drive; single: in single precision."""
         kind: Any = np.float32 if single else np.float64
-        row, p = given.row, Parameter
-        half_front, half_rear = 0.5 * row[p.TRACK_FRONT], 0.5 * row[p.TRACK_REAR]
-        front, rear = row[p.TO_FRONT], -row[p.TO_REAR]
+        row = given.row
+        p = Parameter
+        half_front = 0.5 * row[p.TRACK_FRONT]
+        half_rear = 0.5 * row[p.TRACK_REAR]
+        front = row[p.TO_FRONT]
+        rear = -row[p.TO_REAR]
         places = np.array(
             [[front, half_front], [front, -half_front], [rear, half_rear], [rear, -half_rear]]
         )
@@ -87,7 +90,8 @@ class WheelForces:
     def accelerations(self, k: int, force: FloatArray) -> FloatArray:
         """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at
         sample `k`."""
-        cos, sin = self.turned[k, :, 0], self.turned[k, :, 1]
+        cos = self.turned[k, :, 0]
+        sin = self.turned[k, :, 1]
         ahead = cos * force[..., 0] - sin * force[..., 1]
         left = sin * force[..., 0] + cos * force[..., 1]
         moment = (self.places[:, 0] * left - self.places[:, 1] * ahead).sum(axis=-1)

@@ -177,7 +177,8 @@ def _covariance_step(
     points = model.points(mean, root)
     outcomes = model.outcomes(k, points)
     predicted = model.mean_weights @ outcomes
-    off, apart = points - mean, outcomes - predicted
+    off = points - mean
+    apart = outcomes - predicted
     weighted = model.cov_weights[:, None] * apart
     expected = weighted.T @ apart + model.noise_root**2
     cross = (model.cov_weights[:, None] * off).T @ apart

@@ -117,7 +117,8 @@ def _moved(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) ->
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     share = np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)
-    before, behind = values[after - 1], values[after]
+    before = values[after - 1]
+    behind = values[after]
     nearest = np.where(share < 0.5, before, behind)
     between = before + share * (behind - before)
     return np.where(np.isfinite(between) & (not angle), between, nearest)

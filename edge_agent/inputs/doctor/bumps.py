@@ -69,7 +69,8 @@ def _direction(front: FloatArray, rear: FloatArray, fast: BoolArray, wheelbase: 
     if among.sum() * STEP_M < LEAST_M or front[among].std() == 0.0 or rear[among].std() == 0.0:
         return 0
     limits = CLIPPED * front[among].std(), CLIPPED * rear[among].std()
-    front, rear = np.clip(front, -limits[0], limits[0]), np.clip(rear, -limits[1], limits[1])
+    front = np.clip(front, -limits[0], limits[0])
+    rear = np.clip(rear, -limits[1], limits[1])
     lags = np.arange(-most, most + 1)
     like = np.array(
         [float(np.corrcoef(front[among], np.roll(rear, -lag)[among])[0, 1]) for lag in lags]

@@ -76,7 +76,8 @@ def even(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
     good = np.isfinite(x)
     if good.sum() < 2:
         return np.full(len(at), np.nan)
-    known, values = t[good], x[good]
+    known = t[good]
+    values = x[good]
     place = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
     near = (known[place] - known[place - 1] <= JOINED_S) & (at >= known[0]) & (at <= known[-1])
     return np.where(near, np.interp(at, known, values), np.nan)
@@ -91,12 +92,11 @@ def over_ground(
         np.radians(np.nanmean(latitude))
     )
     half = round(0.5 * FIX_S * RATE_HZ)
-    speed, course = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    speed = np.full(len(at), np.nan)
+    course = np.full(len(at), np.nan)
     if len(at) > 2 * half:
-        d_east, d_north = (
-            east[2 * half :] - east[: -2 * half],
-            north[2 * half :] - north[: -2 * half],
-        )
+        d_east = east[2 * half :] - east[: -2 * half]
+        d_north = north[2 * half :] - north[: -2 * half]
         speed[half:-half] = np.hypot(d_east, d_north) / FIX_S
         course[half:-half] = np.arctan2(d_north, d_east)
     return speed, course
@@ -146,15 +146,24 @@ def prepare(
     yaw_at = even(t, np.unwrap(yaw), at) if np.isfinite(yaw).all() else _yaw(t, yaw, at)
     delta = signals[:, S.DELTA]
     return EvenDrive(
-        t=at, ax=column(S.AX), ay=column(S.AY), r=column(S.YAW_RATE),
-        delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)), wheels=rims, v=v,
-        r_wheels=r_wheels, v_ground=v_ground, course=course, course_yaw=yaw_at,
+        t=at,
+        ax=column(S.AX),
+        ay=column(S.AY),
+        r=column(S.YAW_RATE),
+        delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)),
+        wheels=rims,
+        v=v,
+        r_wheels=r_wheels,
+        v_ground=v_ground,
+        course=course,
+        course_yaw=yaw_at,
         moving=((np.abs(v) > CREEP * fast) & ~slipping(raw, fast)).astype(float),
         grips=(~left_ground(v, v_ground, fast)).astype(float),
         wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
         torque=smooth(even(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)),
-        yaw_front=axles[0], yaw_rear=axles[1],
-    )  # fmt: skip
+        yaw_front=axles[0],
+        yaw_rear=axles[1],
+    )
 
 
 def slipping(wheels: FloatArray, fast: float) -> BoolArray:

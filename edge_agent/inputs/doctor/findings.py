@@ -40,22 +40,25 @@ from schemas.vehicle import Vehicle
 
 # beyond these a constant error is a fault and not the ordinary tilt or zero of a device (std met: .35, .15 m/s^2,
 # .003 rad/s, .003 to .015 rad; radii .15 to 1.6 % apart)
-LARGEST_AX, LARGEST_AY = 1.3, 0.75  # [m/s^2]
+# [m/s^2]
+LARGEST_AX = 1.3
+LARGEST_AY = 0.75
 LARGEST_RATE = 0.02  # [rad/s]
 LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
 JUMPS = 0.01  # share of readings that may jump off the other wheels
-SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
-LARGEST_AX_FAR, AVERAGED_M = (
-    0.9,
-    300.0,
-)  # [m/s^2] and the way over which slopes average to less than 8 %
-CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
+SLOWEST_HZ = 5.0
+FASTEST_HZ = 2000.0
+# [m/s^2] and the way over which slopes average to less than 8 %
+LARGEST_AX_FAR = 0.9
+AVERAGED_M = 300.0
+# [m/s^2] up to which wheels hardly slip, on ice too
+CALM = 0.5
+CALM_ACROSS = 0.5
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
-TIGHT, TIGHT_S = (
-    0.015,
-    1.5,
-)  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
+# (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
+TIGHT = 0.015
+TIGHT_S = 1.5
 FEWEST_OFFSET_S: Final = 8.0
 NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
@@ -101,7 +104,8 @@ def diagnose(
         drive = replace(drive, r_wheels=drive.yaw_front)
     found = fits(drive)
     verdict = explain(found, vehicle)
-    diagnosis.fits, diagnosis.drive = found, drive
+    diagnosis.fits = found
+    diagnosis.drive = drive
     _scales(verdict, found, diagnosis)
     scaled = any(
         fault is not None for fault in verdict.faults.values()
@@ -191,18 +195,21 @@ def _axes_exchanged(drive: EvenDrive) -> bool:
             return 0.0
         return abs(float(np.corrcoef(x[good], y[good])[0, 1]))
 
-    along, across = drive.v_dot, drive.v * drive.r
+    along = drive.v_dot
+    across = drive.v * drive.r
     right = alike(drive.ax, along) + alike(drive.ay, across)
     return alike(drive.ax, across) + alike(drive.ay, along) > right + 0.5
 
 
 WORDS: Final = {
-    "ax": "a_x is {gain:.3g} of the wheels' acceleration", "ay": "a_y is {gain:.3g} of v·r",
+    "ax": "a_x is {gain:.3g} of the wheels' acceleration",
+    "ay": "a_y is {gain:.3g} of v·r",
     "r": "a_y is {lateral:.3g} of v·r, the wheels' yaw rate {axle:.3g} of it",
     "delta": "steering is {gain:.3g} of L·r/v",
     "v": "the wheels go {wheels:.3g} times the speed that everything else tells",
-    "sides": "left and right wheels differ by {gain:.3g} of track·r", "place": "the course turns by {gain:.3g} of r",
-}  # fmt: skip
+    "sides": "left and right wheels differ by {gain:.3g} of track·r",
+    "place": "the course turns by {gain:.3g} of r",
+}
 ASKED: Final = {
     "ax": "longitudinal",
     "ay": "lateral",
@@ -335,7 +342,8 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
 
 def _axles(drive: EvenDrive) -> list[Finding]:
     """Front wheels go the longer way in a turn: v_f² = v_r² + (L r)²."""
-    front, rear = drive.wheels[:, :2].mean(axis=1), drive.wheels[:, 2:].mean(axis=1)
+    front = drive.wheels[:, :2].mean(axis=1)
+    rear = drive.wheels[:, 2:].mean(axis=1)
     good = (
         (drive.moving > 0)
         & np.isfinite(front)
@@ -348,7 +356,8 @@ def _axles(drive: EvenDrive) -> list[Finding]:
     tight = good & (turn > TIGHT)
     if tight.sum() < TIGHT_S * RATE_HZ:
         return []
-    x, y = 0.5 * turn[good], front[good] / rear[good] - 1.0
+    x = 0.5 * turn[good]
+    y = front[good] / rear[good] - 1.0
     table = np.stack([x, np.ones(len(x))], axis=1)
     solution = robust(table, y)
     spread = 1.4826 * float(np.median(np.abs(y - table @ solution)))
@@ -363,7 +372,9 @@ def _axles(drive: EvenDrive) -> list[Finding]:
 def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     """Return constant errors that are beyond the largest usual one by SURE standard deviations."""
     moving = drive.moving > 0
-    lateral, axle, steering = found["lateral"], found["axle"], found["steering"]
+    lateral = found["lateral"]
+    axle = found["axle"]
+    steering = found["steering"]
     listed: list[
         tuple[str, float, float, float, str]
     ] = []  # channel, value, its error, largest, unit

@@ -12,17 +12,24 @@ from schemas.signals import per_wheel
 from schemas.vehicle import Vehicle
 
 OF_DEVICE: Final = {
-    "imu": ("ax", "ay", "yaw_rate"), "gyro": ("yaw_rate",), "steering": per_wheel("delta"),
-    "wheels": per_wheel("omega"), "receiver": ("latitude", "longitude", "yaw"),
-    "delta": per_wheel("delta"), "omega": per_wheel("omega"),
-}  # fmt: skip
+    "imu": ("ax", "ay", "yaw_rate"),
+    "gyro": ("yaw_rate",),
+    "steering": per_wheel("delta"),
+    "wheels": per_wheel("omega"),
+    "receiver": ("latitude", "longitude", "yaw"),
+    "delta": per_wheel("delta"),
+    "omega": per_wheel("omega"),
+}
 LEFT_RIGHT: Final = (("omega_fl", "omega_fr"), ("omega_rl", "omega_rr"))
 FRONT_REAR: Final = (("omega_fl", "omega_rl"), ("omega_fr", "omega_rr"))
 EXCHANGED: Final = {
-    "exchanged with ay": (("ax", "ay"),), "exchanged with longitude": (("latitude", "longitude"),),
-    "left and right exchanged": LEFT_RIGHT, "front left and right exchanged": LEFT_RIGHT[:1],
-    "rear left and right exchanged": LEFT_RIGHT[1:], "front and rear exchanged": FRONT_REAR,
-}  # fmt: skip
+    "exchanged with ay": (("ax", "ay"),),
+    "exchanged with longitude": (("latitude", "longitude"),),
+    "left and right exchanged": LEFT_RIGHT,
+    "front left and right exchanged": LEFT_RIGHT[:1],
+    "rear left and right exchanged": LEFT_RIGHT[1:],
+    "front and rear exchanged": FRONT_REAR,
+}
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
@@ -45,7 +52,8 @@ def fixed(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
     """Profile and vehicle with what the findings say, and the findings that nobody can mend from here."""
-    channels, left = dict(profile.channels), list[Finding]()
+    channels = dict(profile.channels)
+    left = list[Finding]()
     update: dict[str, object] = {}
     for finding in findings:
         if finding.kind in EXCHANGED:
@@ -72,10 +80,13 @@ def fixed(
 
 
 def _corrected(channel: Channel, finding: Finding) -> Channel:
-    return channel.model_copy(update={
-        "scale": channel.scale * finding.scale, "offset": channel.offset * finding.scale + finding.offset,
-        "delay_s": channel.delay_s + finding.delay_s,
-    })  # fmt: skip
+    return channel.model_copy(
+        update={
+            "scale": channel.scale * finding.scale,
+            "offset": channel.offset * finding.scale + finding.offset,
+            "delay_s": channel.delay_s + finding.delay_s,
+        }
+    )
 
 
 def _yaw(channel: Channel, kind: str) -> Channel:

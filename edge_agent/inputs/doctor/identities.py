@@ -24,15 +24,13 @@ LONGEST_LAG_S: Final = 1.0
 FEWEST_S: Final = 8.0  # of excitation, below which nothing is said
 SLOW_SHARE: Final = 0.3  # of the regressor's 95 % size, from which on a moment counts as excited
 LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
-APART_S, RIVAL = (
-    0.3,
-    0.85,
-)  # another peak of the correlation that far off, as high as that share, leaves no lag known
+# another peak of the correlation that far off, as high as that share, leaves no lag known
+APART_S = 0.3
+RIVAL = 0.85
 PARTS: Final = 8  # of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
-USUAL_BEND, BEND_SPREAD = (
-    0.3,
-    0.4,
-)  # understeer's share of the steering at the drive's fast speed: mean and std of cars
+# understeer's share of the steering at the drive's fast speed: mean and std of cars
+USUAL_BEND = 0.3
+BEND_SPREAD = 0.4
 BENDS: Final = np.linspace(-0.3, 1.8, 22)  # shares that are tried
 # [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
 UNLIKE_RADII: Final = 0.004
@@ -122,9 +120,13 @@ def _turning(d: EvenDrive) -> Relation:
 
 
 IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
-    "lateral": _lateral, "longitudinal": _longitudinal, "steering": _steering, "axle": _axle, "ground": _ground,
+    "lateral": _lateral,
+    "longitudinal": _longitudinal,
+    "steering": _steering,
+    "axle": _axle,
+    "ground": _ground,
     "turning": _turning,
-}  # fmt: skip
+}
 
 
 def fits(drive: EvenDrive) -> dict[str, Fit]:
@@ -161,7 +163,8 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
         good &= np.isfinite(other)
     if good.sum() < FEWEST_S * RATE_HZ:
         return NOTHING
-    x, y = right[good], left[good]
+    x = right[good]
+    y = left[good]
     size = np.percentile(np.abs(x - (0.0 if level else np.median(x))), 95)
     excited = np.ones(len(x), bool) if level else np.abs(x - np.median(x)) > SLOW_SHARE * size
     excited_s = excited.sum() / RATE_HZ
@@ -189,7 +192,8 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     count = max(excited_s / CORRELATED_S, 1.0)
     constant = np.ones(len(x)) if sides.per is None else sides.per[good]
     besides = [other[good] for other in sides.beside]
-    bend, unsure = 0.0, 0.0
+    bend = 0.0
+    unsure = 0.0
     if sides.bend is not None:
         bend, unsure = _bend_of(x, y, constant, sides.bend[good], count)
         x = x * (1.0 + bend * sides.bend[good])
@@ -209,9 +213,19 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
         per_square = float(np.median(sides.bend[good] / np.maximum(np.square(constant), 1e-12)))
         found = (gain * bend * per_square * sides.length,)
     return Fit(
-        gain, float(solution[1]), correlation, float(np.hypot(error, unsure)), excited_s, lag, lag_error, y, x, found,
-        _gains(x, rest, excited), float(errors[1]),
-    )  # fmt: skip
+        gain,
+        float(solution[1]),
+        correlation,
+        float(np.hypot(error, unsure)),
+        excited_s,
+        lag,
+        lag_error,
+        y,
+        x,
+        found,
+        _gains(x, rest, excited),
+        float(errors[1]),
+    )
 
 
 def _bend_of(
@@ -221,7 +235,8 @@ def _bend_of(
 
     Each share is tried: what it leaves of the left side, of `count` independent moments, against what cars have.
     """
-    costs, gains = np.zeros(len(BENDS)), np.zeros(len(BENDS))
+    costs = np.zeros(len(BENDS))
+    gains = np.zeros(len(BENDS))
     for k, share in enumerate(BENDS):
         table = np.stack([x * (1.0 + share * bend), constant], axis=1)
         solution = robust(table, y)
@@ -312,7 +327,8 @@ def _peak(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[floa
     if good.sum() < FEWEST_S * RATE_HZ:
         return 0.0, False
     x, y = (np.where(good, side - np.mean(side[good]), 0.0) for side in (right, left))
-    most, size = round(LONGEST_LAG_S * RATE_HZ), len(x) + round(LONGEST_LAG_S * RATE_HZ)
+    most = round(LONGEST_LAG_S * RATE_HZ)
+    size = len(x) + round(LONGEST_LAG_S * RATE_HZ)
     spectrum = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
     across = np.abs(np.concatenate([spectrum[-most:], spectrum[: most + 1]]))
     scale = np.sqrt(float(np.sum(x * x)) * float(np.sum(y * y)))

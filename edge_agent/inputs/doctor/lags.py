@@ -51,7 +51,8 @@ def lags(
 
     rims = [column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
     v = np.mean(rims, axis=0)
-    gyro, left = column(S.YAW_RATE), signals[:, S.DELTA]
+    gyro = column(S.YAW_RATE)
+    left = signals[:, S.DELTA]
     front = (rims[1] - rims[0]) / vehicle.track_front
     rear = (rims[3] - rims[2]) / vehicle.track_rear
     delta = smooth(
@@ -110,26 +111,30 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float)
 
 def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Yaw rate that the vehicle file's bicycle makes of the steering, by the trapezoidal rule."""
-    m, inertia, a, b = (
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.cg_to_front_axle,
-        vehicle.cg_to_rear_axle,
-    )
+    m = vehicle.mass
+    inertia = vehicle.yaw_inertia
+    a = vehicle.cg_to_front_axle
+    b = vehicle.cg_to_rear_axle
     per_share = (
         4.0 * vehicle.cornering_stiffness / (a + b)
     )  # of all wheels, shared out by their static load
-    c_f, c_r = b * per_share, a * per_share
-    half, motion, modelled = 0.5 / RATE_HZ, np.zeros(2), np.full(len(speed), np.nan)
+    c_f = b * per_share
+    c_r = a * per_share
+    half = 0.5 / RATE_HZ
+    motion = np.zeros(2)
+    modelled = np.full(len(speed), np.nan)
     before = 0.0
     for k, (v, delta) in enumerate(zip(speed.tolist(), steering.tolist(), strict=True)):
         if not (v > SLOWEST and abs(delta) < 1.0):  # standing, or NaN
-            motion, before = np.zeros(2), 0.0
+            motion = np.zeros(2)
+            before = 0.0
             continue
-        system = np.array([
-            [-(c_f + c_r) / (m * v), (b * c_r - a * c_f) / (m * v) - v],
-            [(b * c_r - a * c_f) / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
-        ])  # fmt: skip
+        system = np.array(
+            [
+                [-(c_f + c_r) / (m * v), (b * c_r - a * c_f) / (m * v) - v],
+                [(b * c_r - a * c_f) / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
+            ]
+        )
         driven = np.array([c_f / m, a * c_f / inertia]) * (half * (before + delta))
         motion = np.linalg.solve(
             np.eye(2) - half * system, motion + half * (system @ motion) + driven

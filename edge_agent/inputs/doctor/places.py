@@ -38,7 +38,8 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
         np.isfinite(drive.course) & np.isfinite(drive.course_yaw) & (np.abs(drive.v) > 0.3 * fast)
     )
     if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
-        yaw, course = drive.course_yaw[good], drive.course[good]
+        yaw = drive.course_yaw[good]
+        course = drive.course[good]
         fits = {name: _agreement(made(yaw), course) for name, made in COMPASS.items()}
         best = max(fits, key=lambda name: fits[name])
         turns = min(_turned(COMPASS[best](yaw)), _turned(course))
@@ -61,7 +62,8 @@ def _agreement(yaw: FloatArray, course: FloatArray) -> float:
 
 def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
     """Whether the fixes go as the wheels do only when latitude and longitude are exchanged."""
-    latitude, longitude = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
+    latitude = signals[:, S.LATITUDE]
+    longitude = signals[:, S.LONGITUDE]
     if np.isfinite(latitude).sum() < 10:
         return False
     if np.nanmax(np.abs(latitude)) > 90.0:
@@ -73,7 +75,8 @@ def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
     if good.sum() < FEWEST:
         return False
     other, course = over_ground(t, longitude, latitude, drive.t)
-    spreads, turns = [], []
+    spreads = []
+    turns = []
     for speed, way in ((drive.v_ground, drive.course), (other, course)):
         ratio = np.log(np.maximum(speed[good], 1e-3) / np.abs(drive.v[good]))
         spreads.append(float(np.percentile(ratio, 84) - np.percentile(ratio, 16)))

@@ -13,11 +13,13 @@ from edge_agent.inputs.doctor.identities import Fit
 from schemas.numeric import FloatArray
 
 AXES: Final = {
-    "lateral": ("v · yaw rate [m/s²]", "ay [m/s²]"), "longitudinal": ("dv/dt of the wheels [m/s²]", "ax [m/s²]"),
-    "steering": ("L · yaw rate / v [rad]", "delta [rad]"), "axle": ("yaw rate [rad/s]", "of the wheels [rad/s]"),
+    "lateral": ("v · yaw rate [m/s²]", "ay [m/s²]"),
+    "longitudinal": ("dv/dt of the wheels [m/s²]", "ax [m/s²]"),
+    "steering": ("L · yaw rate / v [rad]", "delta [rad]"),
+    "axle": ("yaw rate [rad/s]", "of the wheels [rad/s]"),
     "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
     "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
-}  # fmt: skip
+}
 SHOWN: Final = (
     "gain",
     "offset",
@@ -55,15 +57,20 @@ def lines(diagnosis: Diagnosis) -> list[str]:
 def document(diagnosis: Diagnosis) -> dict[str, object]:
     """What was found, for a program: scale, offset and delay mend a channel, in this order."""
     return {
-        "passed": diagnosis.passed, "advice": advice(diagnosis), "sound": diagnosis.sound, "unknown": diagnosis.unknown,
+        "passed": diagnosis.passed,
+        "advice": advice(diagnosis),
+        "sound": diagnosis.sound,
+        "unknown": diagnosis.unknown,
         "lags_s": {name: round(lag, 4) for name, lag in diagnosis.lags.items()},
         "findings": [
-            {name: _finite(value) for name, value in asdict(finding).items()} for finding in diagnosis.findings
+            {name: _finite(value) for name, value in asdict(finding).items()}
+            for finding in diagnosis.findings
         ],
         "identities": {
-            name: {what: _finite(getattr(fit, what)) for what in SHOWN} for name, fit in diagnosis.fits.items()
+            name: {what: _finite(getattr(fit, what)) for what in SHOWN}
+            for name, fit in diagnosis.fits.items()
         },
-    }  # fmt: skip
+    }
 
 
 def _finite(value: object) -> object:
@@ -113,7 +120,8 @@ def _table(fits: dict[str, Fit]) -> str:
 def _figure(name: str, fit: Fit) -> str:
     """A scatter of both sides, with the identity itself (grey) and what was found (red)."""
     step = max(1, len(fit.right) // POINTS)
-    x, y = fit.right[::step], fit.left[::step]
+    x = fit.right[::step]
+    y = fit.left[::step]
     low, high = (float(np.percentile(x, q)) for q in (0.5, 99.5))
     bottom, top = (float(np.percentile(y, q)) for q in (0.5, 99.5))
     if not (high > low and top > bottom):

@@ -59,12 +59,17 @@ LAWS: Final = {
     "axle": Law(1.0, 0.08, (Member("v", 1), Member("r", -1), Member("sides", 1))),
     "ground": Law(1.0, 0.015, (Member("v", -1),)),
     "turning": Law(1.0, 0.08, (Member("r", -1), Member("place", 1))),
-}  # fmt: skip
+}
 FLIPPED: Final = Mistake("sign", -1.0)
 QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
 # the clocks of the devices: identity -> (device on the left, device on the right)
-CLOCKS: Final = {"longitudinal": ("imu", "wheels"), "axle": ("wheels", "imu"), "steering": ("steering", "imu"),
-                 "ground": ("receiver", "wheels"), "turning": ("receiver", "imu")}  # fmt: skip
+CLOCKS: Final = {
+    "longitudinal": ("imu", "wheels"),
+    "axle": ("wheels", "imu"),
+    "steering": ("steering", "imu"),
+    "ground": ("receiver", "wheels"),
+    "turning": ("receiver", "imu"),
+}
 CLOCK_SPREAD_S: Final = {
     "longitudinal": 0.06,
     "axle": 0.04,
@@ -87,12 +92,10 @@ CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by ch
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     """What each quantity may have."""
-    g, deg, ratio, radius = (
-        1.0 / GRAVITY,
-        1.0 / DEG,
-        vehicle.steering_ratio or 16.0,
-        vehicle.wheel_radius,
-    )
+    g = 1.0 / GRAVITY
+    deg = 1.0 / DEG
+    ratio = vehicle.steering_ratio or 16.0
+    radius = vehicle.wheel_radius
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
     if ground.known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
@@ -118,9 +121,11 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
 
 # several quantities that go wrong for one reason count as one fault
 JOINT: Final = (
-    (("ay", "sign"), ("r", "sign")), (("ax", "g"), ("ay", "g")), (("ax", "sign"), ("ay", "sign")),
+    (("ay", "sign"), ("r", "sign")),
+    (("ax", "g"), ("ay", "g")),
+    (("ax", "sign"), ("ay", "sign")),
     (("ay", "sign"), ("r", "sign"), ("delta", "sign")),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -210,7 +215,8 @@ def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
             total += min(away**2 / (CLOCK_SPREAD_S[name] ** 2 + fit.lag_error_s**2), 100.0)
         return total
 
-    base, options = cost({}), []
+    base = cost({})
+    options = []
     for device in devices:
         guesses = []
         for name, fit in known.items():

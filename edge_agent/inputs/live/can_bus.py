@@ -12,7 +12,8 @@ from edge_agent.inputs.readers.dbc import Database
 from edge_agent.inputs.recording import Series, library
 from schemas.thresholds import NS
 
-EXTENDED_MASK, STANDARD_MASK = 0x1FFFFFFF, 0x7FF
+EXTENDED_MASK = 0x1FFFFFFF
+STANDARD_MASK = 0x7FF
 OWN: Final = "gripmap"
 
 
@@ -59,7 +60,9 @@ class CanFeed(Feed):
         self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]
     ) -> None:
         super().__init__(name, clock)
-        self._can, self._decoder, self._options = library("can"), decoder, dict(options)
+        self._can = library("can")
+        self._decoder = decoder
+        self._options = dict(options)
 
     def listen(self) -> None:
         """Hear frames until the bus fails."""

@@ -35,11 +35,18 @@ class DatabrokerFeed(Feed):
     """
 
     def __init__(
-        self, name: str, clock: HostClock, address: str, paths: Sequence[str], files: Mapping[str, str],
+        self,
+        name: str,
+        clock: HostClock,
+        address: str,
+        paths: Sequence[str],
+        files: Mapping[str, str],
         lasting: Iterable[str] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(name, clock)
-        self._grpc, self._address, self._paths = library("grpc"), address, sorted(paths)
+        self._grpc = library("grpc")
+        self._address = address
+        self._paths = sorted(paths)
         self._lasting = frozenset(lasting)
         # protobuf's runtime is there with the core; the messages are made when a broker is asked for
         self._messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
@@ -104,9 +111,10 @@ class DatabrokerFeed(Feed):
 
     def _method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
         return kind(
-            f"{SERVICE}{name}", request_serializer=lambda request: request.SerializeToString(),
+            f"{SERVICE}{name}",
+            request_serializer=lambda request: request.SerializeToString(),
             response_deserializer=answer.FromString,
-        )  # fmt: skip
+        )
 
     def _known(self, channel: Any) -> list[str]:  # noqa: ANN401
         """The paths that the broker knows: a subscription with an unknown one is refused as a whole."""

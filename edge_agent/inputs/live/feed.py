@@ -65,7 +65,9 @@ class Stamps:
     def place(self, stamp: float, arrival: float) -> float:
         """The host's time of a stamp that arrived now."""
         if arrival - self._turned > WHILE_S:
-            self._before, self._lately, self._turned = self._lately, float("inf"), arrival
+            self._before = self._lately
+            self._lately = float("inf")
+            self._turned = arrival
         self._lately = min(self._lately, arrival - stamp)
         return stamp + self.lead
 
@@ -80,7 +82,8 @@ class Feed(ABC):
     """
 
     def __init__(self, name: str, clock: HostClock) -> None:
-        self.name, self.clock = name, clock
+        self.name = name
+        self.clock = clock
         self.heard = self.lost = self.broken = self.openings = self.losses = 0
         self.stopping = threading.Event()
         self.stamps = Stamps()

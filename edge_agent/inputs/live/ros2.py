@@ -59,11 +59,21 @@ class Ros2Feed(Feed):
     """
 
     def __init__(
-        self, name: str, clock: HostClock, settings: ZenohSettings, *, domain: int, signals: Sequence[str],
-        decoder: Decoder | None = None, buses: Sequence[str] = (), types: Path | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        clock: HostClock,
+        settings: ZenohSettings,
+        *,
+        domain: int,
+        signals: Sequence[str],
+        decoder: Decoder | None = None,
+        buses: Sequence[str] = (),
+        types: Path | None = None,
+    ) -> None:
         super().__init__(name, clock)
-        self._settings, self._domain, self._decoder = settings, domain, decoder
+        self._settings = settings
+        self._domain = domain
+        self._decoder = decoder
         self._wanted = {signal for signal in signals if signal.startswith("/")}
         self._topics = sorted({signal.partition(".")[0] for signal in self._wanted} | set(buses))
         if not self._topics:

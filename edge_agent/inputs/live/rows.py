@@ -55,10 +55,17 @@ class LiveRows:
     """
 
     def __init__(
-        self, feeds: Sequence[Feed], profile: Profile, vehicle: Vehicle, clock: HostClock,
+        self,
+        feeds: Sequence[Feed],
+        profile: Profile,
+        vehicle: Vehicle,
+        clock: HostClock,
         wait: Callable[[float], None] = time.sleep,
-    ) -> None:  # fmt: skip
-        self.feeds, self._profile, self._clock, self._wait = feeds, profile, clock, wait
+    ) -> None:
+        self.feeds = feeds
+        self._profile = profile
+        self._clock = clock
+        self._wait = wait
         self._radius = vehicle.wheel_radius
         self._ratio = vehicle.steering_ratio or profile.steering_ratio
         if self._ratio is None and any(
@@ -151,7 +158,8 @@ class LiveRows:
 
     def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
         """What a source told lately."""
-        kept, fresh_ones = self._readings[place], feed.take()
+        kept = self._readings[place]
+        fresh_ones = feed.take()
         if "course" not in fresh_ones:
             passed = oldest + KEPT_S - 1.0 / self.rate_hz
             self.late += max(
@@ -159,9 +167,11 @@ class LiveRows:
             )
         for name, fresh in fresh_ones.items():
             before = kept.get(name)
-            t, values = fresh.t, fresh.values
+            t = fresh.t
+            values = fresh.values
             if before is not None:
-                t, values = np.concatenate([before.t, t]), np.concatenate([before.values, values])
+                t = np.concatenate([before.t, t])
+                values = np.concatenate([before.values, values])
             order = np.argsort(t, kind="stable")
             kept[name] = Series(t[order], values[order], fresh.unit)
         for name, series in list(kept.items()):
@@ -177,7 +187,8 @@ class LiveRows:
     def _place(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
         """Each fix in the row next to it, or, moved, in the first one where that has gone."""
         half = 0.5 / self.rate_hz
-        speed, course = fixes.get(GROUND), fixes.get("yaw")
+        speed = fixes.get(GROUND)
+        course = fixes.get("yaw")
         for name, series in fixes.items():
             fresh = (
                 (series.t > self._used[name])
@@ -185,7 +196,8 @@ class LiveRows:
                 & np.isfinite(series.values)
             )
             fresh &= series.t > t[0] - OLDEST_FIX_S
-            times, values = series.t[fresh], series.values[fresh]
+            times = series.t[fresh]
+            values = series.values[fresh]
             if not len(times):
                 continue
             self._used[name] = float(times[-1])

@@ -85,9 +85,13 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
         return GpsdFeed(source, clock, _host(source, address, PORTS[kind]))
     if kind == "vss":
         return DatabrokerFeed(
-            source, clock, address or f"127.0.0.1:{PORTS[kind]}", sorted(profile.needs()), options,
+            source,
+            clock,
+            address or f"127.0.0.1:{PORTS[kind]}",
+            sorted(profile.needs()),
+            options,
             lasting=lasting_signals(profile),
-        )  # fmt: skip
+        )
     if kind == "ros2":
         return _ros2(
             source,
@@ -138,14 +142,20 @@ def _ros2(
     clock: HostClock,
 ) -> Feed:
     settings = ZenohSettings(connect=[address]) if address else ZenohSettings()
-    domain, folder = options.get("domain", "0"), options.get("messages")
+    domain = options.get("domain", "0")
+    folder = options.get("messages")
     if not domain.isdigit():
         raise InputError("source", f"{source!r}: a domain is a number", "write it like ?domain=0")
     return Ros2Feed(
-        source, clock, settings, domain=int(domain), signals=sorted(profile.needs()),
-        decoder=None if database is None else Decoder(profile, database), buses=options.get("frames", "").split(),
+        source,
+        clock,
+        settings,
+        domain=int(domain),
+        signals=sorted(profile.needs()),
+        decoder=None if database is None else Decoder(profile, database),
+        buses=options.get("frames", "").split(),
         types=Path(folder) if folder else None,
-    )  # fmt: skip
+    )
 
 
 def _typed(text: str) -> int | float | bool | str:

@@ -59,18 +59,23 @@ class Signal:
     def _raw(self, data: Bytes) -> NDArray[np.uint64]:
         raw = np.zeros(len(data), np.uint64)
         if self.little:
-            first, last = self.start // 8, (self.start + self.size - 1) // 8
+            first = self.start // 8
+            last = (self.start + self.size - 1) // 8
             for place, byte in enumerate(range(first, last + 1)):
                 shift = 8 * place - self.start % 8
                 part = data[:, byte].astype(np.uint64)
                 raw |= part << np.uint64(shift) if shift >= 0 else part >> np.uint64(-shift)
         else:
-            left, byte, top = self.size, self.start // 8, self.start % 8
+            left = self.size
+            byte = self.start // 8
+            top = self.start % 8
             while left > 0:
                 taken = min(left, top + 1)
                 part = (data[:, byte] >> np.uint8(top + 1 - taken)) & np.uint8((1 << taken) - 1)
                 raw = (raw << np.uint64(taken)) | part.astype(np.uint64)
-                left, byte, top = left - taken, byte + 1, 7
+                left = left - taken
+                byte = byte + 1
+                top = 7
         return raw if self.size == 64 else raw & np.uint64((1 << self.size) - 1)
 
     @property
@@ -136,7 +141,8 @@ def parse_dbc(text: str) -> Database:
     message: CanMessage | None = None
     for line in text.splitlines():
         if found := _MESSAGE.match(line):
-            number, length = int(found[1]), int(found[3])
+            number = int(found[1])
+            length = int(found[3])
             message = CanMessage(
                 found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {}
             )
@@ -158,11 +164,16 @@ def _signal(found: re.Match[str]) -> Signal | None:
     mux = found["mux"] or ""
     try:
         signal = Signal(
-            name=re.sub(r"\W", "_", found["name"]), start=int(found["start"]), size=int(found["size"]),
-            little=found["order"] == "1", signed=found["sign"] == "-", factor=float(found["factor"]),
-            offset=float(found["offset"]), unit=found["unit"] or "",
+            name=re.sub(r"\W", "_", found["name"]),
+            start=int(found["start"]),
+            size=int(found["size"]),
+            little=found["order"] == "1",
+            signed=found["sign"] == "-",
+            factor=float(found["factor"]),
+            offset=float(found["offset"]),
+            unit=found["unit"] or "",
             switch=int(mux[1:].rstrip("M")) if mux.startswith("m") else None,
-        )  # fmt: skip
+        )
     except ValueError:
         return None
     sound = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST

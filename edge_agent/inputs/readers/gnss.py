@@ -53,7 +53,8 @@ def parse_nmea(line: str) -> Fix | None:
         raise ValueError("too short")
     if parts[2] != "A":
         return None
-    clock, day = parts[1], parts[9]
+    clock = parts[1]
+    day = parts[9]
     whole = datetime.strptime(day + clock[:6], "%d%m%y%H%M%S").replace(tzinfo=UTC)
     time = int(whole.timestamp()) * NS + round(float(f"0{clock[6:]}") * NS)
     latitude = _degrees(parts[3], 2) * (-1.0 if parts[4] == "S" else 1.0)

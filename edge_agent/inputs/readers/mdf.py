@@ -27,8 +27,14 @@ MOST_CPU_S: Final = 600  # a file of 10 GB takes less
 HEADER: Final = 64  # bytes of the identification block
 # block -> places of its links that lead on (next first, then what hangs on it)
 LINKS: Final = {
-    b"##HD": (0,), b"##DG": (0, 1, 2), b"##CG": (0, 1), b"##CN": (0, 1), b"##DL": (0,), b"##HL": (0,), b"##CA": (0,),
-}  # fmt: skip
+    b"##HD": (0,),
+    b"##DG": (0, 1, 2),
+    b"##CG": (0, 1),
+    b"##CN": (0, 1),
+    b"##DL": (0,),
+    b"##HL": (0,),
+    b"##CA": (0,),
+}
 
 
 def check_blocks(path: Path) -> None:

@@ -34,7 +34,8 @@ def is_bag(path: Path) -> bool:
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
     """A reader, opened and in the end closed; the folder is taken for a database file that lies in it."""
-    highlevel, typesys = library("rosbags.highlevel"), library("rosbags.typesys")
+    highlevel = library("rosbags.highlevel")
+    typesys = library("rosbags.typesys")
     inside = (
         path.parent if path.suffix == ".db3" or (path.parent / "metadata.yaml").is_file() else path
     )
@@ -119,7 +120,8 @@ def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):
             continue
-        path, value = f"{prefix}.{name}", getattr(message, name)
+        path = f"{prefix}.{name}"
+        value = getattr(message, name)
         take = attrgetter(path[1:])
         if isinstance(value, bool | int | float | np.number):
             yield path, take

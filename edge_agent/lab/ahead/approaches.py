@@ -35,10 +35,9 @@ ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and
 NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
 BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
-LEAST_CAME, LEAST_KM = (
-    100,
-    1000.0,
-)  # fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
+# fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
+LEAST_CAME = 100
+LEAST_KM = 1000.0
 START_NS: Final = 1_800_000_000 * NS
 
 
@@ -87,13 +86,22 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
         counts = found[routed]
         km = counts.metres / 1e3
         out += [
-            Figure(f"ahead.warned_share{ending}", counts.warned / counts.came if counts.came else float("nan"), "",
-                   0.99 if routed and counts.came >= LEAST_CAME else None, "more"),
-            Figure(f"ahead.false_per_1000km{ending}", 1e3 * counts.false / km if km else float("nan"), "",
-                   1 if routed and km >= LEAST_KM else None),
+            Figure(
+                f"ahead.warned_share{ending}",
+                counts.warned / counts.came if counts.came else float("nan"),
+                "",
+                0.99 if routed and counts.came >= LEAST_CAME else None,
+                "more",
+            ),
+            Figure(
+                f"ahead.false_per_1000km{ending}",
+                1e3 * counts.false / km if km else float("nan"),
+                "",
+                1 if routed and km >= LEAST_KM else None,
+            ),
             Figure(f"ahead.approaches{ending}", counts.came, "to alerted stretches"),
             Figure(f"ahead.driven_km{ending}", km, "km"),
-        ]  # fmt: skip
+        ]
     return out
 
 
@@ -101,8 +109,10 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
     """Drive one town and add what happened to the counts."""
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
     known = heard(places_of(fleet.scenario, AFTER_S), START_NS)
-    tracks, located_tracks = [_Track() for _ in range(vehicles)], new_tracks(vehicles)
-    steps, driven = round(RATE_HZ), np.zeros(vehicles)
+    tracks = [_Track() for _ in range(vehicles)]
+    located_tracks = new_tracks(vehicles)
+    steps = round(RATE_HZ)
+    driven = np.zeros(vehicles)
     fleet.step(round(AFTER_S * RATE_HZ))
     for second in range(int(seconds)):
         t, signals = fleet.step(steps)
@@ -130,8 +140,11 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
     """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it is at t [s]."""
-    true, every = fleet.truth, round(RATE_HZ / BESIDE_HZ)
-    x, y, yaw = true.x[::every], true.y[::every], true.yaw[::every]
+    true = fleet.truth
+    every = round(RATE_HZ / BESIDE_HZ)
+    x = true.x[::every]
+    y = true.y[::every]
+    yaw = true.yaw[::every]
     lanes = [
         (x - side * np.sin(yaw), y + side * np.cos(yaw)) for side in (-BESIDE_M, 0.0, BESIDE_M)
     ]

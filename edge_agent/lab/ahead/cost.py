@@ -54,7 +54,8 @@ def streets() -> IntArray:
 
 def way(rng: np.random.Generator, metres: float) -> FloatArray:
     """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right, never out of it."""
-    here, heading = np.array([BLOCKS // 2, BLOCKS // 2]), 0
+    here = np.array([BLOCKS // 2, BLOCKS // 2])
+    heading = 0
     corners = [here]
     for _ in range(math.ceil(metres / BLOCK_M)):
         turns = [heading, heading, heading, (heading + 1) % 4, (heading + 3) % 4]
@@ -62,7 +63,8 @@ def way(rng: np.random.Generator, metres: float) -> FloatArray:
         for turn in turns:
             there = here + np.array([[1, 0], [0, 1], [-1, 0], [0, -1]][turn])
             if ((there >= 0) & (there <= BLOCKS)).all():
-                here, heading = there, turn
+                here = there
+                heading = turn
                 break
         corners.append(here)
     return np.array(corners) * BLOCK_M
@@ -70,7 +72,8 @@ def way(rng: np.random.Generator, metres: float) -> FloatArray:
 
 def figures(seed: int, metres: float) -> list[Figure]:
     """Megabytes a day and share of a core, on a given route and, beside it, without."""
-    known, out = streets(), []
+    known = streets()
+    out = []
     for routed, ending in ((True, ""), (False, ".unrouted")):
         megabytes, share = drive(np.random.default_rng(seed), known, metres, routed=routed)
         out += [
@@ -92,17 +95,22 @@ def drive(
     corners = way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))
-    heard, asked, tiles = LocalMap(), RequestLog(), Tiles()
+    heard = LocalMap()
+    asked = RequestLog()
+    tiles = Tiles()
     active: tuple[Active, ...] = ()
-    total, spent = 0, 0.0
+    total = 0
+    spent = 0.0
     for second in range(int(metres / SPEED)):
         s = second * SPEED
-        x, y = np.interp(s, run, corners[:, 0]), np.interp(s, run, corners[:, 1])
+        x = np.interp(s, run, corners[:, 0])
+        y = np.interp(s, run, corners[:, 1])
         step = corners[min(int(s / BLOCK_M) + 1, len(corners) - 1)] - corners[int(s / BLOCK_M)]
         latitude, longitude = to_degrees(np.asarray(x), np.asarray(y), CENTRE)
         now = CENTRE.time + second * NS
         pose = Pose(float(latitude), float(longitude), math.atan2(step[1], step[0]), SPEED, now)
-        began, length = time.process_time(), horizon_length(SPEED)
+        began = time.process_time()
+        length = horizon_length(SPEED)
         paths: list[Path] = []
         if routed and (given := route.ahead(pose, length + FURTHER_M)) is not None:
             paths = [given]
@@ -121,7 +129,8 @@ def drive(
             inside = known[grid.touches(box, grid.bounds(known // grid.SECTORS))]
             tile = grid.tile_of(inside // grid.SECTORS)
             for one in np.unique(tile).tolist():
-                payload, key = tile_payload(inside[tile == one], 0.7, now), keys.map_key(one)
+                payload = tile_payload(inside[tile == one], 0.7, now)
+                key = keys.map_key(one)
                 total += len(payload) + len(key) + FRAME
                 began = time.process_time()
                 heard.take(*decode_cells(key, payload, now), now)

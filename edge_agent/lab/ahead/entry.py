@@ -58,7 +58,8 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     for seed in seeds:
         fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
         trace = record(fleet, seconds)
-        scenario, now = fleet.scenario, START_NS
+        scenario = fleet.scenario
+        now = START_NS
         rng = np.random.default_rng(seed)
         true_map = heard(places_of(scenario, seconds), now, rng)
         old_map = heard(places_of(scenario, BEFORE_S), now, rng)
@@ -117,7 +118,8 @@ def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None)
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
-    with_prior, alone = with_map(trace, known, now), _medians(np.exp(trace.own))
+    with_prior = with_map(trace, known, now)
+    alone = _medians(np.exp(trace.own))
     since = _since_entry(trace.place)
     first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
     first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
@@ -129,7 +131,8 @@ def arrivals(
 ) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
     differ = _differ(trace.place, wrong, right, now)
-    with_prior, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
+    with_prior = with_map(trace, wrong, now)
+    alone = _medians(np.exp(trace.own))
     out = []
     for k in range(trace.place.shape[1]):
         edges = np.flatnonzero(
@@ -167,7 +170,8 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """Median of what would be believed with a map, (T, N)."""
-    prior, out = MapPrior(trace.place.shape[1]), np.empty(trace.place.shape)
+    prior = MapPrior(trace.place.shape[1])
+    out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
         map_beliefs = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
         out[t] = mugrid.quantiles(prior.step(place, trace.own[t], trace.visit[t], map_beliefs), 0.5)

@@ -27,7 +27,8 @@ class KnownPlaces(NamedTuple):
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
     """The places of a scenario's lanes as they are at t [s]."""
     points = scenario.network.points
-    x, y = points[:, LanePoint.X], points[:, LanePoint.Y]
+    x = points[:, LanePoint.X]
+    y = points[:, LanePoint.Y]
     yaw = np.arctan2(points[:, LanePoint.SIN], points[:, LanePoint.COS])
     key = grid.cell_of(*scenario.to_latlon(x, y)) * grid.SECTORS + grid.sector_of(yaw)
     mu = scenario.friction(t, x, y)
@@ -40,12 +41,11 @@ def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None)
     """What a car has heard that was told of all places, by the truth, or off it by chance."""
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)
-    lower, upper = (
-        np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER),
-        np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER),
-    )
+    lower = np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER)
+    upper = np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER)
     slippery = np.clip(0.5 + (SLIPPERY_MU - mu) / (3.0 * SPREAD), 0.0, 1.0)
-    belief, cache = belief_of(lower, mu, upper, slippery), LocalMap(most_cells=1 << 20)
+    belief = belief_of(lower, mu, upper, slippery)
+    cache = LocalMap(most_cells=1 << 20)
     n = len(places.key)
     cells = ReceivedCells(
         places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now))

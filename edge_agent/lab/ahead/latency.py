@@ -42,10 +42,14 @@ def router() -> Iterator[ZenohSettings]:
     """A router in this process, on a free port of loopback."""
     config = zenoh.Config()
     chosen = {
-        "mode": "router", "listen/endpoints": ["tcp/127.0.0.1:0"], "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False, "scouting/delay": 0, "adminspace/enabled": True,
+        "mode": "router",
+        "listen/endpoints": ["tcp/127.0.0.1:0"],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "adminspace/enabled": True,
         "transport/shared_memory/enabled": False,
-    }  # fmt: skip
+    }
     for key, value in chosen.items():
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
@@ -59,12 +63,20 @@ def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
     """Quantiles of the time from put to warning, and the processor's share of looking."""
     waited, share, lost = measure(np.random.default_rng(seed), alerts, vehicles)
     return [
-        Figure("ahead.latency_p99_ms", float(np.quantile(waited, 0.99)) * 1e3 if len(waited) else float("nan"), "ms",
-               250),
-        Figure("ahead.latency_p50_ms", float(np.median(waited)) * 1e3 if len(waited) else float("nan"), "ms"),
+        Figure(
+            "ahead.latency_p99_ms",
+            float(np.quantile(waited, 0.99)) * 1e3 if len(waited) else float("nan"),
+            "ms",
+            250,
+        ),
+        Figure(
+            "ahead.latency_p50_ms",
+            float(np.median(waited)) * 1e3 if len(waited) else float("nan"),
+            "ms",
+        ),
         Figure("ahead.latency.unwarned", lost, f"of {alerts} alerts", 0),
         Figure("ahead.core_share.live", share, "of a core and car, questions included", 0.01),
-    ]  # fmt: skip
+    ]
 
 
 def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[float], float, int]:
@@ -103,7 +115,9 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
             time.sleep(0.05)
             lookout.see(poses())
         time.sleep(SETTLE_S)
-        began, busy, looks = time.perf_counter(), lookout.counts.busy_s, lookout.counts.looks
+        began = time.perf_counter()
+        busy = lookout.counts.busy_s
+        looks = lookout.counts.looks
         for k in rng.integers(0, vehicles, alerts).tolist():
             lookout.see(poses())
             put = time.perf_counter()

@@ -21,19 +21,34 @@ from schemas.wire import Alert
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
     """A tile as a service sends it; `changes` replace columns."""
-    n, mu = len(key), np.broadcast_to(friction, len(key))
+    n = len(key)
+    mu = np.broadcast_to(friction, len(key))
     lower = np.maximum(mu - 0.1, 0.06)
-    cell, sector = key // grid.SECTORS, (key % grid.SECTORS).astype(np.int8)
+    cell = key // grid.SECTORS
+    sector = (key % grid.SECTORS).astype(np.int8)
     latitude, longitude = grid.centre(cell)
     west, south, east, north = grid.bounds(cell)
     columns: dict[str, Any] = {
-        "cell": cell, "sector": sector, "mu": mu, "mu_lower": lower,
-        "mu_upper": np.minimum(mu + 0.1, 1.19), "p_slippery": (mu < 0.4).astype(float),
-        "basis": ["measured"] * n, "vehicles": np.full(n, 4), "observations": np.full(n, 9),
-        "first_time": np.full(n, now - 60 * NS), "last_time": np.full(n, now - NS), "age_s": np.full(n, 1.0),
-        "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
+        "cell": cell,
+        "sector": sector,
+        "mu": mu,
+        "mu_lower": lower,
+        "mu_upper": np.minimum(mu + 0.1, 1.19),
+        "p_slippery": (mu < 0.4).astype(float),
+        "basis": ["measured"] * n,
+        "vehicles": np.full(n, 4),
+        "observations": np.full(n, 9),
+        "first_time": np.full(n, now - 60 * NS),
+        "last_time": np.full(n, now - NS),
+        "age_s": np.full(n, 1.0),
+        "latitude": latitude,
+        "longitude": longitude,
+        "west": west,
+        "south": south,
+        "east": east,
+        "north": north,
         "safe_deceleration": GRAVITY * lower,
-    } | changes  # fmt: skip
+    } | changes
     table = pa.table(
         {f.name: pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA}
     ).cast(tables.MAP_SCHEMA)

@@ -82,7 +82,9 @@ def width_ratio(results: Results) -> float:
     return of("default.straight", "width")(results) / PRIOR_WIDTH
 
 
-M_S, RAD_S, SHARE = "m/s", "rad/s", "1"
+M_S = "m/s"
+RAD_S = "rad/s"
+SHARE = "1"
 BARS: Final = (
     *(
         EstimatorBar(f"papers.004.{kind}.mae_{name}", noise(kind, f"mae_{name}"), unit, bar, "less")
@@ -148,9 +150,17 @@ BARS: Final = (
 )
 
 UNITS: Final = {
-    "vx": M_S, "vy": M_S, "yaw_rate": RAD_S, "beta": "rad", "s": "s", "hours": "h", "changes": "per drive",
-    "rmse_vx": M_S, "rmse_vy": M_S, "v_max": M_S,
-}  # fmt: skip
+    "vx": M_S,
+    "vy": M_S,
+    "yaw_rate": RAD_S,
+    "beta": "rad",
+    "s": "s",
+    "hours": "h",
+    "changes": "per drive",
+    "rmse_vx": M_S,
+    "rmse_vy": M_S,
+    "v_max": M_S,
+}
 
 
 def unit_of(measure: str) -> str:

@@ -83,10 +83,18 @@ def _drive(
     scenario: DriveSpec, seed: int, sensors: str | Sensors, step: int
 ) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
-        scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
-        duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,
-        slope=scenario.slope, faults=() if scenario.torque else (Fault("missing", "torque"),),
-    )  # fmt: skip
+        scenario.manoeuvre,
+        mu=scenario.mu,
+        speed=scenario.speed,
+        seed=seed,
+        rate_hz=scenario.rate_hz,
+        duration_s=scenario.duration_s,
+        vehicle=scenario.vehicle,
+        sensors=sensors,
+        road=scenario.road,
+        slope=scenario.slope,
+        faults=() if scenario.torque else (Fault("missing", "torque"),),
+    )
     return log.take(np.arange(0, len(log), step)), vehicle
 
 

@@ -23,7 +23,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import WHEELS, S
 
-DRIVES, DRIVE_S = 10, 60  # of each car; its road goes on from drive to drive
+# of each car; its road goes on from drive to drive
+DRIVES = 10
+DRIVE_S = 60
 CARS_AT_ONCE: Final = 5
 JUDGED_S: Final = 120  # of the drive after them that is judged
 SETTLED_S: Final = 10.0  # of it that are left out
@@ -33,7 +35,8 @@ ESTIMATOR: Final = "aco-fckf"
 def truth(seed: int, car: int) -> dict[str, float]:
     """What the devices of a rough car are off by."""
     error = error_row(ROUGH_FLEET, GOTHENBURG, seed, car)
-    mounted, offset = error[ErrorColumn.MOUNTED :], error[ErrorColumn.OFFSET :]
+    mounted = error[ErrorColumn.MOUNTED :]
+    offset = error[ErrorColumn.OFFSET :]
     radii = mounted[Misaligned.RADIUS : Misaligned.RADIUS + 4]
     off = (1.0 + radii) / (1.0 + radii.mean()) - 1.0
     return {
@@ -118,10 +121,11 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
         float(np.mean(column)) for column in zip(*groups, strict=True)
     )
     return [
-        Figure("calibration.width_ratio", width / plain, "1", 0.8), Figure("calibration.width", width, "1"),
+        Figure("calibration.width_ratio", width / plain, "1", 0.8),
+        Figure("calibration.width", width, "1"),
         Figure("calibration.coverage", coverage, "1", 0.88, "more"),
         Figure("calibration.plain_coverage", plain_coverage, "1"),
-    ]  # fmt: skip
+    ]
 
 
 def figures(cars: int, seed: int) -> list[Figure]:

@@ -108,7 +108,8 @@ def runs_of(on: NDArray[np.bool_]) -> Stretches:
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
     """Return `on` (T,) with gaps up to `seconds` filled."""
-    out, most = on.copy(), round(seconds * RATE_HZ)
+    out = on.copy()
+    most = round(seconds * RATE_HZ)
     for first, end in runs_of(~on):
         if first > 0 and end < len(on) and end - first <= most:
             out[first:end] = True
@@ -124,7 +125,8 @@ def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretche
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
     """Return by which of ACTIVITIES a slide was caused: the larger acceleration, and its sign."""
-    along, across = float(drive.ax[first:end, n].mean()), float(drive.ay[first:end, n].mean())
+    along = float(drive.ax[first:end, n].mean())
+    across = float(drive.ay[first:end, n].mean())
     if abs(across) > abs(along):
         return "cornering"
     return "braking" if along < 0.0 else "driving"
@@ -146,7 +148,8 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
     """Coverage, false ice, false grip and interval score over samples."""
-    mu, apart = drive.mu, ~drive.stood
+    mu = drive.mu
+    apart = ~drive.stood
     inside = (drive.lower <= mu) & (mu <= drive.upper)
     for name, (above, most) in SURFACES.items():
         among = (mu > above) & (mu <= most)
@@ -156,7 +159,9 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
             drive.lower.astype(np.float64), drive.upper.astype(np.float64), mu.astype(np.float64)
         )
         tally.add(f"score.{name}", score[among & apart])
-    ice, called, grips = (mu <= ICE_MU) & apart, drive.upper < SLIPPERY_MU, mu > SNOW_MU
+    ice = (mu <= ICE_MU) & apart
+    called = drive.upper < SLIPPERY_MU
+    grips = mu > SNOW_MU
     tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
     tally.add("false_grip.sure", (drive.lower > SLIPPERY_MU)[ice])
     excited = lately(drive.used.max(axis=-1)) >= EXCITED_SHARE
@@ -230,7 +235,8 @@ def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
     """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds of each without it."""
-    sliding, extended = np.zeros(len(drive.mu), np.bool_), np.zeros(len(drive.mu), np.bool_)
+    sliding = np.zeros(len(drive.mu), np.bool_)
+    extended = np.zeros(len(drive.mu), np.bool_)
     for first, end in slides:
         sliding[first:end] = True
         extended[first : end + round(AFTER_SLIDE_S * RATE_HZ)] = True
@@ -285,7 +291,8 @@ def _judge_visits(
         _note_visit(tally, f"{kind}.", likelihood, (slid, apart))
         if oracle and kind == "ice":
             grip = drive.mu_wheel[now, n].astype(np.float64)
-            force, slip = drive.used[now, n] * grip, drive.theta[now, n] * grip
+            force = drive.used[now, n] * grip
+            slip = drive.theta[now, n] * grip
             rng = np.random.default_rng([n, now.start])
             found = visit_evidence(force, slip, drive.speed[now, n].astype(np.float64), rng)
             _note_visit(tally, f"oracle.{kind}.", found, (slid, apart))

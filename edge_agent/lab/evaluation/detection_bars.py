@@ -52,7 +52,8 @@ def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
     return lambda tally: 1e3 * tally.rate(over, under)
 
 
-PER_1000_KM, PER_1000_S = "per 1000 km", "per 1000 s"
+PER_1000_KM = "per 1000 km"
+PER_1000_S = "per 1000 s"
 DETECTION: Final = (
     DetectionBar("ice.yield.long", "long", mean_of("ice.yield"), SHARE, (0.60, 0.58)),
     DetectionBar("ice.yield.slide.long", "long", mean_of("ice.yield.slide"), SHARE, (0.80, 0.90)),

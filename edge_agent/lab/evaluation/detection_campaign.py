@@ -69,7 +69,8 @@ def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
             DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS, winter=kind == "plain")
             for kind in KINDS
         ]
-    short, long = seeds[:SHORT_TOWNS], seeds[SHORT_TOWNS:][:LONG_TOWNS] or seeds[:LONG_TOWNS]
+    short = seeds[:SHORT_TOWNS]
+    long = seeds[SHORT_TOWNS:][:LONG_TOWNS] or seeds[:LONG_TOWNS]
     lengths = [(seed, SHORT_S) for seed in short] + [(seed, LONG_S) for seed in long]
     return [
         DetectionTown(seed, kind, s, winter=in_winter(seed))

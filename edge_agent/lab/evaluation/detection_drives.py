@@ -80,8 +80,10 @@ class DetectionDrive:
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
     """Drive a fleet for `seconds` and estimate with the bank."""
-    vehicles, config = fleet.vehicles, AgentConfig()
-    tracks, open_visits = new_tracks(len(vehicles)), OpenVisits.start(len(vehicles))
+    vehicles = fleet.vehicles
+    config = AgentConfig()
+    tracks = new_tracks(len(vehicles))
+    open_visits = OpenVisits.start(len(vehicles))
     parts: list[dict[str, FloatArray]] = []
     visits: list[DetectionVisits] = []
     signals_of: list[FloatArray] = []
@@ -154,7 +156,8 @@ def _estimate_chunk(
     """Return the estimates of a chunk with evidence, and the favour of slippery road (T, N)."""
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
-    parts, favoured = [], np.empty(t.shape)
+    parts = []
+    favoured = np.empty(t.shape)
     for first in range(0, len(t), BELIEF_SAMPLES):
         now = slice(first, min(first + BELIEF_SAMPLES, len(t)))
         parts.append(bank.advance(t[now], signals[now], closes[now]))

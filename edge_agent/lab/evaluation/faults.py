@@ -22,7 +22,9 @@ from edge_agent.lab.simulation.manoeuvres import jump, kmh
 from schemas.numeric import FloatArray
 from schemas.signals import Health
 
-BEGINS, ENDS = 2.0, 5.0  # [s]
+# [s]
+BEGINS = 2.0
+ENDS = 5.0
 DRIVES: Final = {
     "slalom": DriveSpec("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
     "lane change": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
@@ -66,43 +68,60 @@ def during(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
 CASES: Final = {
     "none": Case((), Health.OK, "the drives as they are, for comparison"),
     "inertial-dropout": Case(
-        during("dropout", "ax", "ay", "yaw_rate"), Health.NO_INERTIAL,
+        during("dropout", "ax", "ay", "yaw_rate"),
+        Health.NO_INERTIAL,
         "motion is carried by the wheels with wider spread; nothing is concluded on friction",
     ),
     "steering-dropout": Case(
-        during("dropout", "delta"), Health.NO_STEERING, "the last angle is held; axles say nothing of friction"
+        during("dropout", "delta"),
+        Health.NO_STEERING,
+        "the last angle is held; axles say nothing of friction",
     ),
     "wheel-speed-stuck": Case(
         during("stuck", "omega_fl"), Health.OK, "not told; a wheel that seems to slide is outvoted"
     ),
     "spikes-beyond-belief": Case(
-        during("spike", "omega_fl", size=900.0) + during("spike", "ay", size=60.0), Health.OUTLIER,
+        during("spike", "omega_fl", size=900.0) + during("spike", "ay", size=60.0),
+        Health.OUTLIER,
         "refused reading by reading",
     ),
     "believable-spikes": Case(
-        during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0), Health.OK,
+        during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0),
+        Health.OK,
         "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted less",
     ),
     "bias-step": Case(
-        (Fault("bias", "ay", BEGINS, size=0.3),), Health.OK, "not told; the offset is a state and is learned in seconds"
+        (Fault("bias", "ay", BEGINS, size=0.3),),
+        Health.OK,
+        "not told; the offset is a state and is learned in seconds",
     ),
     "wrong-steering-zero": Case(
-        (Fault("bias", "delta_fl", size=0.003), Fault("bias", "delta_fr", size=0.003)), Health.OK,
+        (Fault("bias", "delta_fl", size=0.003), Fault("bias", "delta_fr", size=0.003)),
+        Health.OK,
         "3 degrees at the steering wheel: not told; the offset of the steering is a state",
     ),
     "one-wheel-speed-lost": Case(
-        (Fault("dropout", "omega_rl", BEGINS),), Health.NO_WHEEL_SPEED, "the others do; the interval is a little wider"
+        (Fault("dropout", "omega_rl", BEGINS),),
+        Health.NO_WHEEL_SPEED,
+        "the others do; the interval is a little wider",
     ),
     "no-torque-at-all": Case(
-        (Fault("missing", "torque"),), Health.NO_TORQUE, "force from the accelerometer, shared out by guess"
+        (Fault("missing", "torque"),),
+        Health.NO_TORQUE,
+        "force from the accelerometer, shared out by guess",
     ),
     "position-gone": Case(
-        tuple(Fault("dropout", channel, BEGINS) for channel in ("latitude", "longitude", "yaw")), Health.NO_POSITION,
+        tuple(Fault("dropout", channel, BEGINS) for channel in ("latitude", "longitude", "yaw")),
+        Health.NO_POSITION,
         "estimates as before; no visit, so no observation",
     ),
-    "time-gap": Case((), Health.TIME_GAP, "motion begins anew, friction fades over the metres missed", gap),
-    "sample-out-of-order": Case((), Health.TIME_GAP, "left out, the estimate before is repeated", late_samples),
-}  # fmt: skip
+    "time-gap": Case(
+        (), Health.TIME_GAP, "motion begins anew, friction fades over the metres missed", gap
+    ),
+    "sample-out-of-order": Case(
+        (), Health.TIME_GAP, "left out, the estimate before is repeated", late_samples
+    ),
+}
 
 
 def harmed(batch: DriveSet, case: Case) -> DriveSet:

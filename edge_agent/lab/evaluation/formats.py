@@ -29,10 +29,16 @@ def as_log(path: Path, messages: Sequence[Any]) -> Path:
 def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
     """A bus log by asammdf, in the layout of its standard."""
     asammdf = library("asammdf")
-    types = np.dtype([
-        ("CAN_DataFrame.BusChannel", "<u1"), ("CAN_DataFrame.ID", "<u4"), ("CAN_DataFrame.IDE", "<u1"),
-        ("CAN_DataFrame.DLC", "<u1"), ("CAN_DataFrame.DataLength", "<u1"), ("CAN_DataFrame.DataBytes", "(64,)u1"),
-    ])  # fmt: skip
+    types = np.dtype(
+        [
+            ("CAN_DataFrame.BusChannel", "<u1"),
+            ("CAN_DataFrame.ID", "<u4"),
+            ("CAN_DataFrame.IDE", "<u1"),
+            ("CAN_DataFrame.DLC", "<u1"),
+            ("CAN_DataFrame.DataLength", "<u1"),
+            ("CAN_DataFrame.DataBytes", "(64,)u1"),
+        ]
+    )
     rows = np.zeros(len(messages), types)
     for place, message in enumerate(messages):
         size = len(message.data)
@@ -56,7 +62,8 @@ def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
 
 def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path:
     """A bag of can_msgs/Frame by rosbags."""
-    rosbag2, typesys = library("rosbags.rosbag2"), library("rosbags.typesys")
+    rosbag2 = library("rosbags.rosbag2")
+    typesys = library("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types.register(typesys.get_types_from_msg(CAN_FRAME, FRAME))
     kind, header, time = (

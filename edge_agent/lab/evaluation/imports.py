@@ -45,10 +45,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
         profile, folder = load_profile(name)
         if profile.dbc is None:
             continue
-        ours, oracle = (
-            read_dbc(folder / profile.dbc),
-            library("cantools", "dev").database.load_file(folder / profile.dbc),
-        )
+        ours = read_dbc(folder / profile.dbc)
+        oracle = library("cantools", "dev").database.load_file(folder / profile.dbc)
         frames = {
             message.name: [rng.bytes(message.length) for _ in range(MADE)]
             for message in oracle.messages
@@ -62,7 +60,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
                         frames[message.name] += [bytes(row[: message.length]) for row in data]
         for message in oracle.messages:
             errors, values = _against(ours, message, frames[message.name])
-            wrong, compared = wrong + errors, compared + values
+            wrong = wrong + errors
+            compared = compared + values
     return wrong, compared
 
 
@@ -73,9 +72,10 @@ def _against(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int
     oracle = [message.decode(frame, decode_choices=False) for frame in frames]
     decoded = ours[message.name].decode(table, list(ours[message.name].signals))
     pairs = [
-        (float(row.get(signal, np.nan)), value) for signal, values in decoded.items()
+        (float(row.get(signal, np.nan)), value)
+        for signal, values in decoded.items()
         for row, value in zip(oracle, values.tolist(), strict=True)
-    ]  # fmt: skip
+    ]
     return sum(a != b and not (np.isnan(a) and np.isnan(b)) for a, b in pairs), len(pairs)
 
 
@@ -120,7 +120,9 @@ def imported(path: Path, profile: Profile, out: Path) -> Path:
 
 def import_s(folder: Path) -> float:
     """Seconds for a minute of a bus, the best of TRIES."""
-    path, profile, spent = a_minute(folder / "minute.blf"), profile_of("can"), []
+    path = a_minute(folder / "minute.blf")
+    profile = profile_of("can")
+    spent = []
     for _ in range(TRIES):
         began = time.perf_counter()
         imported(path, profile, folder / "minute.parquet")
@@ -139,7 +141,8 @@ def estimates_of(log: Path, drive: Recorded) -> FloatArray:
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
     """Largest difference of estimates of one drive over its formats, and how many formats there were."""
     (drive,) = drives(1, seed, rough=True, seconds=seconds)
-    frames, profile = on_a_bus(drive), profile_of("can")
+    frames = on_a_bus(drive)
+    profile = profile_of("can")
     paths = [as_log(folder / f"drive.{kind}", frames) for kind in ("blf", "asc", "log")]
     paths += [as_mf4(folder / "drive.mf4", frames), as_bag(folder / "bag", frames)]
     logs = [imported(path, profile, folder / f"{path.name}.parquet") for path in paths]

@@ -86,7 +86,8 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Of split friction, in the last second: error of the lower side, coverage of the higher."""
-    end, truth = batch.last(LAST_S), batch.mu_wheel
+    end = batch.last(LAST_S)
+    truth = batch.mu_wheel
     wheels = reported.mu_wheel
     if wheels is None:
         whole = np.stack([reported.mu, reported.mu_lower, reported.mu_upper], axis=-1)

@@ -61,7 +61,8 @@ class OracleSignals(NamedTuple):
 def speed(seeds: Sequence[int]) -> FloatArray:
     """RMSE of v_x [m/s] in 002.sine, one per seed."""
     scenario = PAPERS["002.sine"]
-    car, batch = scenario.vehicle, realistic(scenario, seeds)
+    car = scenario.vehicle
+    batch = realistic(scenario, seeds)
     felt = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
     leaked = felt - np.stack([batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1)
     heard = OracleSignals(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
@@ -71,24 +72,38 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 
 def _speed(heard: OracleSignals, n: int, rho: float) -> float:
     """Each second he estimates ρ anew from all that came before, and corrects the wheels by it."""
-    batch, car = heard.batch, PAPERS["002.sine"].vehicle
+    batch = heard.batch
+    car = PAPERS["002.sine"].vehicle
     v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))
     dt = float(batch.t[1, n] - batch.t[0, n])
-    wheels, slipping = (1.0 + rho) * v, vy - car.vehicle.cg_to_rear_axle * r
+    wheels = (1.0 + rho) * v
+    slipping = vy - car.vehicle.cg_to_rear_axle * r
     across = batch.signals[:, n, S.AY] - heard.felt[:, 1] + (v - wheels) * r
     along = batch.signals[:, n, S.AX] - heard.felt[:, 0] + np.gradient(v - wheels, dt)
-    none, one = np.zeros_like(v), np.ones_like(v)
+    none = np.zeros_like(v)
+    one = np.ones_like(v)
     rolling = (heard.rolled, car.roll_leak * np.gradient(heard.rolled, dt))
     sideways = np.stack([-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1)
     ahead = np.stack(
         [-np.gradient(wheels, dt), none, none, r * slipping, none, heard.pitched, one], axis=1
     )
     white, offset = SENSORS[USUAL].acceleration
-    std = np.array([
-        KNOWN["wheel_radius"], ROLL_LEAK_STD, ROLL_LAG_STD, KNOWN["cornering_stiffness"], offset, PITCH_LEAK_STD, offset
-    ])  # fmt: skip
+    std = np.array(
+        [
+            KNOWN["wheel_radius"],
+            ROLL_LEAK_STD,
+            ROLL_LAG_STD,
+            KNOWN["cornering_stiffness"],
+            offset,
+            PITCH_LEAK_STD,
+            offset,
+        ]
+    )
     stretch = round(STRETCH_S / dt)
-    information, vector, off, estimate = np.diag(std**-2), np.zeros(len(std)), np.empty(len(v)), 0.0
+    information = np.diag(std**-2)
+    vector = np.zeros(len(std))
+    off = np.empty(len(v))
+    estimate = 0.0
     for first in range(0, len(v), round(1.0 / dt)):
         now = slice(first, first + round(1.0 / dt))
         off[now] = wheels[now] / (1.0 + estimate) - v[now]
@@ -97,7 +112,8 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
         measured = np.array([along[k : k + stretch].mean() for k in starts])
         rows = np.concatenate([sideways[now], np.sqrt(stretch) * long]) / white
         readings = np.concatenate([across[now], np.sqrt(stretch) * measured]) / white
-        information, vector = information + rows.T @ rows, vector + rows.T @ readings
+        information = information + rows.T @ rows
+        vector = vector + rows.T @ readings
         estimate = float(np.linalg.solve(information, vector)[0])
     return float(np.sqrt(np.mean(off**2)))
 
@@ -105,16 +121,23 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """|μ − truth| at the end of 003.accel, one per seed, and the error that the oracle expects of himself, likewise."""
     scenario = PAPERS["003.accel"]
-    exact, batch = realistic(scenario, seeds[:1], "ideal"), realistic(scenario, seeds)
-    car, v, truth = scenario.vehicle, exact.truth["true_vx"][:, 0], float(exact.mu[0, 0])
+    exact = realistic(scenario, seeds[:1], "ideal")
+    batch = realistic(scenario, seeds)
+    car = scenario.vehicle
+    v = exact.truth["true_vx"][:, 0]
+    truth = float(exact.mu[0, 0])
     slip = car.vehicle.wheel_radius * exact.signals[:, 0, S.OMEGA : S.OMEGA + 4] / v[:, None] - 1.0
     used = np.stack([exact.truth[name][:, 0] for name in per_wheel("true_utilisation")], axis=-1)
     here = np.maximum(_theta(used, car.shape, car.curvature) * truth, LEAST)
     slips = {
-        (mu, *shape): (slip * np.where(here > LEAST, mu * _theta(used * truth / mu, *shape) / here, 1.0)).mean(axis=1)
-        for mu in LIKELY for shape in SHAPES
-    }  # fmt: skip
-    errors, expected = [], []
+        (mu, *shape): (
+            slip * np.where(here > LEAST, mu * _theta(used * truth / mu, *shape) / here, 1.0)
+        ).mean(axis=1)
+        for mu in LIKELY
+        for shape in SHAPES
+    }
+    errors = []
+    expected = []
     for n, vehicle in enumerate(batch.vehicles):
         measured = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
         stiff = float(np.log(vehicle.longitudinal_stiffness / car.vehicle.longitudinal_stiffness))
@@ -146,15 +169,22 @@ def _cost(
 ) -> float:
     """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated out (Laplace)."""
     t = np.arange(len(v)) / 100.0
-    std = np.array([
-        KNOWN["longitudinal_stiffness"], KNOWN["wheel_radius"], SENSORS[USUAL].acceleration[1], PITCH_LEAK_STD,
-        START_STD,
-    ])  # fmt: skip
-    white, z = 0.5 * SENSORS[USUAL].wheel_speed * radius, np.array([-stiff, 0.0, 0.0, 0.0, 0.0])
+    std = np.array(
+        [
+            KNOWN["longitudinal_stiffness"],
+            KNOWN["wheel_radius"],
+            SENSORS[USUAL].acceleration[1],
+            PITCH_LEAK_STD,
+            START_STD,
+        ]
+    )
+    white = 0.5 * SENSORS[USUAL].wheel_speed * radius
+    z = np.array([-stiff, 0.0, 0.0, 0.0, 0.0])
     centre = z.copy()
     for _ in range(3):
         k, rho, offset, leak, start = z
-        ground, turned = v + offset * t + leak * (v - v[0]) + start, 1.0 + slip * np.exp(-k)
+        ground = v + offset * t + leak * (v - v[0]) + start
+        turned = 1.0 + slip * np.exp(-k)
         off = measured - (1.0 + rho) * ground * turned
         slopes = np.stack(
             [-ground * slip * np.exp(-k), ground * turned, t * turned, (v - v[0]) * turned, turned],

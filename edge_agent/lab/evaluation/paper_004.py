@@ -25,9 +25,13 @@ from schemas.numeric import FloatArray
 
 CONSTANT = 0.05  # variance of all three noises [SI]
 EXPERIMENTS = {
-    "constant": MATCHED, "variable": MATCHED, "sedan": SEDAN, "sedan.variable": SEDAN, "van": PRESETS["van"],
+    "constant": MATCHED,
+    "variable": MATCHED,
+    "sedan": SEDAN,
+    "sedan.variable": SEDAN,
+    "van": PRESETS["van"],
     "van.variable": PRESETS["van"],
-}  # fmt: skip
+}
 STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
@@ -53,7 +57,8 @@ def experiments(
     the paper's, and its controls: untuned (paper-fckf), without adaptation (paper-ckf). Only a_x, a_y and r are
     noisy; the names of S are in that order.
     """
-    found, drives = {}, {}
+    found = {}
+    drives = {}
     for name, vehicle in EXPERIMENTS.items():
         exact = ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
         batch = noisy(
@@ -62,8 +67,10 @@ def experiments(
             seeds,
         )
         for estimator, sets in (
-            ("paper-ckf", STILL), ("paper-fckf", Memberships()), ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"]))
-        ):  # fmt: skip
+            ("paper-ckf", STILL),
+            ("paper-fckf", Memberships()),
+            ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"])),
+        ):
             reported = estimates(bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
             found[name, estimator] = measures(batch, reported)
         drives[f"004.{name}"] = (batch, reported)

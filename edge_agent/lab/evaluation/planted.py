@@ -155,16 +155,22 @@ PLANTED: Final = {
     "receiver late": Planted(late(PLACE), "receiver", "clock"),
     "wheels late": Planted(late(OMEGA), "wheels", "clock"),
     "status bits": Planted(status_bits, "omega_fl", "status bits"),
-    "left and right": Planted(exchanged(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"),
+    "left and right": Planted(
+        exchanged(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"
+    ),
     "front left and right": Planted(
         exchanged(OMEGA[:1], OMEGA[1:2]), "omega", "front left and right exchanged"
     ),
-    "rear left and right": Planted(exchanged(OMEGA[2:3], OMEGA[3:]), "omega", "rear left and right exchanged"),
+    "rear left and right": Planted(
+        exchanged(OMEGA[2:3], OMEGA[3:]), "omega", "rear left and right exchanged"
+    ),
     "front and rear": Planted(exchanged(OMEGA[:2], OMEGA[2:]), "omega", "front and rear exchanged"),
-    "latitude and longitude": Planted(exchanged([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"),
+    "latitude and longitude": Planted(
+        exchanged([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"
+    ),
     "compass for yaw": Planted(compass, "yaw", "compass"),
     "yaw in deg": Planted(scaled([S.YAW], 1.0 / DEG), "yaw", "deg"),
-}  # fmt: skip
+}
 RADII_ALIKE: Final = (
     {"km/h", "radius", "mph", "kn"},
 )  # factors near one: no drive tells a unit from another tyre

@@ -70,7 +70,8 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
         axis.set_ylabel(label)
     axes[3].plot(t, first.batch.mu[:, 0], **_true(), label="true, mean of the wheels")
     for estimator, drive in drives.items():
-        reported, style = drive.reported, _line(estimator)
+        reported = drive.reported
+        style = _line(estimator)
         axes[3].plot(t, reported.mu[:, 0], **style)
         if estimator == DEFAULT or len(drives) == 1:
             band = {
@@ -97,8 +98,10 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
 
 def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
     """What is driven: scenario, manoeuvre, speed, friction, vehicle and seed."""
-    spec, batch = SCENARIOS.get(scenario), drive.batch
-    mu, speed = batch.mu[:, 0], batch.truth["true_vx"][0, 0]
+    spec = SCENARIOS.get(scenario)
+    batch = drive.batch
+    mu = batch.mu[:, 0]
+    speed = batch.truth["true_vx"][0, 0]
     road = f"{mu.min():.2f}" if np.ptp(mu) < NEARLY_ALIKE else f"{mu.max():.2f} to {mu.min():.2f}"
     about = spec.about if spec is not None else "drive"
     return f"{scenario}: {about}\nfrom {speed:.0f} m/s, μ {road}, {batch.vehicles[0].name}, seed {seed}"
@@ -118,8 +121,10 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     """One rough car in a hilly town: speed beside the wheels', slope, friction with the default's interval, health."""
     from matplotlib import pyplot as plt
 
-    batch, car = world.batch, int(np.argmax(np.ptp(world.batch.truth["true_slope"], axis=0)))
-    t, first = batch.t[:, car], next(iter(world.reported.values()))
+    batch = world.batch
+    car = int(np.argmax(np.ptp(world.batch.truth["true_slope"], axis=0)))
+    t = batch.t[:, car]
+    first = next(iter(world.reported.values()))
     figure, axes = plt.subplots(5, 1, figsize=(9, 12), sharex=True, layout="constrained")
     wheels = batch.vehicles[car].wheel_radius * np.nanmean(
         batch.signals[:, car, S.OMEGA : S.OMEGA + 4], axis=-1

@@ -36,14 +36,17 @@ def printed(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
     """A row whose own figure comes from sensors without error."""
-    same, real = f"ideal.{scenario}.{estimator}.{measure}", f"real.{scenario}.ESTIMATOR.{measure}"
+    same = f"ideal.{scenario}.{estimator}.{measure}"
+    real = f"real.{scenario}.ESTIMATOR.{measure}"
     return Printed(paper, what, value, same, real)
 
 
 PRINTED: Final = (
     *(
         Printed(
-            "004", f"{noise} noise, {measure} {name}", value,
+            "004",
+            f"{noise} noise, {measure} {name}",
+            value,
             f"noise.004.{noise}.paper-aco-fckf.{measure.lower()}_{key}",
             f"real.004.dlc.ESTIMATOR.{measure.lower()}_{key}",
         )
@@ -52,50 +55,86 @@ PRINTED: Final = (
     ),
     *(
         Printed(
-            "004", f"{noise} noise, before the ants, MAE {name}", value,
-            f"noise.004.{noise}.paper-fckf.mae_{key}", "",
+            "004",
+            f"{noise} noise, before the ants, MAE {name}",
+            value,
+            f"noise.004.{noise}.paper-fckf.mae_{key}",
+            "",
         )
         for noise, values in UNTUNED_004.items()
         for (name, key), value in zip(MOTION, values, strict=True)
     ),
     Printed(
-        "004", "constant noise, on the simulator's own plant, MAE v_y [m/s]", ".0131",
-        "noise.004.sedan.paper-aco-fckf.mae_vy", "real.004.dlc.ESTIMATOR.mae_vy",
+        "004",
+        "constant noise, on the simulator's own plant, MAE v_y [m/s]",
+        ".0131",
+        "noise.004.sedan.paper-aco-fckf.mae_vy",
+        "real.004.dlc.ESTIMATOR.mae_vy",
     ),
     *(
         printed(
-            "001", "001.dlc", "adaptive-federated-ckf", f"{measure.lower()}_{key}",
-            f"lane change, {measure} {name}", value,
+            "001",
+            "001.dlc",
+            "adaptive-federated-ckf",
+            f"{measure.lower()}_{key}",
+            f"lane change, {measure} {name}",
+            value,
         )
         for measure, values in PRINTED_001.items()
         for (name, key), value in zip((*SPEEDS, ("β [rad]", "beta")), values, strict=True)
     ),
     *(
-        printed("002", f"002.{drive}", "compensated-wckf", f"rmse_{key}", f"{drive}, RMSE {name}", value)
+        printed(
+            "002", f"002.{drive}", "compensated-wckf", f"rmse_{key}", f"{drive}, RMSE {name}", value
+        )
         for drive, values in PRINTED_002.items()
         for (name, key), value in zip(SPEEDS, values, strict=True)
     ),
     printed("003", "003.accel", "sr-ukf", "mu_error", "acceleration, MAE μ", ".0031"),
     printed("003", "003.turn", "sr-ukf", "mu_error", "turn on snow, MAE μ", ".0011"),
     printed("003", "003.split", "sr-ukf", "low_error", "split, MAE μ of the low side", ".0037"),
-    printed("003", "003.straight.split", "sr-ukf", "low_error", "split at constant speed, MAE μ, low side", ".0037"),
-    printed("003", "003.straight.low", "sr-ukf", "mu_error", "snow at constant speed, MAE μ", "small"),
+    printed(
+        "003",
+        "003.straight.split",
+        "sr-ukf",
+        "low_error",
+        "split at constant speed, MAE μ, low side",
+        ".0037",
+    ),
+    printed(
+        "003", "003.straight.low", "sr-ukf", "mu_error", "snow at constant speed, MAE μ", "small"
+    ),
     printed("003", "003.jump", "sr-ukf", "mae_mu", ".85 to .5, MAE μ", ".0059"),
     printed("003", "003.jump", "sr-ukf", "arrival_s", ".85 to .5, s to within .1", "about .2"),
-    printed("000", "000.jump", "federated-ckf", "coverage90", ".5 to .3, coverage of 90 %", "none (about 3 s)"),
-)  # fmt: skip
+    printed(
+        "000",
+        "000.jump",
+        "federated-ckf",
+        "coverage90",
+        ".5 to .3, coverage of 90 %",
+        "none (about 3 s)",
+    ),
+)
 
 OWN: Final = {
-    "000": "federated-ckf", "001": "adaptive-federated-ckf", "002": "compensated-wckf", "003": "sr-ukf",
+    "000": "federated-ckf",
+    "001": "adaptive-federated-ckf",
+    "002": "compensated-wckf",
+    "003": "sr-ukf",
     "004": "paper-aco-fckf",
-}  # fmt: skip
+}
 DEFAULT: Final = "aco-fckf"
 
 
 def names() -> list[str]:
     """Names of the figures that stand beside what the papers print, with their spreads."""
-    found = [name.replace("ESTIMATOR", estimator) for row in PRINTED for name in (row.same, row.real) if name
-             for estimator in ((OWN[row.paper], DEFAULT) if "ESTIMATOR" in name else ("",))]  # fmt: skip
+    found = [
+        name.replace("ESTIMATOR", estimator)
+        for row in PRINTED
+        for name in (row.same, row.real)
+        if name
+        for estimator in ((OWN[row.paper], DEFAULT) if "ESTIMATOR" in name else ("",))
+    ]
     return [f"{name}{end}" for name in found for end in ("", ".sd")]
 
 

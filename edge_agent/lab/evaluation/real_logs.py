@@ -127,7 +127,9 @@ def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray
     """
     pipeline = Pipeline(bank_of(ESTIMATOR, [vehicle]), 1, AgentConfig())
     rows = max(1, round(LOOK_S / float(np.median(np.diff(log.t)))))
-    parts, slippery, urgent = [], [], 0
+    parts = []
+    slippery = []
+    urgent = 0
     below = CENTRES < SLIPPERY_MU
     for block in log.blocks(0, rows=rows):
         estimates, observations, _ = pipeline.step(block)
@@ -174,7 +176,8 @@ def judge_estimates(
     urgent: int | None,
 ) -> LogFigures:
     """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and what is known of it."""
-    t, signals = adopted.log.t, adopted.log.signals
+    t = adopted.log.t
+    signals = adopted.log.signals
     values, slippery = estimates
     wheels = np.where(
         np.isfinite(signals[:, S.OMEGA : S.OMEGA + 4]), signals[:, S.OMEGA : S.OMEGA + 4], 0.0

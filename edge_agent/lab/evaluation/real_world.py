@@ -52,7 +52,9 @@ SURE_GRIP: Final = 0.6
 SETTLED_S: Final = 3.0
 SMOOTH_S: Final = 0.2
 RATE_HZ: Final = 100.0
-TOWN_CARS, TOWN_S, TOWNS = 16, 120.0, 5
+TOWN_CARS = 16
+TOWN_S = 120.0
+TOWNS = 5
 STANDING_S: Final = 70.0
 STANDING_SLOPES: Final = (0.05, 0.08)
 
@@ -135,7 +137,9 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
     """Add one town to the tally of an estimator."""
-    mu, inside, width = batch.mu, covered(batch, reported), reported.mu_upper - reported.mu_lower
+    mu = batch.mu
+    inside = covered(batch, reported)
+    width = reported.mu_upper - reported.mu_lower
     excited = lately(used) >= EXCITED_SHARE
     tally.add("coverage90", inside)
     for name, (above, most) in SURFACES.items():
@@ -153,7 +157,8 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
     tally.add(
         "coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)]
     )
-    icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
+    icy = reported.mu_upper < SLIPPERY_MU
+    grips = mu > SURFACES["wet"][0]
     ice = mu <= SURFACES["ice"][1]
     tally.add("missed_ice", ~icy, ice & excited)
     tally.add("false_grip", reported.mu_lower > mu + FALSE_GRIP, ice)
@@ -214,7 +219,8 @@ class RealWorldResults:
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
     """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is kept for plots."""
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
-    tallies, world = {name: Tally() for name in (*estimators, "baseline")}, None
+    tallies = {name: Tally() for name in (*estimators, "baseline")}
+    world = None
     for seed in seeds[:towns]:
         batch, used = town(seed, cars, seconds)
         baseline(tallies["baseline"], batch)

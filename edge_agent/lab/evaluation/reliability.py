@@ -29,7 +29,8 @@ def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray
     """What the bank says of the drives, and the rank of the truth in its posterior once every EVERY_S, (K, N)."""
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
-    parts, ranks = [], []
+    parts = []
+    ranks = []
     for first, end in pairwise([*range(0, samples, step), samples]):
         parts.append(bank.advance(batch.t[first:end], batch.signals[first:end]))
         if end < samples:

@@ -133,7 +133,8 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
     """Mean, ± sd if wanted and known, or a dash where it was not measured."""
-    value, sd = values.get(name, math.nan), values.get(f"{name}.sd")
+    value = values.get(name, math.nan)
+    sd = values.get(f"{name}.sd")
     return (
         "–"
         if math.isnan(value)
@@ -169,13 +170,23 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 def world(values: dict[str, float]) -> str:
     """One row per estimator in the rough world."""
     shown = {
-        "coverage90": "coverage", "coverage90.ice": "on ice", "missed_ice": "missed ice", "false_grip": "false grip",
+        "coverage90": "coverage",
+        "coverage90.ice": "on ice",
+        "missed_ice": "missed ice",
+        "false_grip": "false grip",
         "false_ice": "false ice",
-        "false_ice.of_all": "of all", "false_ice.settled": "settled", "below": "below",
-        "width": "width, excited", "score": "score", "rmse_vx": "rmse_vx", "coverage90.vx": "coverage of v_x",
-        "rmse_vy": "rmse_vy", "coverage90.vy": "coverage of v_y", "lost": "lost",
+        "false_ice.of_all": "of all",
+        "false_ice.settled": "settled",
+        "below": "below",
+        "width": "width, excited",
+        "score": "score",
+        "rmse_vx": "rmse_vx",
+        "coverage90.vx": "coverage of v_x",
+        "rmse_vy": "rmse_vy",
+        "coverage90.vy": "coverage of v_y",
+        "lost": "lost",
         "standing_5pct.v_max": "standing [m/s]",
-    }  # fmt: skip
+    }
     names = [*estimators(values, "world.", ".coverage90"), "baseline"]
     rows = [[name, *(number(values, f"world.{name}.{key}") for key in shown)] for name in names]
     return grid(("estimator", *shown.values()), rows)
@@ -216,12 +227,22 @@ def faults(values: dict[str, float]) -> str:
             for key, value in values.items()
             if key.startswith(f"faults.{name}.") and key.endswith(".finite")
         ]
-        rows.append([
-            name, case.expected,
-            "–" if not case.flag else verdict(recognised), verdict(whole),
-            *(number(values, f"faults.{name}.{DEFAULT}.{measure}", spread=False) for measure in shown),
-            ", ".join(number(values, f"faults.{name}.{paper}.coverage90", spread=False) for paper in FRICTION),
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                case.expected,
+                "–" if not case.flag else verdict(recognised),
+                verdict(whole),
+                *(
+                    number(values, f"faults.{name}.{DEFAULT}.{measure}", spread=False)
+                    for measure in shown
+                ),
+                ", ".join(
+                    number(values, f"faults.{name}.{paper}.coverage90", spread=False)
+                    for paper in FRICTION
+                ),
+            ]
+        )
     head = ("fault", "expected", "told", "finite", *shown, "coverage of 004, 000, 003")
     return grid(head, rows)
 
@@ -287,9 +308,12 @@ def detection_table(figures: Sequence[Figure]) -> str:
     )
     rows = []
     for name in names:
-        cells, limits, held = [], [], []
+        cells = []
+        limits = []
+        held = []
         for kind in ("rough", "plain"):
-            figure, error = by_name.get(f"{name}.{kind}"), by_name.get(f"{name}.{kind}.se")
+            figure = by_name.get(f"{name}.{kind}")
+            error = by_name.get(f"{name}.{kind}.se")
             winter = by_name.get(f"{name}.{kind}.winter")
             shown = figure is not None and not math.isnan(figure.value)
             cells.append(

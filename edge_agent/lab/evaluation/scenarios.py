@@ -58,7 +58,8 @@ def steered_behind(speed: float) -> TrueVehicle:
     Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), alike at both axles.
     """
     light = LIGHT.vehicle
-    a, b = light.cg_to_front_axle, light.cg_to_rear_axle
+    a = light.cg_to_front_axle
+    b = light.cg_to_rear_axle
     pull = light.mass * speed * speed / (2.0 * light.cornering_stiffness * (a + b))
     return replace(LIGHT, rear_steer=(pull * a - b) / (pull * b + a))
 
@@ -74,10 +75,15 @@ VAN: Final = replace(
 LOADED: Final = replace(
     SEDAN,
     vehicle=SEDAN.vehicle.model_copy(
-        update={"mass": 2050.0, "yaw_inertia": 2500.0, "cg_height": 0.60, "cg_to_front_axle": 1.45,
-                "cg_to_rear_axle": 1.24}
+        update={
+            "mass": 2050.0,
+            "yaw_inertia": 2500.0,
+            "cg_height": 0.60,
+            "cg_to_front_axle": 1.45,
+            "cg_to_rear_axle": 1.24,
+        }
     ),
-)  # fmt: skip
+)
 
 PAPERS: Final = {
     "004.dlc": DriveSpec(

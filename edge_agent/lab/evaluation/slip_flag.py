@@ -71,7 +71,8 @@ def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
     """Return the flagged friction (T,) of one car: signals (T, channels); car: radius, wheelbase, half track, share."""
     out = np.full(signals.shape[0], np.inf)
     smooth = 1.0 - np.exp(-period / SMOOTH_S)
-    rim, found = np.zeros(4), np.zeros(4)
+    rim = np.zeros(4)
+    found = np.zeros(4)
     ax = ay = yaw_rate = steer = speed = 0.0
     agreed = slipping = yawing = 0.0
     since_slip = since_yaw = np.inf
@@ -95,10 +96,13 @@ def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
                 count += 1
         if count == 0:
             continue
-        middle, most, least = _median(found, count), found[:count].max(), found[:count].min()
+        middle = _median(found, count)
+        most = found[:count].max()
+        least = found[:count].min()
         wanted = most if ax < -BRAKING else least if ax > BRAKING else middle
         if not begun:
-            speed, begun = middle, True
+            speed = middle
+            begun = True
         speed = min(max(wanted, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
         alike = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(
             speed, SLOWEST

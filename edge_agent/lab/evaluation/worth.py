@@ -32,13 +32,23 @@ from schemas.runtime.figures import Figure
 from schemas.thresholds import SURFACES
 
 ESTIMATOR: Final = "aco-fckf"
-CARS, TOWN_S, DRIVE_S, SEEDS = 8, 60.0, 8.0, 5
+CARS = 8
+TOWN_S = 60.0
+DRIVE_S = 8.0
+SEEDS = 5
 RATE_HZ: Final = 100.0
 SETTLED_S: Final = 1.0  # before, the score is that of the prior
 RATIOS: Final = {"fuzzy.worth": ("fuzzy", "none"), "ants.worth": ("colony", "random")}
 MANOEUVRES: Final = (
-    "double-lane-change", "slalom", "sine", "acceleration", "braking", "constant-radius", "pulses", "j-turn",
-)  # fmt: skip
+    "double-lane-change",
+    "slalom",
+    "sine",
+    "acceleration",
+    "braking",
+    "constant-radius",
+    "pulses",
+    "j-turn",
+)
 
 Scores = dict[str, dict[str, FloatArray]]  # by way, then by surface and "all": one number per seed
 
@@ -46,7 +56,8 @@ Scores = dict[str, dict[str, FloatArray]]  # by way, then by surface and "all": 
 def campaign(seeds: Sequence[int], *, quick: bool) -> Scores:
     """Interval scores by way, surface and seed."""
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
-    chosen, found = [seeds[0]] if quick else list(seeds[:count]), ways()
+    chosen = [seeds[0]] if quick else list(seeds[:count])
+    found = ways()
     scores: dict[str, dict[str, list[float]]] = {way: {} for way in found}
     for seed in chosen:
         batches = [town(seed, cars, seconds)[0], manoeuvres(seed, 2.0 if quick else DRIVE_S)]
@@ -69,7 +80,8 @@ def ways() -> dict[str, list[tuple[Memberships, bool]]]:
     searched = {
         way: [(one, True) for one in sets] for way, sets in search_results(ESTIMATOR).items()
     }
-    tuned, untuned = shipped(ESTIMATOR), Memberships()
+    tuned = shipped(ESTIMATOR)
+    untuned = Memberships()
     given = {
         "fuzzy": (tuned, True),
         "none": (untuned, False),
@@ -81,15 +93,21 @@ def ways() -> dict[str, list[tuple[Memberships, bool]]]:
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
     """One drive of each manoeuvre with misaligned devices: vehicle, friction and road drawn by the seed."""
-    rng, drives = np.random.default_rng([seed, 17]), []
+    rng = np.random.default_rng([seed, 17])
+    drives = []
     for k, manoeuvre in enumerate(MANOEUVRES):
         drives.append(
             simulate_manoeuvre(
-                manoeuvre, mu=float(rng.uniform(0.15, 1.0)), seed=1000 * seed + k, rate_hz=RATE_HZ, duration_s=seconds,
-                vehicle=list(PRESETS)[int(rng.integers(len(PRESETS)))], sensors="rough",
+                manoeuvre,
+                mu=float(rng.uniform(0.15, 1.0)),
+                seed=1000 * seed + k,
+                rate_hz=RATE_HZ,
+                duration_s=seconds,
+                vehicle=list(PRESETS)[int(rng.integers(len(PRESETS)))],
+                sensors="rough",
                 road=list(ROADS)[int(rng.integers(1, len(ROADS)))],
             )
-        )  # fmt: skip
+        )
     return joined(drives)
 
 
@@ -97,7 +115,8 @@ def _scored(
     batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: bool
 ) -> dict[str, float]:
     """Mean interval score over the drives, and over all samples of each surface (NaN where none is met)."""
-    drives, samples = [], []
+    drives = []
+    samples = []
     for batch in batches:
         bank = mixture_bank(
             parameter_table(batch.vehicles), design_of(memberships, adaptive=adaptive)

@@ -109,7 +109,8 @@ def written(kind: str, folder: Path) -> tuple[str, Path | None]:
     """The peer's profile and database as files."""
     if kind == "vss":
         return "vss", None
-    profile, dbc = folder / f"{kind}.json", folder / "peer.dbc"
+    profile = folder / f"{kind}.json"
+    dbc = folder / "peer.dbc"
     profile.write_text(profile_of(kind).text(), encoding="utf-8")
     dbc.write_text(DBC, encoding="utf-8")
     return str(profile), dbc
@@ -126,7 +127,9 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     vehicle = PRESETS["sedan"].vehicle
     feeds, profile, clock = open_sources([source], name, dbc)
     rows = LiveRows(feeds, profile, vehicle, clock)
-    parts, sent, quiet_since = [], 0, float("inf")
+    parts = []
+    sent = 0
+    quiet_since = float("inf")
     with peer(kind, place, samples) as running:
         running.until("ready")
         blocks = rows.blocks()
@@ -138,7 +141,8 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
         for block in blocks:
             parts.append(block.signals[:, 0])
             if feeds[0].heard > heard:
-                heard, quiet_since = feeds[0].heard, time.monotonic()
+                heard = feeds[0].heard
+                quiet_since = time.monotonic()
             if (
                 time.monotonic() > quiet_since + SETTLED_S
                 or time.monotonic() > began + seconds + PATIENCE_S
@@ -168,7 +172,8 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     for kind in (*COUNTED, "gpsd"):
         place, source = addresses(kind)
         name, dbc = written("can" if kind == "gpsd" else kind, folder)
-        config, port = folder / f"{kind}.agent.json", free_port()
+        config = folder / f"{kind}.agent.json"
+        port = free_port()
         settings = {
             "spool": str(folder / f"{kind}.sqlite"),
             "estimator": "ckf",
@@ -268,6 +273,7 @@ def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
     for reason in bad:
         print(reason, file=sys.stderr)
     return [
-        *found, Figure("live.source_loss.crashes", float(len(bad)), "crashes", 0.0),
+        *found,
+        Figure("live.source_loss.crashes", float(len(bad)), "crashes", 0.0),
         Figure("live.source_loss.losses", float(tries), "losses", 12.0, "more"),
-    ]  # fmt: skip
+    ]

@@ -26,7 +26,9 @@ from schemas.runtime.zenoh_session import open_session
 from schemas.signals import per_wheel
 from schemas.thresholds import NS
 
-SPEED, RADIUS = 15.0, 0.3  # [m/s], [m]
+# [m/s], [m]
+SPEED = 15.0
+RADIUS = 0.3
 CHANNELS: Final = ("ax", "ay", "yaw_rate", "delta_fl", *per_wheel("omega"))
 STEP: Final = 1e-6  # of a number on the bus
 DBC: Final = "".join(
@@ -45,9 +47,12 @@ def drive_at(t: float) -> dict[str, float]:
     """What the channels read at time t [s] of a gentle slalom."""
     rate = 0.2 * np.sin(1.5 * t)
     return {
-        "ax": 0.0, "ay": SPEED * rate, "yaw_rate": rate, "delta_fl": 2.7 * rate / SPEED,
+        "ax": 0.0,
+        "ay": SPEED * rate,
+        "yaw_rate": rate,
+        "delta_fl": 2.7 * rate / SPEED,
         **dict.fromkeys(per_wheel("omega"), SPEED / RADIUS),
-    }  # fmt: skip
+    }
 
 
 def profile_of(kind: str) -> Profile:
@@ -101,11 +106,16 @@ def ros2(address: str, samples: int, rate: float) -> int:
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     of = store.types
     header, stamp, vector, turned, imu, joints = (
-        of[name] for name in (
-            "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Vector3",
-            "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState",
+        of[name]
+        for name in (
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+            "geometry_msgs/msg/Vector3",
+            "geometry_msgs/msg/Quaternion",
+            "sensor_msgs/msg/Imu",
+            "sensor_msgs/msg/JointState",
         )
-    )  # fmt: skip
+    )
     names = [name for name in CHANNELS if name not in ("ax", "ay", "yaw_rate")]
     none = np.zeros(9)
     with session:
@@ -121,12 +131,11 @@ def ros2(address: str, samples: int, rate: float) -> int:
         while not all(publisher.matching_status.matching for publisher in put):  # type: ignore[attr-defined]
             time.sleep(0.01)
         for k, t in enumerate(paced(samples, rate)):
-            now, values = time.time_ns(), drive_at(t)
+            now = time.time_ns()
+            values = drive_at(t)
             head = header(stamp(now // NS, now % NS), "")
-            turn, pull = (
-                vector(0.0, 0.0, values["yaw_rate"]),
-                vector(values["ax"], values["ay"], 9.8),
-            )
+            turn = vector(0.0, 0.0, values["yaw_rate"])
+            pull = vector(values["ax"], values["ay"], 9.8)
             speeds = np.array([values[name] for name in names])
             messages = (
                 imu(head, turned(0, 0, 0, 1), none, turn, none, pull, none),
@@ -154,7 +163,8 @@ def vss(address: str, samples: int, rate: float) -> int:
     with Databroker(address, [paths[name] for name in published]) as broker:
         ready()
         for t in paced(samples, rate):
-            now, values = time.time_ns(), drive_at(t)
+            now = time.time_ns()
+            values = drive_at(t)
             broker.publish(
                 {paths[n]: values[n] / (DEG if n in degrees else 1.0) for n in published}, now
             )

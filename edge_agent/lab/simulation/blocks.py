@@ -16,7 +16,8 @@ def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
     """Blocks of BLOCK_S without end; simulated time begins at the moment the first block is asked for."""
-    steps, start_ns = max(1, round(BLOCK_S * rate_hz)), 0
+    steps = max(1, round(BLOCK_S * rate_hz))
+    start_ns = 0
     while True:
         t, signals = fleet.step(steps)
         start_ns = start_ns or time.time_ns()  # after the first step, which may have to compile

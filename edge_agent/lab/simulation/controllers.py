@@ -84,11 +84,9 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
     """Move the brake torque that ABS lets through at wheel `i` on by `dt` [s]."""
-    asked, limit, slip = (
-        u[Control.BRAKE, i] + x[Motion.HELD + i],
-        slip_limit(p, i),
-        w[Wheel.SLIP, i],
-    )
+    asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
+    limit = slip_limit(p, i)
+    slip = w[Wheel.SLIP, i]
     pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
     if asked <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
         x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
@@ -137,7 +135,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
     """Return which wheel ESC brakes (-1: none) and with what torque, over weight times radius."""
-    vx, r = x[Motion.VX], x[Motion.YAW_RATE]
+    vx = x[Motion.VX]
+    r = x[Motion.YAW_RATE]
     if p[TrueParameter.ESC] <= 0.0 or vx < ESC_SLOWEST:
         x[Motion.DEVIATES] = 0.0
         x[Motion.ASKED] = r

@@ -113,7 +113,8 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     """
     points, first, size, spacing, ways = lanes
     while True:
-        lane, point = g[Route.LANE], g[Route.POINT]
+        lane = g[Route.LANE]
+        point = g[Route.POINT]
         row = points[first[lane] + point]
         along = (x[Motion.X] - row[LanePoint.X]) * row[LanePoint.COS] + (
             x[Motion.Y] - row[LanePoint.Y]
@@ -135,7 +136,8 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
     Beyond the next lane he takes the first way.
     """
     _, first, size, spacing, ways = lanes
-    lane, way = g[Route.LANE], g[Route.WAY]
+    lane = g[Route.LANE]
+    way = g[Route.WAY]
     left = max(distance - d[Driver.SHORT] + g[Route.POINT] * spacing[lane], 0.0)
     while True:
         length = (size[lane] - 1) * spacing[lane]
@@ -143,7 +145,8 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
             point = int(left / spacing[lane])
             return int(first[lane] + point), float(left - point * spacing[lane])
         left -= length
-        lane, way = ways[lane, way], 0
+        lane = ways[lane, way]
+        way = 0
 
 
 @compiled
@@ -228,7 +231,8 @@ def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
     """Longitudinal acceleration [m/s^2] that he asks for."""
-    vx, q = x[Motion.VX], budget(d)
+    vx = x[Motion.VX]
+    q = budget(d)
     reach = max(2.0, 0.5 * vx)
     lane = g[Route.LANE]
     row, beyond = ahead(d, g, lanes, reach)
@@ -289,14 +293,17 @@ def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
     """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
-    vx, base = max(x[Motion.VX], SLOWEST), p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
+    vx = max(x[Motion.VX], SLOWEST)
+    base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
     offset = d[Driver.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[Driver.WOBBLE])
     dx = row[LanePoint.X] + row[LanePoint.COS] * beyond - row[LanePoint.SIN] * offset - x[Motion.X]
     dy = row[LanePoint.Y] + row[LanePoint.SIN] * beyond + row[LanePoint.COS] * offset - x[Motion.Y]
-    c, s = math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW])
-    forward, left = c * dx + s * dy + p[Parameter.TO_REAR], c * dy - s * dx
+    c = math.cos(x[Motion.YAW])
+    s = math.sin(x[Motion.YAW])
+    forward = c * dx + s * dy + p[Parameter.TO_REAR]
+    left = c * dy - s * dx
     if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
         return math.copysign(LARGEST_STEER, left)
     steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
@@ -307,9 +314,14 @@ def wished_steer(
 
 @compiled
 def drive(
-    x: FloatArray, driver: tuple[FloatArray, IntArray], world: tuple[Lanes, FloatArray], p: FloatArray,
-    w: FloatArray, now: tuple[float, float, float], keys: tuple[Key, Key],
-) -> None:  # fmt: skip
+    x: FloatArray,
+    driver: tuple[FloatArray, IntArray],
+    world: tuple[Lanes, FloatArray],
+    p: FloatArray,
+    w: FloatArray,
+    now: tuple[float, float, float],
+    keys: tuple[Key, Key],
+) -> None:
     """Move a driver (d, g) and his route on by one sample: afterwards d[STEER], d[FORCE] are what arms and foot do.
 
     world: lanes and friction; `w` is what the wheels did at the last sample; now: time [s], length of the sample [s]

@@ -89,10 +89,14 @@ class Truth:
 
 @compiled
 def run(
-    states: tuple[FloatArray, FloatArray, IntArray, FloatArray], parameters: FloatArray,
-    ground: tuple[Lanes, FloatArray, FloatArray], keys: tuple[KeyArray, KeyArray], first: int, steps: int,
+    states: tuple[FloatArray, FloatArray, IntArray, FloatArray],
+    parameters: FloatArray,
+    ground: tuple[Lanes, FloatArray, FloatArray],
+    keys: tuple[KeyArray, KeyArray],
+    first: int,
+    steps: int,
     timing: tuple[float, int],
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Records (T, N, RECORD) of the next `steps` samples; the states are carried on in place.
 
     states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
@@ -105,7 +109,11 @@ def run(
     records = np.empty((steps, vehicles.shape[0], RECORD))
     u = np.zeros((INPUTS, 4))
     for n in range(vehicles.shape[0]):
-        x, d, g, w, p = vehicles[n], drivers[n], routes[n], wheels[n], parameters[n]
+        x = vehicles[n]
+        d = drivers[n]
+        g = routes[n]
+        w = wheels[n]
+        p = parameters[n]
         for k in range(steps):
             t = (first + k) * period
             lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
@@ -148,9 +156,15 @@ class SimulatedFleet:
     """
 
     def __init__(
-        self, scenario: str | Scenario, vehicles: int, seed: int, rate_hz: float,
-        sensors: str | Sensors = "mems-patchy", rough: float = 0.0, winter: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        scenario: str | Scenario,
+        vehicles: int,
+        seed: int,
+        rate_hz: float,
+        sensors: str | Sensors = "mems-patchy",
+        rough: float = 0.0,
+        winter: float = 0.0,
+    ) -> None:
         if vehicles < 1:
             raise InputError(
                 "vehicles", f"{vehicles} vehicles cannot drive", "give a positive number"
@@ -177,10 +191,14 @@ class SimulatedFleet:
             )
         self._parameters = np.stack([truth.row() for truth in truths])
         self.rough = rough_ones(vehicles, rough)
-        ordinary, origin = sensors_named(sensors), self.scenario.origin
-        self._errors = np.stack([
-            error_row(ROUGH_FLEET if self.rough[k] else ordinary, origin, seed, k) for k in range(vehicles)
-        ])  # fmt: skip
+        ordinary = sensors_named(sensors)
+        origin = self.scenario.origin
+        self._errors = np.stack(
+            [
+                error_row(ROUGH_FLEET if self.rough[k] else ordinary, origin, seed, k)
+                for k in range(vehicles)
+            ]
+        )
         noise = [noise_keys(seed, k) for k in range(vehicles)]
         self._noise = (
             np.array([white for white, _ in noise]),
@@ -203,13 +221,15 @@ class SimulatedFleet:
         """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then that of this block."""
         if steps < 1:
             raise InputError("steps", f"{steps} samples cannot be had", "give a positive number")
-        network, origin = self.scenario.network, self.scenario.origin
+        network = self.scenario.network
+        origin = self.scenario.origin
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)
         timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
         ground = (lanes, self.scenario.table, self._relief)
         records = run(self._states, self._parameters, ground, self._keys, self._next, steps, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
-        known, lead = np.concatenate([self._before, records]), len(self._before)
+        known = np.concatenate([self._before, records])
+        lead = len(self._before)
         clock = (self._next, self.rate_hz, lead)
         signals = sense(known, self._errors, self._wander, place, self._noise, clock)
         memory = memory_of(self._errors[:, ErrorColumn.MOUNTED :], self.rate_hz)
@@ -225,14 +245,18 @@ class SimulatedFleet:
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
         """Where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart, `length` [m] or more."""
-        network, key = self.scenario.network, self._keys[0][k]
+        network = self.scenario.network
+        key = self._keys[0][k]
         lane, point, way, turns = (int(value) for value in self._states[2][k])
-        parts, run = [], 0.0
+        parts = []
+        run = 0.0
         while run < length:
             part = network.lane(lane)[point:, [LanePoint.X, LanePoint.Y]]
             parts.append(part)
             run += len(part) * float(network.spacing[lane])
-            lane, point, turns = int(network.ways[lane, way]), 0, turns + 1
+            lane = int(network.ways[lane, way])
+            point = 0
+            turns = turns + 1
             way = int(uniform(key, turns) * ways_of(network.ways, lane))
         line = np.concatenate(parts)
         return self.scenario.to_latlon(line[:, 0], line[:, 1])
@@ -293,8 +317,10 @@ def _start(
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
     """Vehicles where the network has them start, rolling at walking pace, each with a driver of his own."""
     count = len(rngs)
-    vehicles, wheels = np.zeros((count, STATES)), np.zeros((count, len(Wheel), 4))
-    drivers, routes = np.zeros((count, len(Driver))), np.zeros((count, len(Route)), dtype=np.int64)
+    vehicles = np.zeros((count, STATES))
+    wheels = np.zeros((count, len(Wheel), 4))
+    drivers = np.zeros((count, len(Driver)))
+    routes = np.zeros((count, len(Route)), dtype=np.int64)
     end = np.cumsum(network.size[: network.roads])
     for k, rng in enumerate(rngs):
         place = int((k + 0.5) * GOLDEN % 1.0 * end[-1])

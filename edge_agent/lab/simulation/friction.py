@@ -17,7 +17,10 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 # what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of the usual ranges
-DRY, WET, SNOW, ICE = 0.90, 0.60, 0.35, 0.18
+DRY = 0.90
+WET = 0.60
+SNOW = 0.35
+ICE = 0.18
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,10 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
         row = table[i]
         if t < row[PatchColumn.START] or t >= row[PatchColumn.END] or math.isnan(row[column]):
             continue
-        dx, dy = x - row[PatchColumn.X], y - row[PatchColumn.Y]
-        along, across = (
-            dx * row[PatchColumn.COS] + dy * row[PatchColumn.SIN],
-            dy * row[PatchColumn.COS] - dx * row[PatchColumn.SIN],
-        )
+        dx = x - row[PatchColumn.X]
+        dy = y - row[PatchColumn.Y]
+        along = dx * row[PatchColumn.COS] + dy * row[PatchColumn.SIN]
+        across = dy * row[PatchColumn.COS] - dx * row[PatchColumn.SIN]
         if (
             abs(along) <= row[PatchColumn.HALF_LENGTH]
             and abs(across) <= row[PatchColumn.HALF_WIDTH]

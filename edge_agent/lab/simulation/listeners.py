@@ -82,8 +82,6 @@ class WarnedDrivers:
         while not self._warnings.empty():
             k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself
-                start, end = (
-                    warning.distance_m - AROUND_M,
-                    warning.distance_m + warning.length_m + AROUND_M,
-                )
+                start = warning.distance_m - AROUND_M
+                end = warning.distance_m + warning.length_m + AROUND_M
                 self._fleet.warn(k, (start, end), warning.safe_speed, warning.mu_lower)

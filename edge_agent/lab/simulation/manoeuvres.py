@@ -88,7 +88,8 @@ def hold(now: Moment, speed: float | None = None) -> float:
 
 def steer_to(now: Moment, target_x: float, target_y: float) -> float:
     """Pure pursuit (Coulter, CMU-RI-TR-92-01): the steering of the circle through a point ahead."""
-    dx, dy = target_x - now.x, target_y - now.y
+    dx = target_x - now.x
+    dy = target_y - now.y
     ahead = math.cos(now.yaw) * dx + math.sin(now.yaw) * dy
     left = math.cos(now.yaw) * dy - math.sin(now.yaw) * dx
     curvature = 2.0 * left / max(ahead * ahead + left * left, 1.0)
@@ -157,7 +158,8 @@ def gentle_braking(now: Moment) -> tuple[float, float]:
 
 def constant_radius(now: Moment) -> tuple[float, float]:
     """A circle of 40 m radius to the left, entered straight (ISO 4138)."""
-    radius, look = 40.0, preview(now)
+    radius = 40.0
+    look = preview(now)
     angle = math.atan2(now.x, radius - now.y) + look / radius
     return steer_to(now, radius * math.sin(angle), radius - radius * math.cos(angle)), hold(now)
 

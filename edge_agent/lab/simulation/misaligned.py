@@ -54,8 +54,10 @@ ROUGH: Final = Misalignment(
     tilt=(0.035, 0.015, 0.01), steering=(0.003, 0.03, 0.05), radius=0.004, step=0.1, lag_s=0.06
 )
 MISALIGNED: Final = {
-    "rough": ROUGH, "rough-coarse": replace(ROUGH, step=KMH), "rough-late": replace(ROUGH, lag_s=0.4),
-}  # fmt: skip
+    "rough": ROUGH,
+    "rough-coarse": replace(ROUGH, step=KMH),
+    "rough-late": replace(ROUGH, lag_s=0.4),
+}
 
 
 class Misaligned(IntEnum):
@@ -76,7 +78,8 @@ class Misaligned(IntEnum):
 
 def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
     """Misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
-    key, row = key_of(seed, index, MOUNT_STREAM), np.zeros(COLUMNS)
+    key = key_of(seed, index, MOUNT_STREAM)
+    row = np.zeros(COLUMNS)
     row[Misaligned.ROUGH] = float(size != ALIGNED)
     stds = (
         *(GRAVITY * tilt for tilt in size.tilt[:2]),
@@ -107,7 +110,8 @@ def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> N
     """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them, the first before all."""
     whole = math.floor(samples)
     share = samples - whole
-    near, far = max(now - whole, 0), max(now - whole - 1, 0)
+    near = max(now - whole, 0)
+    far = max(now - whole - 1, 0)
     for c in range(record.size):
         record[c] = (1.0 - share) * records[near, c] + share * records[far, c]
 
@@ -115,7 +119,8 @@ def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> N
 @compiled
 def misalign(mounted: FloatArray, signals: FloatArray) -> None:
     """Turn true readings (18,) into those of misaligned devices, in place."""
-    ax, ay = signals[S.AX], signals[S.AY]
+    ax = signals[S.AX]
+    ay = signals[S.AY]
     signals[S.AX] = ax + mounted[Misaligned.AX] + mounted[Misaligned.TURN] * ay
     signals[S.AY] = ay + mounted[Misaligned.AY] - mounted[Misaligned.TURN] * ax
     for i in range(2):

@@ -28,12 +28,11 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 STEP_S: Final = 1e-4  # of the motor's equations; its electrical time constant is L/R = 3 ms
-D, Q, D_SUM, Q_SUM = (
-    0,
-    1,
-    2,
-    3,
-)  # columns of a motor's state: currents [A], integrals of their errors [A s]
+# columns of a motor's state: currents [A], integrals of their errors [A s]
+D = 0
+Q = 1
+D_SUM = 2
+Q_SUM = 3
 
 
 class Pmsm(NamedTuple):
@@ -83,7 +82,8 @@ def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: 
     for _ in range(count):
         back_d = electrical * motor.inductance_q * state[Q]
         back_q = electrical * (motor.inductance_d * state[D] + motor.flux)
-        error_d, error_q = -state[D], aim - state[Q]
+        error_d = -state[D]
+        error_q = aim - state[Q]
         control = motor.bandwidth * motor.resistance
         voltage_d = motor.bandwidth * motor.inductance_d * error_d + control * state[D_SUM] - back_d
         voltage_q = motor.bandwidth * motor.inductance_q * error_q + control * state[Q_SUM] + back_q

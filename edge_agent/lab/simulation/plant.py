@@ -63,7 +63,8 @@ STILL: Final = 0.02
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
     """(g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the road."""
-    ahead, left = u[Control.TILT, 0], u[Control.TILT, 1]
+    ahead = u[Control.TILT, 0]
+    left = u[Control.TILT, 1]
     share = 1.0 / math.sqrt(1.0 + ahead * ahead + left * left)
     return -GRAVITY * ahead * share, -GRAVITY * left * share, share
 
@@ -85,7 +86,8 @@ def wheel_torques(
     x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
 ) -> tuple[float, float]:
     """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its slip."""
-    drive, brake = u[Control.DRIVE, i], u[Control.BRAKE, i]
+    drive = u[Control.DRIVE, i]
+    brake = u[Control.BRAKE, i]
     if p[TrueParameter.ABS_HZ] > 0.0:
         drive *= 1.0 - x[Motion.CUT]
         brake += x[Motion.HELD + i]
@@ -124,7 +126,8 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
     at_rest = wheel_loads(body(p), 0.0, 0.0)
     _, _, share = gravity(u)
     for i in range(4):
-        load, omega = share * loads[i], x[Motion.OMEGA + i]
+        load = share * loads[i]
+        omega = x[Motion.OMEGA + i]
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
         )
@@ -143,8 +146,10 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
             slope_y *= p[Parameter.REAR_SLOPE]
         if p[TrueParameter.SOFTENING] > 0.0:
             soft = (u[Control.MU, i] / FIRM) ** p[TrueParameter.SOFTENING]
-            slope_x, slope_y = soft * slope_x, soft * slope_y
-        theta_x, theta_y = slope_x * slip_x / u[Control.MU, i], slope_y * slip_y / u[Control.MU, i]
+            slope_x = soft * slope_x
+            slope_y = soft * slope_y
+        theta_x = slope_x * slip_x / u[Control.MU, i]
+        theta_y = slope_y * slip_y / u[Control.MU, i]
         theta = math.hypot(theta_x, theta_y)
         if p[TrueParameter.CURVE] == 0.0:
             curve = magic_formula(theta, p[TrueParameter.SHAPE], p[TrueParameter.CURVATURE])
@@ -198,7 +203,8 @@ def turn_wheels(
     radius = p[Parameter.RADIUS]
     for i in range(4):
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
-        omega, slip = x[Motion.OMEGA + i], abs(w[Wheel.SLIP, i])
+        omega = x[Motion.OMEGA + i]
+        slip = abs(w[Wheel.SLIP, i])
         slow = max(abs(omega), STANDING)
         resistance = p[TrueParameter.ROLLING] * radius * w[Wheel.FZ, i] * omega / slow
         excess = (
@@ -260,13 +266,16 @@ def advance(
             continue
         wheel_forces(x, p, u, w)
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
-        vx, vy, r = x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE]
+        vx = x[Motion.VX]
+        vy = x[Motion.VY]
+        r = x[Motion.YAW_RATE]
         turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
         if p[TrueParameter.RELAXATION] > 0.0:
             relax(x, p, u, dt)
         if p[TrueParameter.ABS_HZ] > 0.0:
             control_slip(x, p, u, w, dt)
-        c, s = math.cos(x[Motion.YAW] + 0.5 * dt * r), math.sin(x[Motion.YAW] + 0.5 * dt * r)
+        c = math.cos(x[Motion.YAW] + 0.5 * dt * r)
+        s = math.sin(x[Motion.YAW] + 0.5 * dt * r)
         x[Motion.X] += dt * (c * vx - s * vy)
         x[Motion.Y] += dt * (s * vx + c * vy)
         x[Motion.YAW] += dt * r
@@ -336,7 +345,8 @@ def substeps_of(rate_hz: float) -> int:
 def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
     """Where wheel `i` stands on the ground, (x, y) [m]."""
     ahead, left = wheel_position(p, i)
-    c, s = math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW])
+    c = math.cos(x[Motion.YAW])
+    s = math.sin(x[Motion.YAW])
     return x[Motion.X] + c * ahead - s * left, x[Motion.Y] + s * ahead + c * left
 
 

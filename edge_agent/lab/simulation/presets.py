@@ -83,11 +83,25 @@ class TrueVehicle:
             self.roll_leak,
             self.pitch_leak,
         )
-        return np.array([
-            *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
-            CURVES[self.curve], STIFFNESSES.get(self.stiffness, self.softening), self.rear_steer,
-            self.relaxation, self.abs_hz, self.tcs, self.esc, self.regeneration,
-        ])  # fmt: skip
+        return np.array(
+            [
+                *nominal,
+                *own,
+                self.drag,
+                self.rolling,
+                self.slip_limit,
+                self.brake_front,
+                self.power,
+                CURVES[self.curve],
+                STIFFNESSES.get(self.stiffness, self.softening),
+                self.rear_steer,
+                self.relaxation,
+                self.abs_hz,
+                self.tcs,
+                self.esc,
+                self.regeneration,
+            ]
+        )
 
 
 def car(
@@ -104,32 +118,79 @@ def car(
     """A vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17 per radian."""
     load = mass * GRAVITY / 4.0
     return Vehicle(
-        name=name, mass=mass, yaw_inertia=yaw_inertia, cg_to_front_axle=axles[0], cg_to_rear_axle=axles[1],
-        track_front=tracks[0], track_rear=tracks[1], cg_height=cg_height, wheel_radius=radius, wheel_inertia=1.2,
-        longitudinal_stiffness=20.0 * load, cornering_stiffness=17.0 * load, drive_split_front=drive_front,
-    )  # fmt: skip
+        name=name,
+        mass=mass,
+        yaw_inertia=yaw_inertia,
+        cg_to_front_axle=axles[0],
+        cg_to_rear_axle=axles[1],
+        track_front=tracks[0],
+        track_rear=tracks[1],
+        cg_height=cg_height,
+        wheel_radius=radius,
+        wheel_inertia=1.2,
+        longitudinal_stiffness=20.0 * load,
+        cornering_stiffness=17.0 * load,
+        drive_split_front=drive_front,
+    )
 
 
 PRESETS: Final = {
     "small": TrueVehicle(  # a front-driven hatchback
-        car("small", 1180.0, 1420.0, (1.02, 1.53), (1.48, 1.48), cg_height=0.52, radius=0.305, drive_front=1.0),
-        shape=1.45, power=65e3,
+        car(
+            "small",
+            1180.0,
+            1420.0,
+            (1.02, 1.53),
+            (1.48, 1.48),
+            cg_height=0.52,
+            radius=0.305,
+            drive_front=1.0,
+        ),
+        shape=1.45,
+        power=65e3,
     ),
     "sedan": TrueVehicle(  # paper 004, table 1; stiffnesses and wheel inertia are not given there; four driven wheels
-        car("sedan", 1643.0, 1954.0, (1.287, 1.403), (1.581, 1.586), cg_height=0.545, radius=0.359, drive_front=0.5),
-        shape=1.55, power=120e3,
+        car(
+            "sedan",
+            1643.0,
+            1954.0,
+            (1.287, 1.403),
+            (1.581, 1.586),
+            cg_height=0.545,
+            radius=0.359,
+            drive_front=0.5,
+        ),
+        shape=1.55,
+        power=120e3,
     ),
     "van": TrueVehicle(  # a rear-driven, half-laden delivery van
-        car("van", 2350.0, 4600.0, (1.55, 1.75), (1.70, 1.68), cg_height=0.74, radius=0.345, drive_front=0.0),
-        shape=1.40, curvature=0.0, roll_leak=0.10, drag=0.75, power=100e3,
+        car(
+            "van",
+            2350.0,
+            4600.0,
+            (1.55, 1.75),
+            (1.70, 1.68),
+            cg_height=0.74,
+            radius=0.345,
+            drive_front=0.0,
+        ),
+        shape=1.40,
+        curvature=0.0,
+        roll_leak=0.10,
+        drag=0.75,
+        power=100e3,
     ),
-}  # fmt: skip
+}
 
 # how well a vehicle file knows its vehicle: relative standard deviations
 KNOWN: Final = {
-    "mass": 0.03, "yaw_inertia": 0.05, "wheel_radius": 0.002, "cg_height": 0.05,
-    "longitudinal_stiffness": 0.12, "cornering_stiffness": 0.10,
-}  # fmt: skip
+    "mass": 0.03,
+    "yaw_inertia": 0.05,
+    "wheel_radius": 0.002,
+    "cg_height": 0.05,
+    "longitudinal_stiffness": 0.12,
+    "cornering_stiffness": 0.10,
+}
 
 
 def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:

@@ -94,7 +94,8 @@ def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
     """∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left of `heading` (cos, sin)."""
-    east, north = -left * heading[1], left * heading[0]
+    east = -left * heading[1]
+    north = left * heading[0]
     for k in range(1, table.shape[0]):
         row = table[k]
         along = place[0] * row[WaveColumn.EAST] + place[1] * row[WaveColumn.NORTH]
@@ -105,14 +106,16 @@ def gradient(
         north += row[WaveColumn.PEAK] * slope * row[WaveColumn.NORTH]
     steep = math.hypot(east, north)
     if steep > STEEPEST:
-        east, north = east * STEEPEST / steep, north * STEEPEST / steep
+        east = east * STEEPEST / steep
+        north = north * STEEPEST / steep
     return east, north
 
 
 @compiled
 def tilt(east: float, north: float, yaw: float) -> tuple[float, float]:
     """Rise per metre ahead of a vehicle of that heading [rad], and to its left."""
-    c, s = math.cos(yaw), math.sin(yaw)
+    c = math.cos(yaw)
+    s = math.sin(yaw)
     return c * east + s * north, c * north - s * east
 
 
@@ -155,8 +158,12 @@ def hilly(seed: int) -> Relief:
 
 
 ROADS: Final[dict[str, Callable[[int], Relief]]] = {
-    "level": level, "rolling": rolling, "stepped": stepped, "banked": banked, "hilly": hilly,
-}  # fmt: skip
+    "level": level,
+    "rolling": rolling,
+    "stepped": stepped,
+    "banked": banked,
+    "hilly": hilly,
+}
 """Test tracks by name; each is drawn by a seed."""
 
 

@@ -128,15 +128,18 @@ def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         p = np.array(corner)
-        a, b = _unit(np.array(before) - p), _unit(np.array(after) - p)
+        a = _unit(np.array(before) - p)
+        b = _unit(np.array(after) - p)
         half = math.acos(float(np.clip(a @ b, -1.0, 1.0))) / 2.0  # half the angle between the legs
         centre = p + _unit(a + b) * radius / math.sin(half)
-        start, end = p + a * radius / math.tan(half), p + b * radius / math.tan(half)
+        start = p + a * radius / math.tan(half)
+        end = p + b * radius / math.tan(half)
         swept = math.pi - 2.0 * half
         turn = math.copysign(1.0, float(a[1] * b[0] - a[0] * b[1]))
         spoke = start - centre
         for angle in np.linspace(0.0, swept * turn, max(2, round(radius * swept / 0.25))):
-            c, s = math.cos(angle), math.sin(angle)
+            c = math.cos(angle)
+            s = math.sin(angle)
             line.append(
                 centre + np.array([c * spoke[0] - s * spoke[1], s * spoke[0] + c * spoke[1]])
             )
@@ -161,12 +164,11 @@ def shifted_right(line: FloatArray, offset: float) -> FloatArray:
 
 def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
     """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other without a kink."""
-    p0, p3 = arriving[-1], leaving[0]
+    p0 = arriving[-1]
+    p3 = leaving[0]
     handle = HANDLE * float(np.linalg.norm(p3 - p0))
-    p1, p2 = (
-        p0 + handle * _unit(arriving[-1] - arriving[-2]),
-        p3 - handle * _unit(leaving[1] - leaving[0]),
-    )
+    p1 = p0 + handle * _unit(arriving[-1] - arriving[-2])
+    p2 = p3 - handle * _unit(leaving[1] - leaving[0])
     u = np.linspace(0.0, 1.0, 200)[:, None]
     return resampled(
         (1 - u) ** 3 * p0 + 3 * (1 - u) ** 2 * u * p1 + 3 * (1 - u) * u**2 * p2 + u**3 * p3

@@ -100,8 +100,13 @@ def demo() -> Scenario:
     return Scenario(
         name="demo",
         about="a crossing and a ring of 2 km; black ice appears at 70 s",
-        junctions={"centre": (0.0, 0.0), "north": (14.0, 140.0), "east": (190.0, 16.0), "south": (0.0, -140.0),
-                   "west": (-190.0, -20.0)},
+        junctions={
+            "centre": (0.0, 0.0),
+            "north": (14.0, 140.0),
+            "east": (190.0, 16.0),
+            "south": (0.0, -140.0),
+            "west": (-190.0, -20.0),
+        },
         roads=(
             Road("centre", "north", ((0.0, 45.0), (14.0, 95.0)), 45.0),
             Road("centre", "east", ((70.0, 0.0), (130.0, 16.0)), 60.0),
@@ -116,12 +121,30 @@ def demo() -> Scenario:
         patches=(
             Patch("wet north-west", -110.0, 90.0, 220.0, 160.0, WET, looks=WET),
             Patch("snow south-west", -110.0, -80.0, 220.0, 180.0, SNOW, looks=SNOW),
-            Patch("slush west of the southern street", -4.0, -75.0, 70.0, 4.0, SNOW, math.pi / 2, looks=WET),
-            Patch("slush east of the southern street", 4.0, -75.0, 70.0, 4.0, SNOW, math.pi / 2, looks=WET),
+            Patch(
+                "slush west of the southern street",
+                -4.0,
+                -75.0,
+                70.0,
+                4.0,
+                SNOW,
+                math.pi / 2,
+                looks=WET,
+            ),
+            Patch(
+                "slush east of the southern street",
+                4.0,
+                -75.0,
+                70.0,
+                4.0,
+                SNOW,
+                math.pi / 2,
+                looks=WET,
+            ),
             Patch("ice on the southern street", -33.0, -151.0, 36.0, 14.0, ICE, 0.32, looks=0.25),
             Patch("black ice", 40.0, 0.0, 44.0, 12.0, ICE, start=70.0),
         ),
-    )  # fmt: skip
+    )
 
 
 def hills() -> Scenario:
@@ -131,8 +154,9 @@ def hills() -> Scenario:
     """
     relief = Relief(
         (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
-        crossfall=0.025, banking=0.5,
-    )  # fmt: skip
+        crossfall=0.025,
+        banking=0.5,
+    )
     return replace(
         demo(),
         name="hills",
@@ -149,15 +173,22 @@ def frost() -> Scenario:
     town = hills()
     kept = tuple(patch for patch in town.patches if not math.isfinite(patch.start))
     places = (
-        ("Brogatan", 40.0, 0.0, 0.0), ("Kyrkogatan", 14.0, 112.0, math.pi / 2), ("Norra Ringvägen", 66.0, 144.0, 0.0),
-        ("Östra Ringvägen", 190.0, 62.0, math.pi / 2), ("Östra Ringvägen south", 190.0, -34.0, math.pi / 2),
-    )  # fmt: skip
+        ("Brogatan", 40.0, 0.0, 0.0),
+        ("Kyrkogatan", 14.0, 112.0, math.pi / 2),
+        ("Norra Ringvägen", 66.0, 144.0, 0.0),
+        ("Östra Ringvägen", 190.0, 62.0, math.pi / 2),
+        ("Östra Ringvägen south", 190.0, -34.0, math.pi / 2),
+    )
     ice = tuple(
         Patch(f"black ice on {name}", x, y, 44.0, 12.0, ICE, angle, start=35.0)
         for name, x, y, angle in places
     )
-    return replace(town, name="frost", about="the town on hills; at 35 s black ice appears at five places",
-                   patches=(*kept, *ice))  # fmt: skip
+    return replace(
+        town,
+        name="frost",
+        about="the town on hills; at 35 s black ice appears at five places",
+        patches=(*kept, *ice),
+    )
 
 
 def drawn(seed: int) -> Scenario:
@@ -166,17 +197,22 @@ def drawn(seed: int) -> Scenario:
     What is dry, wet, snow and ice there lies anywhere in the usual range of its kind; no road is one that anybody
     tuned on, and black ice appears at 30 s.
     """
-    key, usual = key_of(checked_seed(seed), DRAWN_STREAM), demo()
+    key = key_of(checked_seed(seed), DRAWN_STREAM)
+    usual = demo()
     kinds = {DRY: (0.78, 1.05), WET: (0.50, 0.72), SNOW: (0.25, 0.42), ICE: (0.10, 0.195)}
     now = {
         kind: low + (high - low) * uniform(key, k)
         for k, (kind, (low, high)) in enumerate(kinds.items())
     }
     patches = tuple(
-        replace(p, mu=now[p.mu], looks=now.get(p.looks, p.looks) if p.looks is not None else None,
-                start=30.0 if math.isfinite(p.start) else p.start)
+        replace(
+            p,
+            mu=now[p.mu],
+            looks=now.get(p.looks, p.looks) if p.looks is not None else None,
+            start=30.0 if math.isfinite(p.start) else p.start,
+        )
         for p in usual.patches
-    )  # fmt: skip
+    )
     waves = tuple(
         Wave(
             peak, length, 2.0 * math.pi * uniform(key, 10 + k), 2.0 * math.pi * uniform(key, 20 + k)
@@ -201,7 +237,8 @@ def winter(seed: int) -> Scenario:
     under the right wheels alone; two ruts of slush; or nothing. No ice is seen; slush looks wet.
     """
     town = drawn(seed)
-    key, network = key_of(checked_seed(seed), WINTER_STREAM), town.network
+    key = key_of(checked_seed(seed), WINTER_STREAM)
+    network = town.network
     order = sorted(range(len(ON_LANES)), key=lambda k: uniform(key, k))
     patches = list(town.patches)
     for lane in range(network.roads):
@@ -223,7 +260,8 @@ def winter(seed: int) -> Scenario:
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
     """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place, length and friction."""
     place, size, grip = numbers
-    ice, slush = 0.10 + 0.095 * grip, 0.28 + 0.12 * grip
+    ice = 0.10 + 0.095 * grip
+    slush = 0.28 + 0.12 * grip
     last = len(points) - 1
     if kind == "braking":
         length = 12.0 + 13.0 * size
@@ -234,7 +272,8 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
         row = edge + int(np.argmax(np.abs(points[edge:-edge, LanePoint.CURVATURE])))
         return [_lay_patch(f"ice in bend {lane}", points, row, (9.0 + 5.0 * size, 4.5), ice)]
     if kind in ("left", "right"):
-        length, side = 25.0 + 15.0 * size, 1.5 if kind == "left" else -1.5
+        length = 25.0 + 15.0 * size
+        side = 1.5 if kind == "left" else -1.5
         row = last - int(8.0 + 15.0 * place + 0.5 * length)
         return [_lay_patch(f"ice {kind} of lane {lane}", points, row, (length, 3.0), ice, side)]
     if kind == "ruts":

@@ -61,18 +61,36 @@ class Sensors:
 ORDINARY: Final = {
     "ideal": Sensors(),
     "mems": Sensors(
-        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
-        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01),
+        acceleration=(0.05, 0.03),
+        yaw_rate=(0.002, 0.001),
+        steering=(0.001, 0.0005),
+        wheel_speed=0.03,
+        torque=(2.0, 0.03),
+        position=(0.3, 1.5),
+        yaw=(0.01, 0.01),
     ),
     "mems-leak": Sensors(
-        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
-        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01), leak=True,
+        acceleration=(0.05, 0.03),
+        yaw_rate=(0.002, 0.001),
+        steering=(0.001, 0.0005),
+        wheel_speed=0.03,
+        torque=(2.0, 0.03),
+        position=(0.3, 1.5),
+        yaw=(0.01, 0.01),
+        leak=True,
     ),
     "mems-patchy": Sensors(
-        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
-        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01), leak=True, dropouts=0.002,
+        acceleration=(0.05, 0.03),
+        yaw_rate=(0.002, 0.001),
+        steering=(0.001, 0.0005),
+        wheel_speed=0.03,
+        torque=(2.0, 0.03),
+        position=(0.3, 1.5),
+        yaw=(0.01, 0.01),
+        leak=True,
+        dropouts=0.002,
     ),
-}  # fmt: skip
+}
 SENSORS: Final = ORDINARY | {
     name: replace(ORDINARY["mems-leak"], yaw_rate=(0.002, 0.003), mounted=mounted)
     for name, mounted in MISALIGNED.items()
@@ -140,13 +158,18 @@ def sensors_named(name: str | Sensors) -> Sensors:
 def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
     """Errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and gain are drawn here."""
     north, east = origin.per_metre
-    white, offset = np.zeros(len(CHANNELS)), np.zeros(len(CHANNELS))
+    white = np.zeros(len(CHANNELS))
+    offset = np.zeros(len(CHANNELS))
     for first, count, (std, bias) in (
-        (S.AX, 2, sensors.acceleration), (S.YAW_RATE, 1, sensors.yaw_rate), (S.DELTA, 4, sensors.steering),
-        (S.OMEGA, 4, (sensors.wheel_speed, 0.0)), (S.TORQUE, 4, (sensors.torque[0], 0.0)),
-        (S.LATITUDE, 1, (sensors.position[0] * north, 0.0)), (S.LONGITUDE, 1, (sensors.position[0] * east, 0.0)),
+        (S.AX, 2, sensors.acceleration),
+        (S.YAW_RATE, 1, sensors.yaw_rate),
+        (S.DELTA, 4, sensors.steering),
+        (S.OMEGA, 4, (sensors.wheel_speed, 0.0)),
+        (S.TORQUE, 4, (sensors.torque[0], 0.0)),
+        (S.LATITUDE, 1, (sensors.position[0] * north, 0.0)),
+        (S.LONGITUDE, 1, (sensors.position[0] * east, 0.0)),
         (S.YAW, 1, (sensors.yaw[0], 0.0)),
-    ):  # fmt: skip
+    ):
         white[first : first + count], offset[first : first + count] = std, bias
     rng = np.random.default_rng([seed, index, OFFSET_STREAM])
     gain = np.ones(len(CHANNELS))
@@ -191,7 +214,8 @@ def read_late(
     signals: FloatArray,
 ) -> None:
     """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
-    record, readings = np.empty(records.shape[1]), np.empty(signals.size)
+    record = np.empty(records.shape[1])
+    readings = np.empty(signals.size)
     for device in range(DEVICES):
         late(records, lead, error[ErrorColumn.MOUNTED + Misaligned.LAG + device] * rate_hz, record)
         read_out(record, error, place, readings)
@@ -212,9 +236,13 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 
 @compiled
 def sense(
-    records: FloatArray, errors: FloatArray, wander: FloatArray, place: FloatArray, keys: tuple[KeyArray, KeyArray],
+    records: FloatArray,
+    errors: FloatArray,
+    wander: FloatArray,
+    place: FloatArray,
+    keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were read before.
 
     `wander` (N, 3) is carried on; keys: two uint64 arrays (N,), of the noise and of the dropouts; clock: number of the
@@ -222,7 +250,8 @@ def sense(
     """
     white, silence = keys
     first, rate_hz, lead = clock
-    steps, vehicles = records.shape[0] - lead, records.shape[1]
+    steps = records.shape[0] - lead
+    vehicles = records.shape[1]
     signals = np.empty((steps, vehicles, len(CHANNELS)))
     per_fix = max(1, round(rate_hz * FIX_S))
     per_silence = max(1, round(rate_hz * SILENCE_S))

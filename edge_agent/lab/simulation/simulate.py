@@ -50,24 +50,41 @@ from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
 TRUTH: Final = (
-    ("true_vx", RecordColumn.VX), ("true_vy", RecordColumn.VY), ("true_yaw_rate", RecordColumn.YAW_RATE),
-    ("true_x", RecordColumn.X), ("true_y", RecordColumn.Y),
-    ("true_yaw", RecordColumn.YAW), ("true_ax", RecordColumn.AX), ("true_ay", RecordColumn.AY),
+    ("true_vx", RecordColumn.VX),
+    ("true_vy", RecordColumn.VY),
+    ("true_yaw_rate", RecordColumn.YAW_RATE),
+    ("true_x", RecordColumn.X),
+    ("true_y", RecordColumn.Y),
+    ("true_yaw", RecordColumn.YAW),
+    ("true_ax", RecordColumn.AX),
+    ("true_ay", RecordColumn.AY),
     *((name, RecordColumn.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
     *((name, RecordColumn.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
-    ("true_slope", RecordColumn.SLOPE), ("true_bank", RecordColumn.BANK),
-    ("true_abs_active", RecordColumn.ABS), ("true_tcs_active", RecordColumn.TCS),
+    ("true_slope", RecordColumn.SLOPE),
+    ("true_bank", RecordColumn.BANK),
+    ("true_abs_active", RecordColumn.ABS),
+    ("true_tcs_active", RecordColumn.TCS),
     ("true_esc_active", RecordColumn.ESC),
-)  # fmt: skip
+)
 STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
 PEDAL_LAG_S: Final = 0.15
 
 
 def simulate_manoeuvre(
-    name: str, *, mu: Friction | None = None, speed: float | None = None, seed: int = 0, rate_hz: float = 100.0,
-    duration_s: float | None = None, vehicle: str | Vehicle | TrueVehicle = "sedan", sensors: str | Sensors = "mems",
-    faults: tuple[Fault, ...] = (), road: str | Relief = "level", slope: float = 0.0, origin: Origin = GOTHENBURG,
-) -> tuple[pa.Table, Vehicle]:  # fmt: skip
+    name: str,
+    *,
+    mu: Friction | None = None,
+    speed: float | None = None,
+    seed: int = 0,
+    rate_hz: float = 100.0,
+    duration_s: float | None = None,
+    vehicle: str | Vehicle | TrueVehicle = "sedan",
+    sensors: str | Sensors = "mems",
+    faults: tuple[Fault, ...] = (),
+    road: str | Relief = "level",
+    slope: float = 0.0,
+    origin: Origin = GOTHENBURG,
+) -> tuple[pa.Table, Vehicle]:
     """Drive a manoeuvre and return (log, vehicle file).
 
     The log has a row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing), and the truth
@@ -148,14 +165,13 @@ def _drive(
     samples: int,
 ) -> FloatArray:
     """True records (T, RECORD) of the drive; the driver gives as much more gas as a slope takes."""
-    p, x, u, w = (
-        truth.row(),
-        np.zeros(STATES),
-        np.zeros((len(Control), 4)),
-        np.zeros((len(Wheel), 4)),
-    )
+    p = truth.row()
+    x = np.zeros(STATES)
+    u = np.zeros((len(Control), 4))
+    w = np.zeros((len(Wheel), 4))
     records = np.empty((samples, RECORD))
-    substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
+    substeps = substeps_of(rate_hz)
+    dt = 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     across = cross_slope(world.relief, 0.0)
     steer = force = lost = 0.0

@@ -144,12 +144,21 @@ OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
 
 def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
     """Simulate the drives, each `duration_s` [s] long."""
-    signals, truth, used, vehicles = [], [], [], []
+    signals = []
+    truth = []
+    used = []
+    vehicles = []
     for drive in drives:
         log, vehicle = simulate_manoeuvre(
-            drive.manoeuvre, mu=drive.mu, seed=drive.seed, rate_hz=RATE_HZ, duration_s=duration_s,
-            vehicle=drive.vehicle, sensors=drive.sensors, road=drive.road,
-        )  # fmt: skip
+            drive.manoeuvre,
+            mu=drive.mu,
+            seed=drive.seed,
+            rate_hz=RATE_HZ,
+            duration_s=duration_s,
+            vehicle=drive.vehicle,
+            sensors=drive.sensors,
+            road=drive.road,
+        )
         signals.append(
             np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(np.float64)
         )
@@ -214,11 +223,9 @@ def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> Tu
     )
     settled = drives.t.min(axis=1) >= SETTLED_S
     rate_hz = (len(drives.t) - 1) / float(np.mean(drives.t[-1] - drives.t[0]))
-    lower, upper, truth = (
-        estimates.mu_lower[settled],
-        estimates.mu_upper[settled],
-        drives.mu[settled],
-    )
+    lower = estimates.mu_lower[settled]
+    upper = estimates.mu_upper[settled]
+    truth = drives.mu[settled]
     log_likelihoods = np.nan_to_num(
         estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST
     )

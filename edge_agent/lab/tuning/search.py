@@ -126,7 +126,8 @@ class Ledger:
             value = float(self.objective(self.graph.vector(path)))
             self.values[key] = value if np.isfinite(value) else -np.inf
             if self.best_path is None or self.values[key] > self.best_value:
-                self.best_path, self.best_value = path, self.values[key]
+                self.best_path = path
+                self.best_value = self.values[key]
         return self.values[key]
 
     def record(self, values: Sequence[float], progress: Progress | None) -> None:

@@ -48,9 +48,11 @@ class Condition(NamedTuple):
 
 
 CONDITIONS: Final = {
-    "right": Condition(1.0), "too-small": Condition(0.1), "too-large": Condition(10.0),
+    "right": Condition(1.0),
+    "too-small": Condition(0.1),
+    "too-large": Condition(10.0),
     "schedule": Condition(1.0, schedule=True),
-}  # fmt: skip
+}
 
 
 class StudyDrive(NamedTuple):
@@ -63,14 +65,19 @@ class StudyDrive(NamedTuple):
 
 
 TRAIN: Final = (
-    StudyDrive("double-lane-change", "sedan", kmh(80), 301), StudyDrive("sine", "small", kmh(60), 302),
-    StudyDrive("slalom", "sedan", kmh(35), 303), StudyDrive("pulses", "van", kmh(50), 304),
-)  # fmt: skip
+    StudyDrive("double-lane-change", "sedan", kmh(80), 301),
+    StudyDrive("sine", "small", kmh(60), 302),
+    StudyDrive("slalom", "sedan", kmh(35), 303),
+    StudyDrive("pulses", "van", kmh(50), 304),
+)
 HELD_OUT: Final = (
-    StudyDrive("two-lane-changes", "small", kmh(60), 951), StudyDrive("j-turn", "van", kmh(50), 952),
-    StudyDrive("accelerating-sine", "sedan", kmh(70), 953), StudyDrive("brisk-acceleration", "small", kmh(30), 954),
-    StudyDrive("low-turn", "sedan", kmh(60), 955), StudyDrive("moderate-braking", "van", kmh(80), 956),
-)  # fmt: skip
+    StudyDrive("two-lane-changes", "small", kmh(60), 951),
+    StudyDrive("j-turn", "van", kmh(50), 952),
+    StudyDrive("accelerating-sine", "sedan", kmh(70), 953),
+    StudyDrive("brisk-acceleration", "small", kmh(30), 954),
+    StudyDrive("low-turn", "sedan", kmh(60), 955),
+    StudyDrive("moderate-braking", "van", kmh(80), 956),
+)
 
 
 @dataclass(frozen=True)
@@ -95,12 +102,19 @@ class StudyScores(NamedTuple):
 
 def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
     """Simulate the drives, each `duration_s` [s] long, with the noise of every condition."""
-    exact, truth, vehicles = [], [], []
+    exact = []
+    truth = []
+    vehicles = []
     for drive in drives:
         log, vehicle = simulate_manoeuvre(
-            drive.manoeuvre, mu=MU, speed=drive.speed, rate_hz=FINE * RATE_HZ, duration_s=duration_s,
-            vehicle=matched(PRESETS[drive.vehicle]), sensors="ideal",
-        )  # fmt: skip
+            drive.manoeuvre,
+            mu=MU,
+            speed=drive.speed,
+            rate_hz=FINE * RATE_HZ,
+            duration_s=duration_s,
+            vehicle=matched(PRESETS[drive.vehicle]),
+            sensors="ideal",
+        )
         log = log.take(np.arange(0, len(log), FINE))
         exact.append(
             np.stack([log[name].to_numpy(zero_copy_only=False) for name in SIGNALS], axis=-1)
@@ -109,7 +123,8 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
             np.stack([log[f"true_{name}"].to_numpy() for name in ("vx", "vy", "yaw_rate")], axis=-1)
         )
         vehicles.append(vehicle)
-    signals, seeds = np.stack(exact, axis=1).astype(float), [drive.seed for drive in drives]
+    signals = np.stack(exact, axis=1).astype(float)
+    seeds = [drive.seed for drive in drives]
     t = np.arange(len(signals))[:, None] / RATE_HZ + np.zeros(len(drives))
     noisy = {
         name: _noisy(signals, t[:, 0], seeds, condition) for name, condition in CONDITIONS.items()
@@ -121,10 +136,8 @@ def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
     """A copy with white noise on a_x, a_y and r."""
-    variance, noisy = (
-        scheduled(t) if condition.schedule else np.full(len(t), VARIANCE),
-        exact.copy(),
-    )
+    variance = scheduled(t) if condition.schedule else np.full(len(t), VARIANCE)
+    noisy = exact.copy()
     for n, seed in enumerate(seeds):
         add_white(noisy[:, n], variance, np.random.default_rng([seed, 5]))
     return noisy
@@ -181,11 +194,24 @@ def objective_on(drives: StudySet) -> Objective:
 
 
 def search(
-    way: str, drives: StudySet, *, ants: int, iterations: int, positions: int, seed: int,
+    way: str,
+    drives: StudySet,
+    *,
+    ants: int,
+    iterations: int,
+    positions: int,
+    seed: int,
     progress: Progress | None = None,
-) -> Result:  # fmt: skip
+) -> Result:
     """Search the vertices in one of WAYS; both begin at the untuned ones."""
     return WAYS[way](
-        Problem(objective_on(drives), choices(positions)[:VERTICES], Memberships().to_vector()[:VERTICES]),
-        ants=ants, iterations=iterations, rng=np.random.default_rng([seed, list(WAYS).index(way)]), progress=progress,
-    )  # fmt: skip
+        Problem(
+            objective_on(drives),
+            choices(positions)[:VERTICES],
+            Memberships().to_vector()[:VERTICES],
+        ),
+        ants=ants,
+        iterations=iterations,
+        rng=np.random.default_rng([seed, list(WAYS).index(way)]),
+        progress=progress,
+    )

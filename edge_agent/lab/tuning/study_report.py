@@ -31,8 +31,12 @@ UNITS: Final = {
     "rmse_vy": "m/s",
     "rmse_yaw_rate": "rad/s",
 }
-TITLES: Final = {"right": "R right", "too-small": "ten times too small", "too-large": "ten times too large",
-                 "schedule": "noise by schedule"}  # fmt: skip
+TITLES: Final = {
+    "right": "R right",
+    "too-small": "ten times too small",
+    "too-large": "ten times too large",
+    "schedule": "noise by schedule",
+}
 
 
 GIVEN: Final = {
@@ -64,17 +68,27 @@ class Study:
 
 
 def run(
-    *, ants: int, iterations: int, positions: int, seeds: Sequence[int], duration_s: float,
+    *,
+    ants: int,
+    iterations: int,
+    positions: int,
+    seeds: Sequence[int],
+    duration_s: float,
     reporter: Callable[[str], Progress],
-) -> Study:  # fmt: skip
+) -> Study:
     """Search with every seed in every way; `reporter` makes the progress of a search from its name."""
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     for seed in seeds:
         for way in WAYS:
             result = study.search(
-                way, done.train, ants=ants, iterations=iterations, positions=positions, seed=seed,
+                way,
+                done.train,
+                ants=ants,
+                iterations=iterations,
+                positions=positions,
+                seed=seed,
                 progress=reporter(f"{way} {seed}"),
-            )  # fmt: skip
+            )
             done.found.setdefault(way, []).append(result)
     return done
 

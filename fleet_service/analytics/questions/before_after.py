@@ -26,9 +26,11 @@ def expression(t: Table, at_s: int) -> Table:
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
     place = ["cell", "sector"]
     cells = t.group_by(place).aggregate(
-        n_a=t.after.sum(), n_b=(~t.after).sum(),
-        s_a=ibis.ifelse(t.after, t.y, 0.0).sum(), s_b=ibis.ifelse(t.after, 0.0, t.y).sum(),
-    )  # fmt: skip
+        n_a=t.after.sum(),
+        n_b=(~t.after).sum(),
+        s_a=ibis.ifelse(t.after, t.y, 0.0).sum(),
+        s_b=ibis.ifelse(t.after, 0.0, t.y).sum(),
+    )
     cells = cells.filter(cells.n_a > 0, cells.n_b > 0)
     weight = cells.n_a * cells.n_b / (cells.n_a + cells.n_b)
     cells = cells.mutate(
@@ -67,9 +69,15 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         )
     difference = (row["later"] - row["before"]) / row["w"]
     std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
-    return pa.table({
-        "period": ["before", "after"], "mu": [row["before"] / row["w"], row["later"] / row["w"]],
-        "difference": [0.0, difference], "lower": [0.0, difference - Z_95 * std],
-        "upper": [0.0, difference + Z_95 * std],
-        "cells": [row["cells"]] * 2, "vehicles": [row["vehicles"]] * 2, "values": [row["values"]] * 2,
-    })  # fmt: skip
+    return pa.table(
+        {
+            "period": ["before", "after"],
+            "mu": [row["before"] / row["w"], row["later"] / row["w"]],
+            "difference": [0.0, difference],
+            "lower": [0.0, difference - Z_95 * std],
+            "upper": [0.0, difference + Z_95 * std],
+            "cells": [row["cells"]] * 2,
+            "vehicles": [row["vehicles"]] * 2,
+            "values": [row["values"]] * 2,
+        }
+    )

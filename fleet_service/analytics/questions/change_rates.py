@@ -115,11 +115,19 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 _FIELDS: Final[list[tuple[str, pa.DataType]]] = [
-    ("by", pa.string()), ("class", pa.string()), ("pairs", pa.int64()), ("days", pa.int64()),
-    ("hours_between", pa.float64()), ("unlike", pa.int64()), ("share_slippery", pa.float64()),
-    ("rate_per_hour", pa.float64()), ("rate_lower", pa.float64()), ("rate_upper", pa.float64()),
-    ("misread", pa.float64()), ("assumed_per_hour", pa.float64()),
-]  # fmt: skip
+    ("by", pa.string()),
+    ("class", pa.string()),
+    ("pairs", pa.int64()),
+    ("days", pa.int64()),
+    ("hours_between", pa.float64()),
+    ("unlike", pa.int64()),
+    ("share_slippery", pa.float64()),
+    ("rate_per_hour", pa.float64()),
+    ("rate_lower", pa.float64()),
+    ("rate_upper", pa.float64()),
+    ("misread", pa.float64()),
+    ("assumed_per_hour", pa.float64()),
+]
 SCHEMA: Final = pa.schema(_FIELDS)
 
 
@@ -140,7 +148,8 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
         np.add.at(cube[..., k], (day, octave), column)
     pairs, unlike, slippery, seconds = cube.sum(axis=(0, 1)) if cube.size else np.zeros(4)
     rate, misread = fit(cube.sum(axis=0)) if cube.size else (np.nan, np.nan)
-    lower, upper = np.nan, np.nan
+    lower = np.nan
+    upper = np.nan
     if len(days) >= LEAST_DAYS and np.isfinite(rate):
         rng = np.random.default_rng(0)
         samples = rng.integers(len(days), size=(DRAWS, len(days)))
@@ -149,11 +158,17 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
             np.nanpercentile(drawn, ENDS) if np.isfinite(drawn).any() else (np.nan, np.nan)
         )
     return {
-        "pairs": int(pairs), "days": len(days), "hours_between": seconds / 3600, "unlike": int(unlike),
-        "share_slippery": slippery / max(2.0 * pairs, 1.0), "rate_per_hour": _known(3600 * rate),
-        "rate_lower": _known(3600 * lower), "rate_upper": _known(3600 * upper), "misread": _known(misread),
+        "pairs": int(pairs),
+        "days": len(days),
+        "hours_between": seconds / 3600,
+        "unlike": int(unlike),
+        "share_slippery": slippery / max(2.0 * pairs, 1.0),
+        "rate_per_hour": _known(3600 * rate),
+        "rate_lower": _known(3600 * lower),
+        "rate_upper": _known(3600 * upper),
+        "misread": _known(misread),
         "assumed_per_hour": 3600 / CHANGE_S,
-    }  # fmt: skip
+    }
 
 
 BEGINS: Final = tuple(
@@ -177,7 +192,8 @@ def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> t
     apart = seconds / pairs
 
     def loss(x: FloatArray) -> float:
-        rate, misread = np.exp(x[0]), most / (1.0 + np.exp(-x[1]))
+        rate = np.exp(x[0])
+        misread = most / (1.0 + np.exp(-x[1]))
         p = np.clip(misread + (most - misread) * -np.expm1(-rate * apart), 1e-9, 1.0 - 1e-9)
         return -float(unlike @ np.log(p) + (pairs - unlike) @ np.log1p(-p))
 

@@ -31,13 +31,26 @@ GAP_S: Final = 7200  # two slots below that lie further apart are two breaches, 
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
 # of one vehicle's error that its own interval does not know: its tyres, its calibration
 LEAST_STD: Final = 0.05
-KEPT, BROKEN, UNKNOWN = "kept", "broken", "unknown"
+KEPT = "kept"
+BROKEN = "broken"
+UNKNOWN = "unknown"
 _ROW: Final[dict[str, pa.DataType]] = {
-    "link": pa.string(), "direction": pa.string(), "name": pa.string(), "verdict": pa.string(),
-    "breach_s": pa.int64(), "least_s": pa.int64(), "most_s": pa.int64(), "begin": pa.int64(),
-    "mu_worst": pa.float64(), "mu_worst_lower": pa.float64(), "mu_worst_upper": pa.float64(),
-    "measured_share": pa.float64(), "length_m": pa.float64(), "vehicles": pa.int64(), "values": pa.int64(),
-}  # fmt: skip
+    "link": pa.string(),
+    "direction": pa.string(),
+    "name": pa.string(),
+    "verdict": pa.string(),
+    "breach_s": pa.int64(),
+    "least_s": pa.int64(),
+    "most_s": pa.int64(),
+    "begin": pa.int64(),
+    "mu_worst": pa.float64(),
+    "mu_worst_lower": pa.float64(),
+    "mu_worst_upper": pa.float64(),
+    "measured_share": pa.float64(),
+    "length_m": pa.float64(),
+    "vehicles": pa.int64(),
+    "values": pa.int64(),
+}
 
 
 def expression(t: Table, places: Table) -> Table:
@@ -119,7 +132,8 @@ def breach(
         level: agreed grip.
         span: begin and end [s] of all measurements; outside it nothing is known, so slots are cut to it.
     """
-    begins, closes = np.maximum(slot * SLOT_S, span[0]), np.minimum((slot + 1) * SLOT_S, span[1])
+    begins = np.maximum(slot * SLOT_S, span[0])
+    closes = np.minimum((slot + 1) * SLOT_S, span[1])
     first, after = _runs(mu < level)
     ends = np.where(after < len(slot), begins[np.minimum(after, len(slot) - 1)], closes[after - 1])
     lasted = ends - begins[first]
@@ -152,10 +166,14 @@ class _Measured(NamedTuple):
 def _judged(
     found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options
 ) -> pa.Table:
-    level, within = options.level or 0.0, options.within_s or 0.0
-    about = {(row["link"], row["direction"]): row
-             for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
-                 [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
+    level = options.level or 0.0
+    within = options.within_s or 0.0
+    about = {
+        (row["link"], row["direction"]): row
+        for row in roads.group_by(["link", "direction"], use_threads=False)
+        .aggregate([("name", "first"), ("length_m", "first")])
+        .to_pylist()
+    }
     share = _measured_share(roads, seen)
     rows = found.to_pylist()
     names = [
@@ -164,7 +182,8 @@ def _judged(
     ]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
     found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
-    each, keys = slots(found), sorted(number)
+    each = slots(found)
+    keys = sorted(number)
     links: dict[tuple[str, str], _Measured] = {}
     for (link, direction, _, _), row in zip(names, rows, strict=True):
         own = links.setdefault((link, direction), _Measured({}, set(), []))
@@ -188,12 +207,24 @@ def _judged(
         enough = share[key] >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
         verdict = BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN
         out.append(
-            {"link": key[0], "direction": key[1], "name": about[key]["name_first"], "verdict": verdict,
-             "breach_s": by_mean, "least_s": least, "most_s": most, "begin": begin or None,
-             "mu_worst": each["mu"][worst], "mu_worst_lower": each["lower"][worst],
-             "mu_worst_upper": each["upper"][worst], "measured_share": share[key],
-             "length_m": about[key]["length_m_first"], "vehicles": len(own.vehicles), "values": sum(own.values)}
-        )  # fmt: skip
+            {
+                "link": key[0],
+                "direction": key[1],
+                "name": about[key]["name_first"],
+                "verdict": verdict,
+                "breach_s": by_mean,
+                "least_s": least,
+                "most_s": most,
+                "begin": begin or None,
+                "mu_worst": each["mu"][worst],
+                "mu_worst_lower": each["lower"][worst],
+                "mu_worst_upper": each["upper"][worst],
+                "measured_share": share[key],
+                "length_m": about[key]["length_m_first"],
+                "vehicles": len(own.vehicles),
+                "values": sum(own.values),
+            }
+        )
     return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
 
 

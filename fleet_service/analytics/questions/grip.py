@@ -56,9 +56,12 @@ def coverage(found: pa.Table) -> list[str]:
     lines = []
     for day in np.unique(days):
         here = days == day
-        reported, visited = int((here & known).sum()), int(here.sum())
+        reported = int((here & known).sum())
+        visited = int(here.sum())
         shares = (reported / network, (visited - reported) / network, 1.0 - visited / network)
-        lines.append("{}: {:.0%} of {} cells measured, {:.0%} only bounded, {:.0%} not visited".format(
-            np.datetime64(int(day), "D"), shares[0], network, *shares[1:]
-        ))  # fmt: skip
+        lines.append(
+            "{}: {:.0%} of {} cells measured, {:.0%} only bounded, {:.0%} not visited".format(
+                np.datetime64(int(day), "D"), shares[0], network, *shares[1:]
+            )
+        )
     return lines

@@ -46,7 +46,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             if rows // REPORT_ROWS > (rows - len(updated.late)) // REPORT_ROWS:
                 options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
-    step, due, frames = int(options.step_s * NS), None, []
+    step = int(options.step_s * NS)
+    due = None
+    frames = []
     for updated in replay(
         engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)
     ):

@@ -47,10 +47,17 @@ def expression(t: Table, least_vehicles: int) -> Table:
     spells = spells.filter(spells.vehicles >= least_vehicles)
     end = ibis.ifelse(spells.open, ibis.null("int64"), spells.end)
     return spells.select(
-        *place, "onset", "last", "values", "vehicles", "mu", end=end, lasts=spells.open,
+        *place,
+        "onset",
+        "last",
+        "values",
+        "vehicles",
+        "mu",
+        end=end,
+        lasts=spells.open,
         duration_s=ibis.ifelse(spells.open, spells["last"], spells.end) - spells.onset,
         to_alert_s=spells.alert - spells.onset,
-    )  # fmt: skip
+    )
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:

@@ -57,20 +57,30 @@ def stretches(cells: pa.Table) -> pa.Table:
     west, south, east, north = _boxes(column["cell"], label, count)
     metres = np.cos(np.radians((south + north) / 2)) * METRES_PER_DEGREE
     length = np.hypot((east - west) * metres, (north - south) * METRES_PER_DEGREE)
-    values, slippery = total(column["values"]), total(column["slippery"])
+    values = total(column["values"])
+    slippery = total(column["slippery"])
     lower = wilson(slippery, values)
     first = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first, label, column["cell"])
     sector = np.zeros(count, np.int8)
     sector[label] = column["sector"]
     found = {
-        "cell": first, "sector": sector, "cells": np.bincount(label, minlength=count), "length_m": length,
-        "exposure": total(column["observations"]).astype(np.int64), "values": values.astype(np.int64),
-        "share_slippery": slippery / np.maximum(values, 1), "share_lower": lower,
-        "mu": total(column["mu_sum"]) / np.maximum(slippery, 1), "score": lower * length,
-        "west": west, "south": south, "east": east, "north": north,
+        "cell": first,
+        "sector": sector,
+        "cells": np.bincount(label, minlength=count),
+        "length_m": length,
+        "exposure": total(column["observations"]).astype(np.int64),
+        "values": values.astype(np.int64),
+        "share_slippery": slippery / np.maximum(values, 1),
+        "share_lower": lower,
+        "mu": total(column["mu_sum"]) / np.maximum(slippery, 1),
+        "score": lower * length,
+        "west": west,
+        "south": south,
+        "east": east,
+        "north": north,
         "members": _members(column["cell"], label, count),
-    }  # fmt: skip
+    }
     return pa.table(found).sort_by([("score", "descending"), ("cell", "ascending")])
 
 

@@ -30,10 +30,19 @@ SERVICE_M: Final = 6.0  # a yard's entrance beside a street is driven far less
 STEP_M: Final = 2.0
 PIECE: Final = 4096  # cells at once
 _TYPES: Final[dict[str, pa.DataType]] = {
-    "cell": pa.int64(), "sector": pa.int8(), "link": pa.string(), "direction": pa.string(), "from_m": pa.float64(),
-    "to_m": pa.float64(), "length_m": pa.float64(), "name": pa.string(), "kind": pa.string(),
-    "distance_m": pa.float64(), "ambiguous_m": pa.float64(), "shared": pa.bool_(),
-}  # fmt: skip
+    "cell": pa.int64(),
+    "sector": pa.int8(),
+    "link": pa.string(),
+    "direction": pa.string(),
+    "from_m": pa.float64(),
+    "to_m": pa.float64(),
+    "length_m": pa.float64(),
+    "name": pa.string(),
+    "kind": pa.string(),
+    "distance_m": pa.float64(),
+    "ambiguous_m": pa.float64(),
+    "shared": pa.bool_(),
+}
 SCHEMA: Final = pa.schema(_TYPES)
 
 
@@ -51,10 +60,8 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     """Return one row per cell and sector on a link; the reference "Columns of the ten questions" explains the
     columns."""
     lengths, marks = _marks(network.links)
-    tree, scale = (
-        cKDTree(_conformal(marks.latitude, marks.longitude)),
-        np.cos(np.radians(marks.latitude)),
-    )
+    tree = cKDTree(_conformal(marks.latitude, marks.longitude))
+    scale = np.cos(np.radians(marks.latitude))
     reach = REACH_M / scale.min()
     side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
     cells = _near(marks, float(side))
@@ -70,7 +77,9 @@ def join_roads(network: RoadNetwork) -> pa.Table:
         for axis in range(grid.SECTORS):
             turn = _apart(marks.yaw[pairs["j"]], axis * np.pi / 2.0)
             fits = (turn <= MOST_TURN) & (metres <= REACH_M)
-            row, mark, metre = pairs["i"][fits], pairs["j"][fits], metres[fits]
+            row = pairs["i"][fits]
+            mark = pairs["j"][fits]
+            metre = metres[fits]
             link = marks.link[mark]
             cost = metre + TURN_M * turn[fits] + service[link]
             each = _first_of(
@@ -83,7 +92,8 @@ def join_roads(network: RoadNetwork) -> pa.Table:
                 np.cumsum(np.append(0, row[1:] != row[:-1]))[: len(row)]
             ]
             goes_on = (end[link] == start[link[best]]) | (end[link[best]] == start[link])
-            mine, more = link == link[best], cost - cost[best]
+            mine = link == link[best]
+            more = cost - cost[best]
             kept = mine | (goes_on & (more <= side / 2.0))  # the next link begins within the cell
             other = np.full(len(piece), np.inf)
             np.minimum.at(other, row, np.where(kept, np.inf, more))
@@ -94,7 +104,8 @@ def join_roads(network: RoadNetwork) -> pa.Table:
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     link = marks.link[mark]
-    middle, length = marks.run[mark], lengths[link]
+    middle = marks.run[mark]
+    length = lengths[link]
     texts = {
         name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
         for name, field in (
@@ -105,9 +116,14 @@ def join_roads(network: RoadNetwork) -> pa.Table:
         )
     }
     numbers = {
-        "cell": cell, "sector": sector.astype(np.int8), "from_m": np.maximum(middle - side / 2.0, 0.0),
-        "to_m": np.minimum(middle + side / 2.0, length), "length_m": length, "distance_m": distance, "shared": second,
-    }  # fmt: skip
+        "cell": cell,
+        "sector": sector.astype(np.int8),
+        "from_m": np.maximum(middle - side / 2.0, 0.0),
+        "to_m": np.minimum(middle + side / 2.0, length),
+        "length_m": length,
+        "distance_m": distance,
+        "shared": second,
+    }
     arrays: dict[str, Any] = {name: pa.array(column) for name, column in numbers.items()} | texts
     arrays["ambiguous_m"] = pa.array(ambiguous, from_pandas=True)
     found = pa.table([arrays[name] for name in SCHEMA.names], schema=SCHEMA)
@@ -135,10 +151,12 @@ def read_roads(path: Path) -> pa.Table:
 
 def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
     """Return the lengths [m] of the links, and their marks."""
-    lengths, parts = np.empty(len(links)), []
+    lengths = np.empty(len(links))
+    parts = []
     for k, link in enumerate(links):
         east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(link.latitude))))
-        dx, dy = np.diff(link.longitude) * east, np.diff(link.latitude) * METRES_PER_DEGREE
+        dx = np.diff(link.longitude) * east
+        dy = np.diff(link.latitude) * METRES_PER_DEGREE
         run = np.concatenate([[0.0], np.cumsum(np.hypot(dx, dy))])
         lengths[k] = run[-1]
         at = (
@@ -148,9 +166,14 @@ def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
         )
         piece = np.minimum(np.searchsorted(run, at, side="right") - 1, len(dx) - 1)
         parts.append(
-            (np.full(len(at), k), at, np.interp(at, run, link.latitude), np.interp(at, run, link.longitude),
-             np.arctan2(dy, dx)[piece])
-        )  # fmt: skip
+            (
+                np.full(len(at), k),
+                at,
+                np.interp(at, run, link.latitude),
+                np.interp(at, run, link.longitude),
+                np.arctan2(dy, dx)[piece],
+            )
+        )
     return lengths, _Marks._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
 

@@ -15,10 +15,23 @@ from schemas.runtime.installing import install_command
 EXTRACT: Final = (".pbf", ".osm", ".osm.gz", ".osm.bz2")
 LINES: Final = (".gpkg", ".geojson", ".shp", ".fgb", ".parquet")
 CLASSES: Final = (
-    "motorway", "motorway_link", "trunk", "trunk_link", "primary", "primary_link", "secondary", "secondary_link",
-    "tertiary", "tertiary_link", "unclassified", "residential", "living_street", "service",
-)  # fmt: skip  # of OpenStreetMap's highways, those that cars may drive
-FORWARD, BACKWARD = "forward", "backward"
+    "motorway",
+    "motorway_link",
+    "trunk",
+    "trunk_link",
+    "primary",
+    "primary_link",
+    "secondary",
+    "secondary_link",
+    "tertiary",
+    "tertiary_link",
+    "unclassified",
+    "residential",
+    "living_street",
+    "service",
+)  # of OpenStreetMap's highways, those that cars may drive
+FORWARD = "forward"
+BACKWARD = "backward"
 _ONLY_FORWARD: Final = frozenset({"yes", "true", "1", FORWARD})
 _ONLY_BACKWARD: Final = frozenset({"-1", "reverse", BACKWARD})
 
@@ -68,7 +81,8 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
     if path.name.endswith(EXTRACT):
         links, about = _openstreetmap(path)
     elif path.name.endswith(LINES):
-        links, about = _lines(path, identity, name), {}
+        links = _lines(path, identity, name)
+        about = {}
     else:
         known = ", ".join((*EXTRACT, *LINES))
         raise InputError(
@@ -101,7 +115,8 @@ def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
                 [(node.lat, node.lon) for node in way.nodes if node.location.valid()]
             ).reshape(-1, 2)
             tags = dict(way.tags)
-            kind, name = tags["highway"], tags.get("name", tags.get("ref", ""))
+            kind = tags["highway"]
+            name = tags.get("name", tags.get("ref", ""))
             by_rule = tags.get("junction") in ("roundabout", "circular") or kind.startswith(
                 "motorway"
             )

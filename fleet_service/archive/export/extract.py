@@ -111,8 +111,10 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
 
 
 WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
-    "map": map_then, "observations": observations, "rollup": cell_hours,
-}  # fmt: skip
+    "map": map_then,
+    "observations": observations,
+    "rollup": cell_hours,
+}
 
 
 def _within(column: str, part: Extract) -> ValueRange:

@@ -81,11 +81,16 @@ def write_table(
     """
     names = table.schema.names
     options: dict[str, Any] = {
-        "compression": "zstd", "compression_level": encoding.level,
+        "compression": "zstd",
+        "compression_level": encoding.level,
         "use_dictionary": [name for name in encoding.dictionary if name in names],
-        "column_encoding": {name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names},
-        "write_statistics": encoding.index, "write_page_index": encoding.index, "write_page_checksum": True,
-    }  # fmt: skip
+        "column_encoding": {
+            name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names
+        },
+        "write_statistics": encoding.index,
+        "write_page_index": encoding.index,
+        "write_page_checksum": True,
+    }
     with (
         open_durably(path, named=named) as file,
         pq.ParquetWriter(file, table.schema, **options) as writer,

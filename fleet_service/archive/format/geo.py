@@ -18,11 +18,15 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 
 GEO: Final = b"geo"
-GEOMETRY, BBOX = "geometry", "bbox"
+GEOMETRY = "geometry"
+BBOX = "bbox"
 SIDES: Final = ("xmin", "ymin", "xmax", "ymax")
 _POINT: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _RING: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("rings", "<u4"), ("points", "<u4")])
-_LITTLE_ENDIAN, _TYPE_POINT, _TYPE_POLYGON, _TYPE_MULTIPOLYGON = 1, 1, 3, 6
+_LITTLE_ENDIAN = 1
+_TYPE_POINT = 1
+_TYPE_POLYGON = 3
+_TYPE_MULTIPOLYGON = 6
 Pieces = Sequence[Sequence[int]]
 
 
@@ -43,7 +47,8 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
     x, y = _outlines(table, np.array([cell for own in cells for cell in own], np.int64), count)
-    boxes, sides = _polygons(x, y), _extremes(x, y)
+    boxes = _polygons(x, y)
+    sides = _extremes(x, y)
     head = struct.Struct("<BII")
     wkb = [
         head.pack(_LITTLE_ENDIAN, _TYPE_MULTIPOLYGON, n) + boxes[begin : begin + n].tobytes()
@@ -132,16 +137,15 @@ def _marked(
 ) -> pa.Table:
     box = pa.StructArray.from_arrays([pa.array(side) for side in sides], names=list(SIDES))
     column: dict[str, Any] = {
-        "encoding": "WKB", "geometry_types": [kind] if len(geometry) else [],
+        "encoding": "WKB",
+        "geometry_types": [kind] if len(geometry) else [],
         "covering": {"bbox": {side: [BBOX, side] for side in SIDES}},
-    }  # fmt: skip
+    }
     if kind != "Point":
         column["orientation"] = "counterclockwise"
     if len(geometry):
-        least, most = (
-            [float(side.min()) for side in sides[:2]],
-            [float(side.max()) for side in sides[2:]],
-        )
+        least = [float(side.min()) for side in sides[:2]]
+        most = [float(side.max()) for side in sides[2:]]
         column["bbox"] = [*least, *most]
     geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
     marked = table.append_column(

@@ -186,7 +186,7 @@ def content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
 
 def _content(
     path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged, buffer_bytes: int = 0
-) -> Content | None:  # fmt: skip
+) -> Content | None:
     try:
         with pq.ParquetFile(
             path, page_checksum_verification=True, buffer_size=buffer_bytes

@@ -96,7 +96,9 @@ class Listing:
     def __init__(
         self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
     ) -> None:
-        self.kind, self._wanted, self._damaged = kind, wanted, damaged
+        self.kind = kind
+        self._wanted = wanted
+        self._damaged = damaged
         self._schema = segments.SCHEMAS[kind]
         self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
         needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
@@ -107,7 +109,8 @@ class Listing:
 
     def inbox(self) -> Iterator[pa.Table]:
         """Yield the rows that no compacted file holds; call it once."""
-        fresh, self._fresh = self._fresh, []
+        fresh = self._fresh
+        self._fresh = []
         for path, table in fresh:
             yield drop_compacted(table, self.kind, self._done.get(path.name, set())).select(
                 self._names

@@ -76,7 +76,8 @@ def keep(root: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    path, page = root / NAME, text().encode()
+    path = root / NAME
+    page = text().encode()
     there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
     if there != page and (
         not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())

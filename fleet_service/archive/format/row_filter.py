@@ -37,7 +37,8 @@ def filter_table(table: pa.Table, where: Where) -> pa.Table:
         for compare, bound in ((pc.greater_equal, least), (pc.less_equal, most)):
             if bound is not None:
                 mask = compare(values, pa.scalar(bound, values.type))
-                table, values = table.filter(mask), values.filter(mask)
+                table = table.filter(mask)
+                values = values.filter(mask)
     return table
 
 

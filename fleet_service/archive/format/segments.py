@@ -55,7 +55,9 @@ class Writer:
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
-        self._root, self._shard, self._seq = root, shard, 0
+        self._root = root
+        self._shard = shard
+        self._seq = 0
         folders = [folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
             inbox.mkdir(parents=True, exist_ok=True)

@@ -92,11 +92,14 @@ class ErasedData(NamedTuple):
 
 def read(folder: Path) -> ErasedData:
     """Return the erased data recorded in the folder of the keys."""
-    months, vehicles = list[Span](), dict[int, int]()
+    months = list[Span]()
+    vehicles = dict[int, int]()
     for path in sorted(folder.glob("*.erased")):
         if (name := _NAME.fullmatch(path.name)) is None:
             continue
-        month, pseudonym, until = name[1], name[2], int(name[3])
+        month = name[1]
+        pseudonym = name[2]
+        until = int(name[3])
         if pseudonym is None:
             months.append(Span(span_of(month).begin, until))
         else:

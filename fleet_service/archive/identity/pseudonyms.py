@@ -113,7 +113,8 @@ def _checked(path: Path) -> bytes:
         OSError: it is damaged; other pseudonyms would result, and every batch would be accepted again.
     """
     data = path.read_bytes()
-    key, check = data[:KEY_BYTES], data[KEY_BYTES:]
+    key = data[:KEY_BYTES]
+    check = data[KEY_BYTES:]
     if len(key) < KEY_BYTES or (check and check != _check(key)):
         raise OSError(errno.EIO, "the key is damaged; bring it back from a copy", str(path))
     return key

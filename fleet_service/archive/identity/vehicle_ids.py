@@ -43,7 +43,8 @@ class VehicleIds:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._term = folder, layout.read_epoch(folder.parent)
+        self._folder = folder
+        self._term = layout.read_epoch(folder.parent)
         self._key: bytes | None = None
         self._known: set[int] | None = None
         self._unsynced: set[Path] = set()

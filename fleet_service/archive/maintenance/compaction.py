@@ -173,7 +173,8 @@ def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
     """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
     out: list[tuple[str, int, int]] = []
     for name in names:
-        prefix, n = Path(name).stem.rpartition("-")[0], layout.age(name)[1]
+        prefix = Path(name).stem.rpartition("-")[0]
+        n = layout.age(name)[1]
         if out and out[-1][0] == prefix and out[-1][2] == n - 1:
             out[-1] = (prefix, out[-1][1], n)
         else:
@@ -186,10 +187,13 @@ def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Par
     if not table.num_rows:
         return
     table = table.combine_chunks()
-    time, cell = segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy()
+    time = segments.nanoseconds(table[layout.TIME[kind]])
+    cell = table["cell"].to_numpy()
     day, zone = layout.partitions_of(time, cell)
     order = np.lexsort((time, cell, day))  # the zone is the cell's leading digits
-    table, day, zone = table.take(order), day[order], zone[order]
+    table = table.take(order)
+    day = day[order]
+    zone = zone[order]
     starts = np.flatnonzero(np.diff(day, prepend=day[0] - 1) | np.diff(zone, prepend=zone[0]))
     for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=True):
         yield layout.Partition(int(day[start]), int(zone[start])), table.slice(start, stop - start)

@@ -151,7 +151,8 @@ def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
     """Return the table of a kind with all columns known today."""
     from pyiceberg.transforms import DayTransform
 
-    name, schema = (place.namespace, layout.TABLES[kind]), SCHEMAS[kind]
+    name = (place.namespace, layout.TABLES[kind])
+    schema = SCHEMAS[kind]
     if not catalog.table_exists(name):
         new = catalog.create_table_transaction(name, schema=_plain(schema), properties=PROPERTIES)
         with new, new.update_spec() as spec:  # a compacted file holds one date

@@ -170,7 +170,9 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
     pseudonym = _pseudonym(root, vehicle, month)
     if (newest := _newest(root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)])) >= 0:
         erasures.record_erasure(root / _KEYS, month, newest, pseudonym)
-    rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
+    rows = 0
+    files = [*root.rglob(f"*{BAD}")]
+    cells = set[int]()
     with hold_compaction_lock(root):
         drop_checkpoints(root)  # what it reported is in them
         for damaged in files:  # nobody can tell what is in them
@@ -184,7 +186,8 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
             iceberg.unregister(root, theirs)
             for path in theirs:
                 if len(removed := _without(root, kind, path, pseudonym)):
-                    rows, cells = rows + len(removed), cells.union(removed)
+                    rows = rows + len(removed)
+                    cells = cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
         for folder in layout.days(root, snapshots.TABLE, begin, end):
             files += [

@@ -127,15 +127,18 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
         "vehicles": np.bincount(pairs // (int(who.max()) + 1), minlength=len(starts)),
         "vehicle_bits": np.bitwise_or.reduceat(np.uint64(1) << names[who], starts).view(np.int64),
         "mu_count": np.add.reduceat(with_mu.astype(np.int64), starts),
-        "mu_sum": np.add.reduceat(mu, starts), "mu_sum_squares": np.add.reduceat(mu * mu, starts),
+        "mu_sum": np.add.reduceat(mu, starts),
+        "mu_sum_squares": np.add.reduceat(mu * mu, starts),
         "mu_min": np.minimum.reduceat(np.where(with_mu, rows["mu"], np.inf), starts),
         "mu_max": np.maximum.reduceat(np.where(with_mu, rows["mu"], -np.inf), starts),
         "utilised_max": np.fmax.reduceat(rows["mu_utilised"], starts),
         "value_count": np.add.reduceat(value.astype(np.int64), starts),
         "value_sum": np.add.reduceat(np.where(value, mu, 0.0), starts),
         "mu_histogram": histogram,
-        "log_likelihood_sum": np.add.reduceat(rows["log_likelihood"].astype(np.int32), starts, axis=0),
-    }  # fmt: skip
+        "log_likelihood_sum": np.add.reduceat(
+            rows["log_likelihood"].astype(np.int32), starts, axis=0
+        ),
+    }
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 columns of many types

@@ -75,7 +75,8 @@ class _AmqpEvents(MessagingHandler):
         self._container.stop()
 
     def _send(self) -> None:
-        sender, queue = self._sender, self._link.queue
+        sender = self._sender
+        queue = self._link.queue
         while sender is not None and queue and sender.credit > 0:
             parcel = queue.popleft()
             message = proton.Message(
@@ -137,17 +138,22 @@ class AmqpLink:
         selector: str = "",
         on_accepted: Callable[[str], None] = lambda _: None,
         on_message: Callable[[bytes, Mapping[str, Any]], None] = lambda *_: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not url.startswith(("amqp://", "amqps://")):
             raise InputError(
                 "amqp",
                 f"{url!r} is no address",
                 "write it like amqps://interchange.example.org:5671",
             )
-        self.url, self.target, self.source, self.selector = url, target, source, selector
-        self.on_accepted, self.on_message = on_accepted, on_message
+        self.url = url
+        self.target = target
+        self.source = source
+        self.selector = selector
+        self.on_accepted = on_accepted
+        self.on_message = on_message
         self.queue: deque[Parcel] = deque()
-        self.is_connected, self.rejected = False, 0
+        self.is_connected = False
+        self.rejected = 0
         self.injector = EventInjector()
         self._container = Container(_AmqpEvents(self))
         self._thread = threading.Thread(target=self._container.run, name="amqp", daemon=True)

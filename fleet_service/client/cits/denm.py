@@ -15,14 +15,13 @@ from schemas.thresholds import METRES_PER_DEGREE, NS
 PROTOCOL_VERSION: Final = 2
 MESSAGE_ID: Final = 1  # of a DENM
 ADHESION: Final = 6  # adverse weather condition: adhesion
-UNKNOWN_SLIPPERY, HEAVY_FROST, SNOW, ICE, BLACK_ICE, SALTED = (
-    0,
-    1,
-    4,
-    5,
-    6,
-    10,
-)  # sub-causes of adhesion
+# sub-causes of adhesion
+UNKNOWN_SLIPPERY = 0
+HEAVY_FROST = 1
+SNOW = 4
+ICE = 5
+BLACK_ICE = 6
+SALTED = 10
 ROADSIDE: Final = 15  # station type of an infrastructure that has no vehicle
 VALIDITY_DEFAULT_S: Final = 600
 POINTS: Final = 23  # most events of a history
@@ -151,10 +150,12 @@ def _position(denm: Denm) -> dict[str, Any]:
         "latitude": round(UNITS * denm.position[0]),
         "longitude": round(UNITS * denm.position[1]),
         "positionConfidenceEllipse": {
-            "semiMajorConfidence": axis, "semiMinorConfidence": axis, "semiMajorOrientation": 0,
+            "semiMajorConfidence": axis,
+            "semiMinorConfidence": axis,
+            "semiMajorOrientation": 0,
         },
         "altitude": {"altitudeValue": 800_001, "altitudeConfidence": "unavailable"},
-    }  # fmt: skip
+    }
 
 
 def _situation(denm: Denm) -> dict[str, Any]:
@@ -197,8 +198,10 @@ def _delta(origin: Point, point: Point) -> dict[str, int] | None:
 
 def _record(message: Mapping[str, Any]) -> Denm:
     content = message["denm"]
-    management, situation = content["management"], content.get("situation", {})
-    place, action = management["eventPosition"], management["actionID"]
+    management = content["management"]
+    situation = content.get("situation", {})
+    place = management["eventPosition"]
+    action = management["actionID"]
     position = (place["latitude"] / UNITS, place["longitude"] / UNITS)
     axis = place["positionConfidenceEllipse"]["semiMajorConfidence"]
     location = content.get("location", {})
@@ -238,7 +241,8 @@ def approach(
     position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
 ) -> tuple[Point, ...]:
     """Return points of the way to an event along its heading [deg from north], nearest first."""
-    north, east = math.cos(math.radians(heading)), math.sin(math.radians(heading))
+    north = math.cos(math.radians(heading))
+    east = math.sin(math.radians(heading))
     width = METRES_PER_DEGREE * math.cos(math.radians(position[0]))
     return tuple(
         (position[0] - far * north / METRES_PER_DEGREE, position[1] - far * east / width)

@@ -63,7 +63,8 @@ class EventBook:
             raise InputError(
                 "station", f"{station} is no station identifier", "give 1 to 4294967295"
             )
-        self.station, self._next = station, 0
+        self.station = station
+        self._next = 0
         self._events: dict[str, OpenEvent] = {}
         if content is not None:
             self._read(content)
@@ -77,9 +78,10 @@ class EventBook:
     def content(self) -> dict[str, Any]:
         """Return the book for a file."""
         return {
-            "station": self.station, "next": self._next,
+            "station": self.station,
+            "next": self._next,
             "events": [asdict(event) for event in self._events.values()],
-        }  # fmt: skip
+        }
 
     def update(
         self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]

@@ -17,8 +17,11 @@ from schemas.thresholds import NS
 # Friction that a sub-cause means: middle and bounds. Snow and ice as in the tyres' table of the simulator; frost and
 # unknown causes between. A salted road is no warning of low friction.
 GRIP: Final = {
-    HEAVY_FROST: (0.3, 0.15, 0.45), SNOW: (0.3, 0.2, 0.45), ICE: (0.2, 0.08, 0.35), BLACK_ICE: (0.15, 0.06, 0.3),
-}  # fmt: skip
+    HEAVY_FROST: (0.3, 0.15, 0.45),
+    SNOW: (0.3, 0.2, 0.45),
+    ICE: (0.2, 0.08, 0.35),
+    BLACK_ICE: (0.15, 0.06, 0.3),
+}
 UNKNOWN: Final = (0.35, 0.15, 0.6)
 USED: Final = 0.6  # of the middle: with less, a report would say only "at least"
 WORST_STD: Final = 30.0  # [m] of a position that names a cell at all
@@ -46,14 +49,19 @@ def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[
     for seq, (region, points) in enumerate(by_region.items(), first_seq):
         rows = len(points)
         batch: dict[str, Any] = {
-            "vehicle": name, "boot": str(boot), "seq": str(seq),
+            "vehicle": name,
+            "boot": str(boot),
+            "seq": str(seq),
             "enter_time": [str(min(denm.referenced, now))] * rows,
-            "latitude": [point[0] for point in points], "longitude": [point[1] for point in points],
+            "latitude": [point[0] for point in points],
+            "longitude": [point[1] for point in points],
             "yaw": [math.radians(90.0 - (denm.heading or 0.0))] * rows,
             "position_std": [denm.position_std if denm.position_std > 0.0 else POSITION_STD] * rows,
-            "mu": [mu] * rows, "mu_lower": [lower] * rows, "mu_upper": [upper] * rows,
+            "mu": [mu] * rows,
+            "mu_lower": [lower] * rows,
+            "mu_upper": [upper] * rows,
             "mu_utilised": [USED * mu] * rows,
-        }  # fmt: skip
+        }
         out.append((keys.observation_key(region, name), json.dumps(batch).encode()))
     return out
 

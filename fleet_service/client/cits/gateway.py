@@ -55,8 +55,11 @@ class Witness:
     def __init__(
         self, session: zenoh.Session, name: str, clock: Callable[[], int] = time.time_ns
     ) -> None:
-        self._session, self._name, self._clock = session, name, clock
-        self._boot, self._seq = secrets.randbits(63), 1
+        self._session = session
+        self._name = name
+        self._clock = clock
+        self._boot = secrets.randbits(63)
+        self._seq = 1
         self.refused = self.silent = 0
 
     def close(self) -> None:

@@ -43,7 +43,10 @@ class DenmOutput:
         send: Callable[[Parcel], None],
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._originator, self._path, self._send, self._clock = originator, path, send, clock
+        self._originator = originator
+        self._path = path
+        self._send = send
+        self._clock = clock
         self._lock = threading.Lock()
         self._checked = -float("inf")
         before = _read(path)
@@ -91,8 +94,9 @@ class DenmOutput:
             fresh = {f"{one.sequence}-{one.referenced}": (encode(one), one) for one in due}
             self._pending |= {name: body for name, (body, _) in fresh.items()}
             content = {
-                "book": self._book.content, "pending": {name: body.hex() for name, body in self._pending.items()},
-            }  # fmt: skip
+                "book": self._book.content,
+                "pending": {name: body.hex() for name, body in self._pending.items()},
+            }
         with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(json.dumps(content).encode())
         for name, (body, denm) in fresh.items():

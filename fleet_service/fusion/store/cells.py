@@ -67,7 +67,9 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
     """A slot that holds the prior."""
     live.belief[slot] = FULL
     cell = live.cells[slot]
-    cell.key, cell.window, cell.reporters = key, NONE, NONE
+    cell.key = key
+    cell.window = NONE
+    cell.reporters = NONE
 
 
 @refcount_free_inlined
@@ -75,7 +77,8 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
     """What is known of a slot, from one row to another; not where its window and its reporters lie."""
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]
-    window, reporters = target.cells[to].window, target.cells[to].reporters
+    window = target.cells[to].window
+    reporters = target.cells[to].reporters
     target.cells[to] = source.cells[at]
     target.cells[to].window, target.cells[to].reporters = window, reporters
 

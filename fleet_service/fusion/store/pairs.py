@@ -47,7 +47,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
     """Put an entry among those of its vehicle in its window."""
     pairs[pair].waiting += 1
     entries[entry].pair = pair
-    before, after = int(pairs[pair].last), NONE
+    before = int(pairs[pair].last)
+    after = NONE
     while before != NONE and precedes(entries, entry, before):
         before, after = int(entries[before].before), before
     entries[entry].before = before
@@ -63,7 +64,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """What an entry reported becomes what its vehicle reported before the checkpoint; later entries stand alone."""
-    pair, kind = int(entries[entry].pair), int(entries[entry].kind)
+    pair = int(entries[entry].pair)
+    kind = int(entries[entry].kind)
     pairs[pair].time[kind] = entries[entry].time // NS
     pairs[pair].mean[kind] = entries[entry].last_mean
     pairs[pair].spent[kind] = entries[entry].spent
@@ -95,7 +97,8 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
     """Move the pairs that reported since `least` [s] to another table; returns the places of the others."""
-    dropped, count = np.empty(len(old), np.int64), 0
+    dropped = np.empty(len(old), np.int64)
+    count = 0
     for begin in range(0, len(old), AHEAD):
         end = min(begin + AHEAD, len(old))
         for place in range(begin, end):
@@ -127,7 +130,8 @@ def returning(number: int) -> np.uint64:
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
     """Note in cells (k,) that vehicles (k,) were there, though what they reported is forgotten."""
     for k in range(len(slots)):
-        slot, bit = slots[k], returning(numbers[k])
+        slot = slots[k]
+        bit = returning(numbers[k])
         state.live.cells[slot].returned |= bit
         window = state.live.cells[slot].window
         if window != NONE:

@@ -19,7 +19,9 @@ from schemas.runtime.records import RecordArray, record_type
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
-GRIP, ICE = 0, 1  # sides: what a corroborating source reported
+# sides: what a corroborating source reported
+GRIP = 0
+ICE = 1
 SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
 # What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,
 # and below 4 all. In the window as before the checkpoint, so that it does not matter which of the two is asked.

@@ -28,7 +28,7 @@ from fleet_service.fusion.store.records import (
     Int32Array,
     Rows,
     State,
-)  # fmt: skip
+)
 from fleet_service.fusion.store.table import (
     LEAST,
     PAIRS_MOST,
@@ -39,7 +39,7 @@ from fleet_service.fusion.store.table import (
     rows_of,
     slots_for,
     table_of,
-)  # fmt: skip
+)
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
@@ -65,9 +65,13 @@ class Store:
         self.state = State(
             live=Rows(no_beliefs(0), np.zeros(0, CELL), np.zeros(0, REPORTER)),
             base=Rows(no_beliefs(0), np.zeros(0, CELL), np.zeros(0, SOURCE)),
-            windows=np.zeros(0, WINDOW), free_windows=_NOTHING, entries=np.zeros(0, ENTRY), free_entries=_NOTHING,
-            pairs=_no_pairs(LEAST), used=np.zeros(4, np.int64),
-        )  # fmt: skip
+            windows=np.zeros(0, WINDOW),
+            free_windows=_NOTHING,
+            entries=np.zeros(0, ENTRY),
+            free_entries=_NOTHING,
+            pairs=_no_pairs(LEAST),
+            used=np.zeros(4, np.int64),
+        )
         self.peers = no_peers(0)
         self.names: RecordArray = np.zeros(0, VEHICLE)
         self.size = self.vehicles = 0
@@ -81,8 +85,12 @@ class Store:
     ) -> Store:
         """A store with these contents."""
         store = Store()
-        store.state, store.peers, store.names = state, peers, names
-        store.size, store.vehicles, store.hour = size, vehicles, hour
+        store.state = state
+        store.peers = peers
+        store.names = names
+        store.size = size
+        store.vehicles = vehicles
+        store.hour = hour
         store._slots = table_of(state.live.cells, size, size)
         store._known = table_of(names, vehicles, vehicles)
         return store
@@ -127,7 +135,8 @@ class Store:
         if is_full(most, len(self._slots), ROWS_MOST):
             self._slots = table_of(self.state.live.cells, self.size, most)
         if most > len(self.state.live.cells):
-            live, rows = self.state.live, max(most, 2 * len(self.state.live.cells))
+            live = self.state.live
+            rows = max(most, 2 * len(self.state.live.cells))
             live = live._replace(belief=_longer(live.belief, rows), cells=_longer(live.cells, rows))
             self.state = self.state._replace(live=live)
         slots[new], self.size = slots_for(self._slots, self.state.live, keys[new], self.size)
@@ -147,7 +156,8 @@ class Store:
             self._known = table_of(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
-            self.names, peers = _longer(self.names, rows), no_peers(rows)
+            self.names = _longer(self.names, rows)
+            peers = no_peers(rows)
             peers[: len(self.peers)] = self.peers
             self.peers = peers
         index, self.vehicles = numbered(self._known, self.names, vehicle, self.vehicles)
@@ -175,12 +185,15 @@ class Store:
         self.state = self.state._replace(entries=entries, free_entries=free)
 
     def _more_windows(self, most: int) -> None:
-        old, rows = self.state, max(2 * len(self.state.windows), most)
+        old = self.state
+        rows = max(2 * len(self.state.windows), most)
         windows = _longer(old.windows, rows)
         windows["slot"][len(old.windows) :] = NONE
         base = Rows(
-            _longer(old.base.belief, rows), _longer(old.base.cells, rows), _longer(old.base.reporters, rows)
-        )  # fmt: skip
+            _longer(old.base.belief, rows),
+            _longer(old.base.cells, rows),
+            _longer(old.base.reporters, rows),
+        )
         free = _restacked(old.free_windows, old.used, FREE_WINDOWS, rows)
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
@@ -195,7 +208,8 @@ class Store:
 
     def untouched(self, before: int) -> BoolArray:
         """Slots (size,) whose last visit was before a time [ns], and which nothing else points at."""
-        cells, pairs = self.state.live.cells[: self.size], self.state.pairs
+        cells = self.state.live.cells[: self.size]
+        pairs = self.state.pairs
         found = (cells["time"] < before) & (cells["window"] == NONE) & (cells["reporters"] == NONE)
         found[pairs["slot"][pairs["slot"] != NONE]] = False
         return np.asarray(found)
@@ -206,7 +220,8 @@ class Store:
         place = np.full(self.size, NONE, np.int64)
         place[stay] = np.arange(len(stay))
         live = self.state.live
-        belief, cells = no_beliefs(len(stay)), rows_of_lines(len(stay), CELL)
+        belief = no_beliefs(len(stay))
+        cells = rows_of_lines(len(stay), CELL)
         belief[:], cells[:] = live.belief[stay], live.cells[stay]
         self.state = self.state._replace(live=live._replace(belief=belief, cells=cells))
         for pointing in (self.state.windows["slot"], self.state.pairs["slot"]):
@@ -230,9 +245,11 @@ class Store:
 
     def _rebuild_reporters(self, least: int) -> None:
         """Drop reporters whose last report was before `least` [s], but for those of a window."""
-        live, cells = self.state.live, self.state.live.cells[: self.size]
+        live = self.state.live
+        cells = self.state.live.cells[: self.size]
         slots = np.flatnonzero(cells["reporters"] != NONE)
-        row, old = cells["reporters"][slots], live.reporters
+        row = cells["reporters"][slots]
+        old = live.reporters
         last = np.maximum(
             old["time"].max(axis=1, initial=0), old["source_time"].max(axis=(1, 2), initial=0)
         )
@@ -246,12 +263,10 @@ class Store:
 @compiled
 def due(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
     """Windows with entries before `before` [ns]: those without a value, and those with one."""
-    plain, valued, without, of_value = (
-        np.empty(len(windows), np.int64),
-        np.empty(len(windows), np.int64),
-        0,
-        0,
-    )
+    plain = np.empty(len(windows), np.int64)
+    valued = np.empty(len(windows), np.int64)
+    without = 0
+    of_value = 0
     for window in range(len(windows)):
         if windows[window].slot != NONE and windows[window].first < before:
             if windows[window].values:
@@ -295,7 +310,8 @@ def _longer(old: Array, rows: int) -> Array:
 
 def _restacked(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
     """Free rows of a grown pool: those of the old one, and the new ones; counted in `used[which]`."""
-    count, more = int(used[which]), rows - len(old)
+    count = int(used[which])
+    more = rows - len(old)
     new = np.zeros(rows, np.int32)
     new[:count] = old[:count]
     new[count : count + more] = np.arange(len(old), rows)

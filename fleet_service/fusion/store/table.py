@@ -59,7 +59,8 @@ def _held(mixed: np.uint64, row: int) -> int:
 def locate(table: IntArray, rows: RecordArray, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
     mixed = _mixed(key)
-    place, tag = _first(mixed, len(table)), np.int64(mixed & np.uint64(_TAG))
+    place = _first(mixed, len(table))
+    tag = np.int64(mixed & np.uint64(_TAG))
     while table[place] != NONE and (
         (table[place] >> 32) != tag or rows[_row(table[place])].key != key
     ):

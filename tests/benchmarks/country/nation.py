@@ -92,7 +92,8 @@ def started(folder: Path, endpoint: str, name: str, region: str) -> Service:
         metrics_port=0,
         compact_s=COMPACT_S,
     )
-    path, archive = folder / f"{name}.json", folder / name
+    path = folder / f"{name}.json"
+    archive = folder / name
     path.write_text(
         config.model_dump_json(include={"name", "regions", "zenoh", "metrics_port", "compact_s"})
     )
@@ -175,14 +176,19 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
     least = [float("inf")] * (len(parts) - 1)
     while sender.alive:
         values = [one.values() for one in services]
-        looks.append(Look(
-            time.monotonic() - began, _least(least, parts), [spent_s(part) for part in parts],
-            [value["gripmap_cells"] for value in values],
-            [value['gripmap_rows_total{kind="observation"}'] for value in values],
-            [value["gripmap_queue_messages"] for value in values],
-        ))  # fmt: skip
+        looks.append(
+            Look(
+                time.monotonic() - began,
+                _least(least, parts),
+                [spent_s(part) for part in parts],
+                [value["gripmap_cells"] for value in values],
+                [value['gripmap_rows_total{kind="observation"}'] for value in values],
+                [value["gripmap_queue_messages"] for value in values],
+            )
+        )
         if len(looks) % 6 == 0:
-            now, last = looks[-1], _last_line(sender)
+            now = looks[-1]
+            last = _last_line(sender)
             memory = ", ".join(f"{value:.0f}" for value in now.memory)
             waits = f"oldest {last.get('oldest_s', 0.0):.1f} s, p99 {last.get('p99_s', 0.0):.2f} s"
             late = f"sender {last.get('late_s', 0.0):.1f} s late"
@@ -228,9 +234,12 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
     """Return the waiting times of the batches of the ten minutes, and the slowest regions."""
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)
-    halves, most = np.transpose([
-        np.quantile(waits[:, region == k][measured[:, region == k]], (0.5, 0.99)) for k in range(sum(ZONES))
-    ])  # fmt: skip
+    halves, most = np.transpose(
+        [
+            np.quantile(waits[:, region == k][measured[:, region == k]], (0.5, 0.99))
+            for k in range(sum(ZONES))
+        ]
+    )
     rate = measured.sum() * ROWS / MEASURED_S
     return [
         Figure("country.rate", float(rate), "observations/s that were sent", 0.98 * RATE, "more"),
@@ -293,9 +302,11 @@ def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
 def _shares(looks: Sequence[Look], observations: int) -> list[Figure]:
     """Return the processor time of each process in the ten minutes."""
     late = [look for look in looks if look.time >= WARM_S]
-    first, last = late[0], late[-1]
+    first = late[0]
+    last = late[-1]
     apart = last.time - first.time
-    rows, spent = np.array(last.rows) - first.rows, (np.array(last.spent) - first.spent) / apart
+    rows = np.array(last.rows) - first.rows
+    spent = (np.array(last.spent) - first.spent) / apart
     per_row = spent[: len(SERVICES)] * apart / rows
     return [
         Figure(

@@ -21,7 +21,8 @@ NEW_PLACES: Final = 1.0
 
 def million(found: Mapping[str, float]) -> list[Figure]:
     """A million vehicles at the country's rate each, from what was measured."""
-    rate, cells = FACTOR * found["country.rate"], FACTOR * found["country.cells"]
+    rate = FACTOR * found["country.rate"]
+    cells = FACTOR * found["country.cells"]
     cores = rate * found["country.service_us"] * 1e-6
     pairs = rate * NEW_PLACES * (FORGOTTEN_S + HOUR_S / 2)
     per_day = rate * DAY_S * found["country.archive_bytes"] / 1e9

@@ -17,8 +17,11 @@ COLOURS: Final = ("#0072b2", "#d55e00", "#009e73")
 def draw(course: Path, out: Path) -> None:
     """Draw what the course left in its folder."""
     with np.load(course / "course.npz") as looks, np.load(course / "waits.npz") as waits:
-        time_s, memory, cells = looks["time"], looks["memory"], looks["cells"]
-        put, wait = waits["put"].ravel(), np.nan_to_num(waits["wait"].ravel(), nan=np.inf)
+        time_s = looks["time"]
+        memory = looks["memory"]
+        cells = looks["cells"]
+        put = waits["put"].ravel()
+        wait = np.nan_to_num(waits["wait"].ravel(), nan=np.inf)
     canvas = Canvas(figsize=(8.0, 7.0), layout="constrained")
     above, middle, below = canvas.subplots(3, 1, sharex=True)
     for k, (name, colour) in enumerate(zip(SERVICES, COLOURS, strict=True)):

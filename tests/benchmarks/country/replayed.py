@@ -112,11 +112,16 @@ class Country:
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
         k = int(self.region[vehicle])
-        (region_x, region_y), (east, south) = self.regions[k], TOWNS[self.town[vehicle]]
-        x0, y0 = (region_x * _TILES + east) * _CELLS, (region_y * _TILES + south) * _CELLS
-        side, now = 1 << grid.CELL_ZOOM, time.time_ns()
+        (region_x, region_y) = self.regions[k]
+        (east, south) = TOWNS[self.town[vehicle]]
+        x0 = (region_x * _TILES + east) * _CELLS
+        y0 = (region_y * _TILES + south) * _CELLS
+        side = 1 << grid.CELL_ZOOM
+        now = time.time_ns()
         message = chunk.message
-        message.vehicle, message.boot, message.region = f"car-{vehicle:06}", boot, self.region_id(k)
+        message.vehicle = f"car-{vehicle:06}"
+        message.boot = boot
+        message.region = self.region_id(k)
         message.seq = message.first_held = turn + 1
         message.cell[:] = grid.interleave(chunk.cell_x + x0, chunk.cell_y + y0).tolist()
         message.longitude[:] = ((chunk.x + x0) / side * 360.0 - 180.0).tolist()

@@ -40,18 +40,18 @@ class Waits:
 
     def line(self, since: float) -> dict[str, float]:
         """Return the batches sent and waiting, and the 99 % quantile of finished waits since then [s]."""
-        put, acked, now = (
-            self.put,
-            self.acked.copy(),
-            time.monotonic(),
-        )  # a copy: it is written meanwhile
+        # a copy: it is written meanwhile
+        put = self.put
+        acked = self.acked.copy()
+        now = time.monotonic()
         waits = np.isfinite(put) & np.isnan(acked)
         ended = (acked - put)[(put >= since) & np.isfinite(acked)]
         return {
-            "put": float(np.isfinite(put).sum()), "acked": float(np.isfinite(acked).sum()),
+            "put": float(np.isfinite(put).sum()),
+            "acked": float(np.isfinite(acked).sum()),
             "oldest_s": float(now - put[waits].min()) if waits.any() else 0.0,
             "p99_s": float(np.quantile(ended, 0.99)) if len(ended) else float("nan"),
-        }  # fmt: skip
+        }
 
 
 def main() -> int:
@@ -68,8 +68,10 @@ def main() -> int:
     session = open_session(ZenohSettings(connect=[asked.endpoint]))
     assert session is not None
     turns = int(asked.seconds / PERIOD_S) + 1
-    waits, boot = Waits(session, asked.vehicles, turns), time.time_ns()
-    rate, encoding = asked.vehicles / PERIOD_S, wire.ENCODING[Kind.OBSERVATION]
+    waits = Waits(session, asked.vehicles, turns)
+    boot = time.time_ns()
+    rate = asked.vehicles / PERIOD_S
+    encoding = wire.ENCODING[Kind.OBSERVATION]
     began = said = time.monotonic()
     late = 0.0
     for number in range(int(asked.seconds * rate)):
@@ -84,7 +86,8 @@ def main() -> int:
         if time.monotonic() - said >= EVERY_S:
             line = waits.line(said) | {"late_s": late, "payload": float(len(payload))}
             print(json.dumps(line), flush=True)
-            said, late = time.monotonic(), 0.0
+            said = time.monotonic()
+            late = 0.0
     deadline = time.monotonic() + PATIENCE_S
     while (
         left := np.isfinite(waits.put) & np.isnan(waits.acked)

@@ -29,7 +29,9 @@ LEAP_M: Final = 20.0  # between two steps: SUMO has taken it out of a jam
 SMOOTH_M: Final = 13  # over which a driver opens his path
 # [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
 USUAL_Q: Final = 5.0
-WET_AREAS, SNOW_AREAS, ICE_PATCHES = 4, 2, 24
+WET_AREAS = 4
+SNOW_AREAS = 2
+ICE_PATCHES = 24
 
 
 class Drive(NamedTuple):
@@ -75,7 +77,8 @@ def _drive(rows: pd.DataFrame) -> Drive | None:
     moves = np.r_[True, step > 0.05]
     if moves.sum() < 10 or step.max() > LEAP_M:
         return None
-    line, speed = np.column_stack([x, y])[moves], rows.vehicle_speed.to_numpy(float)[moves]
+    line = np.column_stack([x, y])[moves]
+    speed = rows.vehicle_speed.to_numpy(float)[moves]
     run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
     even = np.arange(0.0, run[-1], 1.0)
     window = np.hanning(SMOOTH_M + 2)[1:-1]
@@ -99,7 +102,8 @@ def town(found: list[Drive], seed: int) -> Streets:
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed
     )
-    usual, rng = drawn(seed), np.random.default_rng(seed)
+    usual = drawn(seed)
+    rng = np.random.default_rng(seed)
     points = np.concatenate([one.line for one in found])
     patches = []
     for kind, mu, count, size in (
@@ -114,11 +118,18 @@ def town(found: list[Drive], seed: int) -> Streets:
     for k in range(ICE_PATCHES):
         line = found[rng.integers(len(found))].line
         at = rng.integers(5, len(line) - 5)
-        along, (x, y) = line[at + 3] - line[at - 3], line[at]
+        along = line[at + 3] - line[at - 3]
+        (x, y) = line[at]
         angle = float(np.arctan2(along[1], along[0]))
         patches.append(Patch(f"ice {k}", x, y, 40.0, 14.0, ICE * rng.uniform(0.6, 1.1), angle))
     return Streets(
-        name="helsinki", about="the centre of Helsinki", junctions={}, roads=(), background=DRY * rng.uniform(0.9, 1.1),
-        patches=tuple(patches), relief=usual.relief, origin=HELSINKI,
+        name="helsinki",
+        about="the centre of Helsinki",
+        junctions={},
+        roads=(),
+        background=DRY * rng.uniform(0.9, 1.1),
+        patches=tuple(patches),
+        relief=usual.relief,
+        origin=HELSINKI,
         lanes=replace(lanes, starts=np.arange(len(found))),
-    )  # fmt: skip
+    )

@@ -24,7 +24,8 @@ SLOWER: Final = 1.2  # of the time of the quickest route
 def measure_routes(folder: Path, quick: bool) -> list[Figure]:
     """Send cars through a town with icy streets, with and without costs of grip."""
     draw = np.random.default_rng(SEED)
-    engine, town = routes.Valhalla(folder), routes.make_town(draw)
+    engine = routes.Valhalla(folder)
+    town = routes.make_town(draw)
     network = folder / "town.osm"
     routes.write_town(town, network)
     engine.build(network)
@@ -34,13 +35,21 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
     icy = [town.streets[k] for k in chosen.tolist()]
     middles = np.array([town.crossings[list(street)].mean(axis=0) for street in icy])
     table = routes.icy_map(town, icy)
-    costs = routing.valhalla(routing.cost_lines(table, [
-        road for street in town.streets for line in [town.line(street)]
-        for road in (line, routing.RoadLine(line.latitude[::-1], line.longitude[::-1]))
-    ]))  # fmt: skip
+    costs = routing.valhalla(
+        routing.cost_lines(
+            table,
+            [
+                road
+                for street in town.streets
+                for line in [town.line(street)]
+                for road in (line, routing.RoadLine(line.latitude[::-1], line.longitude[::-1]))
+            ],
+        )
+    )
     closed = [{"lat": a, "lon": b} for a, b in middles.tolist()]
     cases = avoided = 0
-    error_s, longer = 0.0, list[float]()
+    error_s = 0.0
+    longer = list[float]()
     for _ in range(20 if quick else 60):
         trip = town.crossings[draw.choice(len(town.crossings), 2, replace=False)]
         request = {"locations": [{"lat": a, "lon": b} for a, b in trip.tolist()], "costing": "auto"}
@@ -100,7 +109,8 @@ def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
 def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
     """Return True if a route passes the middle of an icy street."""
     scale = np.array([1.0, np.cos(np.radians(routes.ORIGIN[0]))])
-    first, last = shape[:-1] * scale, shape[1:] * scale
+    first = shape[:-1] * scale
+    last = shape[1:] * scale
     along = last - first
     length = np.maximum((along**2).sum(axis=1), 1e-18)
     for middle in middles * scale:
@@ -113,7 +123,9 @@ def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
 
 def _decode(text: str) -> np.ndarray[Any, Any]:
     """Return the points of an encoded polyline with six decimals."""
-    numbers, value, shift = list[int](), 0, 0
+    numbers = list[int]()
+    value = 0
+    shift = 0
     for letter in text:
         bits = ord(letter) - 63
         value |= (bits & 31) << shift

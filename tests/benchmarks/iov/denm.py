@@ -29,18 +29,37 @@ def _stretch(number: int, draw: np.random.Generator) -> StretchAlert:
     latitude, longitude = draw.normal(CENTRE, 0.2).tolist()
     points = tuple((latitude + 1e-4 * k, longitude) for k in range(int(draw.integers(1, 12))))
     return StretchAlert(
-        f"s{number}", "raised", START, START, 20.0, "north-south", ("north",), latitude, longitude, (0, 0, 0, 0),
-        len(points), float(draw.uniform(0.1, 0.35)), 0.1, 0.4, 0.95, int(draw.integers(2, 6)), "", points,
-    )  # fmt: skip
+        f"s{number}",
+        "raised",
+        START,
+        START,
+        20.0,
+        "north-south",
+        ("north",),
+        latitude,
+        longitude,
+        (0, 0, 0, 0),
+        len(points),
+        float(draw.uniform(0.1, 0.35)),
+        0.1,
+        0.4,
+        0.95,
+        int(draw.integers(2, 6)),
+        "",
+        points,
+    )
 
 
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     """Raise, change and end events, with a restart of the gateway after each step."""
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
-    draw, url, path = np.random.default_rng(4202), free_url(), folder / "cits.json"
+    draw = np.random.default_rng(4202)
+    url = free_url()
+    path = folder / "cits.json"
     path.unlink(missing_ok=True)
-    events, now = 500 if quick else 2000, [START]
+    events = 500 if quick else 2000
+    now = [START]
     stretches = [_stretch(number, draw) for number in range(events)]
     steps = [
         stretches,
@@ -57,7 +76,8 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
             until(lambda link=link: link.is_connected)  # type: ignore[misc]
             output = DenmOutput(STATION, originator, path, link.send, lambda: now[0])
             now[0] += NS
-            before, began = len(there.received), time.perf_counter()
+            before = len(there.received)
+            began = time.perf_counter()
             output.keep_up(standing, lambda *_: True)
             sent = output.unsettled
             until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
@@ -67,9 +87,11 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
             output.keep_up(standing, lambda *_: True)
             link.close()
             assert len(there.received) - before == sent
-    oracle, invalid = DENM_PDU_Descriptions.DENM, 0
+    oracle = DENM_PDU_Descriptions.DENM
+    invalid = 0
     first: dict[int, tuple[float, float]] = {}
-    doubled, last = 0, dict[int, str | None]()
+    doubled = 0
+    last = dict[int, str | None]()
     for body, _ in there.received:
         oracle.from_uper(body)
         invalid += oracle.to_uper() != body
@@ -106,7 +128,8 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
 
 def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
     """Return how often `quadTree LIKE '%,DIGITS%'` and the place of an event disagree."""
-    wrong, squares = 0, set[tuple[int, int]]()
+    wrong = 0
+    squares = set[tuple[int, int]]()
     denms = [(decode(body), given) for body, given in received]
     lasting = [(denm, given) for denm, given in denms if denm.termination is None]
     for denm, _ in lasting[:10]:

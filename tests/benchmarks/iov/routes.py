@@ -92,10 +92,14 @@ def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
     lower = np.array(list(rows.values()))
     return pa.table(
         {
-            "cell": cell, "sector": sector.astype(np.int8), "mu_lower": lower, "mu_upper": lower + 0.1,
-            "p_slippery": np.where(lower < 0.4, 0.99, 0.01), "basis": ["measured"] * len(cell),
+            "cell": cell,
+            "sector": sector.astype(np.int8),
+            "mu_lower": lower,
+            "mu_upper": lower + 0.1,
+            "p_slippery": np.where(lower < 0.4, 0.99, 0.01),
+            "basis": ["measured"] * len(cell),
         }
-    )  # fmt: skip
+    )
 
 
 class Valhalla:

@@ -13,7 +13,8 @@ from edge_agent.adaptation.memberships import Memberships
 from schemas.errors import InputError
 
 SETS = Memberships()
-INPUTS, OUTPUTS = np.array(SETS.inputs), np.array(SETS.outputs)
+INPUTS = np.array(SETS.inputs)
+OUTPUTS = np.array(SETS.outputs)
 
 
 def test_at_the_peak_of_a_set_its_output_alone_speaks() -> None:
@@ -35,10 +36,8 @@ def test_noise_grows_where_the_actual_innovation_exceeds_the_theoretical_one() -
 def test_the_factor_stays_within_its_bounds_however_long_the_mismatch_lasts() -> None:
     high = low = 1.0
     for _ in range(1000):
-        high, low = (
-            adapted(high, 100.0, 1.0, INPUTS, OUTPUTS),
-            adapted(low, 0.0, 1.0, INPUTS, OUTPUTS),
-        )
+        high = adapted(high, 100.0, 1.0, INPUTS, OUTPUTS)
+        low = adapted(low, 0.0, 1.0, INPUTS, OUTPUTS)
     assert high == LARGEST_FACTOR
     assert low == LEAST_FACTOR
 

@@ -44,7 +44,8 @@ def test_a_corrupted_table_is_refused(printed: tuple[str, ...]) -> None:
 
 def test_bounds_and_pace_of_the_adaptation_matter() -> None:
     sets = Memberships()
-    inputs, outputs = np.array(sets.inputs), np.array(sets.outputs)
+    inputs = np.array(sets.inputs)
+    outputs = np.array(sets.outputs)
     one = adapted_within(1.0, 3.0, 1.0, inputs, outputs, 1.0, (0.1, 20.0))
     assert one == adapted(1.0, 3.0, 1.0, inputs, outputs)
     assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, 2.0, (0.1, 20.0)) == pytest.approx(one**2)

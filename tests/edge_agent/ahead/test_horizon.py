@@ -66,10 +66,8 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 ) -> None:
     """A right angle to the left, 120 m on."""
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
-    x, y = (
-        np.concatenate([way, np.full(len(way) - 1, 120.0)]),
-        np.concatenate([np.zeros(len(way)), way[1:]]),
-    )
+    x = np.concatenate([way, np.full(len(way) - 1, 120.0)])
+    y = np.concatenate([np.zeros(len(way)), way[1:]])
     route = GivenRoute(*to_degrees(x, y, HOME))
     latitude, longitude = to_degrees(
         np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME
@@ -151,7 +149,8 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
 def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     said = cells(keys_on(), 0.15, width=0.05)
     said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
-    cache, path = told([said]), straight_path(HOME, 60.0)
+    cache = told([said])
+    path = straight_path(HOME, 60.0)
     share = -math.expm1(-2400.0 / CHANGE_S)
     assert 0.9 * (1.0 - share) + 0.304 * share < WARN_ABOVE
     assert look_ahead(path, cache, NOW + 1500 * NS).slippery.any()
@@ -183,7 +182,8 @@ def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
 
 
 def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
-    keys, cache = keys_on(100.0), LocalMap()
+    keys = keys_on(100.0)
+    cache = LocalMap()
     cache.take(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
     cache.take(1, cells(keys, 0.8), NOW + NS)
     found = cache.look_up(keys, NOW + NS)
@@ -195,7 +195,8 @@ def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
 
 
 def test_alerts_missing_from_a_tiles_standing_list_are_dropped() -> None:
-    cache, keys = LocalMap(), keys_on()
+    cache = LocalMap()
+    keys = keys_on()
     tile = int(grid.tile_of(keys[3] // grid.SECTORS))
     assert cache.alert(alert(keys[3]), NOW)
     assert not cache.alert(alert(keys[3]), NOW + NS), "put again, it is no news"
@@ -222,7 +223,10 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
     """It has heard only of what it asked for, and what lies behind that it must ask for before it comes there."""
-    road, cache, asked, known_m = keys_on(1500.0), LocalMap(), RequestLog(), []
+    road = keys_on(1500.0)
+    cache = LocalMap()
+    asked = RequestLog()
+    known_m = []
     latitude, longitude = line(1500.0)
     length = horizon_length(HOME.speed)
     for second in range(80):
@@ -257,7 +261,8 @@ def test_the_other_carriageway_is_no_way_on() -> None:
 def test_safe_speed_allows_stopping_in_sight_and_falls_comfortably() -> None:
     lower = np.concatenate([np.full(100, 0.8), np.full(50, 0.12)])
     speed = safe_speed(np.zeros(150), lower)
-    v, a = speed[120], 0.12 * GRAVITY
+    v = speed[120]
+    a = 0.12 * GRAVITY
     assert v * 1.5 + v * v / (2 * a) == pytest.approx(SIGHT_M)
     assert -np.diff(speed[:101] ** 2).min() / 2.0 <= COMFORT + 1e-9
     assert (np.diff(speed) <= 1e-9).all()
@@ -276,7 +281,8 @@ def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
 
 
 def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
-    road, path = keys_on(), straight_path(HOME, 60.0)
+    road = keys_on()
+    path = straight_path(HOME, 60.0)
     other = [int(key) ^ OTHER_WAY for key in road[2:4]]
     cache = LocalMap()
     for key in other:

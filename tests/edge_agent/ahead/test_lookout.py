@@ -246,7 +246,8 @@ def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Rou
             assert np.isnan(seen.runs.safe_speed).all()
             assert not seen.warnings
         subscriber = car.lookout.counts.subscribers[CAR]
-        now, key = time.time_ns(), keys.map_key(TILE)
+        now = time.time_ns()
+        key = keys.map_key(TILE)
         for when, mu in ((now, 0.15), (now - DAY, 0.85)):
             with subscriber.looking():
                 subscriber.known.take(*decode_cells(key, tile_payload(HERE, mu, when), now), now)
@@ -257,7 +258,8 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     router: Router, town: MadeUpService
 ) -> None:
     town.mu = {int(key): 0.2 for key in keys_on()}
-    here, flat = np.array([keys_on()[0]]), (np.zeros((1, 32)), np.zeros((1, 32)))
+    here = np.array([keys_on()[0]])
+    flat = (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
         car.lookout.believe(np.array([-1]), flat)
         car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
@@ -357,7 +359,8 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
     ):
         later_s = 0.0
         while liar.said < every:  # a piece is asked for again when it is old
-            said, later_s = liar.said, later_s + REFRESH_S + 1.0
+            said = liar.said
+            later_s = later_s + REFRESH_S + 1.0
             car.be(later_s=later_s)
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
@@ -371,7 +374,8 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
 
 
 def test_alerts_that_are_not_possible_are_refused() -> None:
-    good, key = alert(int(HERE[0]), time=NOW), keys.alert_key(TILE)
+    good = alert(int(HERE[0]), time=NOW)
+    key = keys.alert_key(TILE)
     assert (
         decode_alert_message(key, wire.encode_alert(good), NOW)
         == decode_standing_alerts(key, wire.encode_standing([good]), NOW)[1][0]
@@ -400,7 +404,8 @@ def _at(metre: float, seconds: float) -> Pose:
 
 
 def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> None:
-    asked, pose = RequestLog(), _at(0, 0)
+    asked = RequestLog()
+    pose = _at(0, 0)
     path = straight_path(pose, 150.0)
     boxes = asked.wanting(path, pose, 100.0)
     assert 1 <= len(boxes) <= 6
@@ -421,17 +426,21 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
 
 
 def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
-    tiles, begun, ceased = Tiles(), 0, 0
+    tiles = Tiles()
+    begun = 0
+    ceased = 0
     for second in range(600):
         metre = 40.0 * second
         pose = _at(metre, second)
         here: list[Path] = [straight_path(pose, 150.0)]
         fresh, gone = tiles.follow(here, pose)
-        begun, ceased = begun + len(fresh), ceased + len(gone)
+        begun = begun + len(fresh)
+        ceased = ceased + len(gone)
         assert len(tiles.heard) <= MOST_TILES
         assert len(tiles.heard) == begun - ceased
     assert 15 < begun < 60, "24 km over tiles of 1.3 km"
-    border, flickers = Tiles(), 0
+    border = Tiles()
+    flickers = 0
     west, _, _, _ = (float(side) for side in grid.bounds(TILE, grid.TILE_ZOOM))
     for second in range(100):
         pose = HOME._replace(

@@ -54,7 +54,8 @@ def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
     """Return the speed [m/s] with which a car that starts `metres` before ice enters it."""
     safe = np.full(metres + 50, np.nan)
     safe[metres:] = stopping_speed(mu, SIGHT_M)
-    at, step = 0.0, 0.05
+    at = 0.0
+    step = 0.05
     while at < metres:
         ahead = safe[int(at) :]
         limit = limit_ahead(np.arange(len(ahead), dtype=float), ahead) if limited else math.inf
@@ -65,9 +66,11 @@ def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
 
 @pytest.mark.parametrize("limited", [True, False])
 def test_limit_lets_a_car_stop_within_sight_on_ice(limited: bool) -> None:
-    draw, stops = np.random.default_rng(3), list[bool]()
+    draw = np.random.default_rng(3)
+    stops = list[bool]()
     for _ in range(50):
-        speed, mu = draw.uniform(12.0, 36.0), draw.uniform(0.06, 0.3)
+        speed = draw.uniform(12.0, 36.0)
+        mu = draw.uniform(0.06, 0.3)
         metres = int(speed**2 / (2.0 * COMFORT) + MARGIN_M + draw.uniform(5.0, 100.0))
         entered = enter_ice(speed, mu, metres, limited=limited)
         stops.append(entered <= float(stopping_speed(mu, SIGHT_M)) + 1e-6)

@@ -42,7 +42,8 @@ def key(k: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def test_without_a_map_the_vehicle_believes_what_its_filter_believes() -> None:
-    prior, own = MapPrior(1), saying(0.7)
+    prior = MapPrior(1)
+    own = saying(0.7)
     out = prior.step(key(5), own, saying(0.7), {0: None})
     assert np.array_equal(out, np.exp(own) / np.exp(own).sum())
 
@@ -59,7 +60,8 @@ def test_at_the_border_of_a_cell_that_the_map_knows_its_belief_is_expected() -> 
 
 def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
     road = keys_on(100.0)
-    place, shares = int(road[0]), []
+    place = int(road[0])
+    shares = []
     for age_s in (0.0, 1800.0, 4 * 3600.0):
         said = cells(road, 0.2, at=NOW - round(age_s * NS))
         belief = told([said._replace(heard=np.full(len(road), NOW))]).belief(place, NOW)
@@ -72,7 +74,8 @@ def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
 
 
 def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> None:
-    prior, says = MapPrior(1), []
+    prior = MapPrior(1)
+    says = []
     prior.step(key(4), saying(0.9), FLAT, {0: sharp(0.9)})
     for cell in range(5, 9):
         entered = prior.step(key(cell), saying(0.2, 0.3), FLAT, {0: sharp(0.9)})
@@ -84,7 +87,8 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
 
 def test_a_map_says_nothing_twice() -> None:
     """However many cells say the same, the belief does not grow beyond that of one."""
-    prior, widths = MapPrior(1), []
+    prior = MapPrior(1)
+    widths = []
     for cell in range(30):
         out = prior.step(key(cell), FLAT, FLAT, {0: sharp(0.6)})
         widths.append(float((mugrid.quantiles(out, 0.95) - mugrid.quantiles(out, 0.05))[0]))
@@ -100,12 +104,15 @@ def test_who_is_nowhere_knows_no_map() -> None:
 
 
 def test_what_is_published_is_the_same_bit_for_bit_whatever_the_map_says() -> None:
-    fleet, published = SimulatedFleet("test", 2, 3, 100.0), []
+    fleet = SimulatedFleet("test", 2, 3, 100.0)
+    published = []
     source = blocks(fleet, 100.0)
     driven: list[Block] = [next(source) for _ in range(60)]
     for lie in (None, sharp(0.15), sharp(1.0)):
         pipeline = Pipeline(bank_of("aco-fckf", fleet.vehicles), 2, AgentConfig())
-        prior, records, helped = MapPrior(2), [], 0.0
+        prior = MapPrior(2)
+        records = []
+        helped = 0.0
         for block in driven:
             _, seen, states = pipeline.step(block)
             records += [*seen.columns.values(), *states.columns.values()]

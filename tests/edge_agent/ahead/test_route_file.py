@@ -35,13 +35,21 @@ def test_gpx_and_geojson_give_the_same_way(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "{}", "[]", "no", "<gpx>", LAUGHS, GPX.format(""), GPX.format('<trkpt lat="57.7"/>'), "[" * 100_000,
+        "",
+        "{}",
+        "[]",
+        "no",
+        "<gpx>",
+        LAUGHS,
+        GPX.format(""),
+        GPX.format('<trkpt lat="57.7"/>'),
+        "[" * 100_000,
         GPX.format('<trkpt lat="57.7" lon="11"/>' * 2),
         GPX.format('<trkpt lat="1e9" lon="11"/><trkpt lat="1" lon="1"/>'),
         json.dumps({"type": "LineString", "coordinates": [[11.9, 57.7], ["x", 57.8]]}),
         json.dumps({"type": "LineString", "coordinates": [[float("nan"), 57.7], [1, 57.8]]}),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_route_is_refused_with_the_field_and_the_fix(tmp_path: Path, text: str) -> None:
     file = tmp_path / "route.gpx"
     file.write_text(text)

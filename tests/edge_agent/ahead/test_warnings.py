@@ -23,7 +23,8 @@ class Car:
     """A car that drives along the road and hears of warnings."""
 
     def __init__(self, cache: LocalMap, speed: float = 14.0) -> None:
-        self.cache, self.speed = cache, speed
+        self.cache = cache
+        self.speed = speed
         self.route = GivenRoute(*line(ROAD))
         self.active: tuple[Active, ...] = ()
         self.metre = 0.0
@@ -117,7 +118,8 @@ def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
 
 
 def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> None:
-    cache, keys = LocalMap(), icy(200.0, 80.0)
+    cache = LocalMap()
+    keys = icy(200.0, 80.0)
     for key in keys[:3]:
         cache.alert(alert(key), NOW)
     car = Car(cache)

@@ -136,7 +136,8 @@ def test_several_logs_are_not_published(
 def test_an_engine_is_for_several_logs_and_wants_no_jobs(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    paths, out = [str(path) for path in logs(drives)], ["--out", str(tmp_path / "out")]
+    paths = [str(path) for path in logs(drives)]
+    out = ["--out", str(tmp_path / "out")]
     assert main(["replay", *paths, *out, "--engine", "abacus"]) == 2
     assert "error: engine: 'abacus' is none" in capsys.readouterr().err
     assert main(["replay", *paths, *out, "--engine", "spark", "--jobs", "2"]) == 2

@@ -16,7 +16,8 @@ from tests.edge_agent.estimators.drives import drive
 @pytest.mark.parametrize("name", TUNED)
 def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
-    t, signals = t[:, None], signals[:, None]
+    t = t[:, None]
+    signals = signals[:, None]
     reported = bank_of(name, [vehicle]).advance(t, signals)
     tuned = create(name, [vehicle], memberships=shipped(TUNED[name])).advance(t, signals)
     untuned = create(name, [vehicle], memberships=Memberships()).advance(t, signals)

@@ -27,7 +27,8 @@ from schemas import grid
 from schemas.config import AgentConfig
 from schemas.wire import Kind
 
-VEHICLES, RATE = 3, 50.0
+VEHICLES = 3
+RATE = 50.0
 
 
 class Basket:
@@ -70,7 +71,8 @@ def joined(parts: list[Block]) -> Block:
 
 def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> None:
     fleet, parts = fleet_blocks(300)
-    pipeline, basket = pipeline_of(fleet), Basket()
+    pipeline = pipeline_of(fleet)
+    basket = Basket()
     for block in parts:
         basket.offer(*pipeline.step(block)[1:])
     last = pipeline.finish()
@@ -88,7 +90,8 @@ def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> N
 
 def test_the_records_of_a_fleet_do_not_depend_on_the_blocks() -> None:
     fleet, parts = fleet_blocks(60)
-    whole, pieces = Basket(), Basket()
+    whole = Basket()
+    pieces = Basket()
     whole.offer(*pipeline_of(fleet).step(joined(parts))[1:])
     pipeline = pipeline_of(fleet)
     for block in parts:
@@ -96,7 +99,8 @@ def test_the_records_of_a_fleet_do_not_depend_on_the_blocks() -> None:
     for kind in Kind:
         assert len(whole.column(kind, "vehicle"))
         for name in whole.taken[kind is Kind.STATE].columns:
-            expected, found = whole.column(kind, name), pieces.column(kind, name)
+            expected = whole.column(kind, name)
+            found = pieces.column(kind, name)
             assert np.array_equal(expected, found, equal_nan=expected.dtype.kind == "f"), name
 
 
@@ -108,7 +112,8 @@ def test_a_pipeline_without_samples_has_nothing_to_finish() -> None:
 def run(
     parts: Iterator[Block], fleet: SimulatedFleet, stop: threading.Event, **options: object
 ) -> tuple[Progress, Basket, list[float]]:
-    basket, reported = Basket(), []
+    basket = Basket()
+    reported = []
     report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
     progress = drive(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
     return progress, basket, reported
@@ -139,10 +144,8 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     last = pipeline.finish()
     assert last is not None
     plain.offer(last)
-    whose, flag = (
-        basket.column(Kind.OBSERVATION, "vehicle"),
-        basket.column(Kind.OBSERVATION, "abs_active"),
-    )
+    whose = basket.column(Kind.OBSERVATION, "vehicle")
+    flag = basket.column(Kind.OBSERVATION, "abs_active")
     assert set(flag[whose == 0].tolist()) == {0, 1}
     assert set(flag[whose > 0].tolist()) == {-1}
     filled = np.isfinite(basket.column(Kind.OBSERVATION, "air_temperature"))

@@ -28,7 +28,8 @@ def samples(count: int) -> pa.Table:
 
 @pytest.mark.parametrize("count", [0, 1, 2500])
 def test_reader_finds_every_sample_with_its_schema(tmp_path: Path, count: int) -> None:
-    table, path = samples(count), tmp_path / "drive.mcap"
+    table = samples(count)
+    path = tmp_path / "drive.mcap"
     write_table("out", path, table)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)

@@ -21,7 +21,8 @@ def test_an_agent_shows_what_was_settled_and_what_waits(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False
-    publisher, progress = publisher_of(settings(router, tmp_path)), Progress()
+    publisher = publisher_of(settings(router, tmp_path))
+    progress = Progress()
     observations, _ = drive()
     sent = len(observations.vehicle)
     publisher.offer(observations)
@@ -54,8 +55,9 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
     publisher.offer(states._replace(columns=strange), observations)
     until(lambda: publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle))
     assert publisher.counts.dropped == {
-        Kind.OBSERVATION: len(observations.vehicle), Kind.STATE: len(states.vehicle)
-    }  # fmt: skip
+        Kind.OBSERVATION: len(observations.vehicle),
+        Kind.STATE: len(states.vehicle),
+    }
     assert publisher.counts.failures > 1
     assert not publisher.broken
     assert publisher.close(within_s=5.0)
@@ -67,9 +69,12 @@ def test_agent_without_answers_or_with_full_outbox_reports_problems(
     late: list[float] = []
     config = settings(router, tmp_path)
     publisher = Publisher(
-        NAMES, Outbox(config.spool, capacity_bytes=40_000), config, "test",
+        NAMES,
+        Outbox(config.spool, capacity_bytes=40_000),
+        config,
+        "test",
         clock=lambda: time.monotonic() + sum(late),
-    )  # fmt: skip
+    )
     publisher.start()
     for seed in range(6):
         publisher.offer(*drive(seed))

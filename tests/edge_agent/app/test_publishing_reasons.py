@@ -69,7 +69,8 @@ def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
     """Return the lines that are printed in so many seconds."""
-    clock, lines = Clock(), list[str]()
+    clock = Clock()
+    lines = list[str]()
     watch = SignalWatch(clock)
     reporter = ReasonReporter(lambda: find(watch), lines.append, clock)
     for _ in range(round(seconds / 0.1)):

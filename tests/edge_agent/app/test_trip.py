@@ -35,7 +35,8 @@ def source(drive: Recorded) -> Generator[Block]:
 
 def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
     """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
-    admitted, blocks = [], []
+    admitted = []
+    blocks = []
     for block in trip.blocks(source(drive), lambda: np.full(ROWS, np.nan)):
         if trip._looking is not None:
             trip._looking.result()
@@ -78,17 +79,16 @@ def test_a_fault_is_never_admitted_and_teaches_nothing(
 
 
 def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path: Path) -> None:
-    path, bad = tmp_path / "car.json", moved([S.YAW_RATE], 0.012)(smooth)
+    path = tmp_path / "car.json"
+    bad = moved([S.YAW_RATE], 0.012)(smooth)
     for count in range(1, 4):
         trip = Trip(bad.vehicle, PROFILE, path)
         assert trip.admitted() == (count > 1), "the doctor's word is remembered"
         known = trip.vehicle.calibration
         assert (0 if known is None else known.drives) == count - 1
         _, blocks = driven(trip, bad)
-        got, raw = (
-            np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks]),
-            bad.signals[:, S.YAW_RATE],
-        )
+        got = np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks])
+        raw = bad.signals[:, S.YAW_RATE]
         offset = 0.0 if known is None or known.yaw_rate is None else known.yaw_rate[0]
         waited = [rows for rows in range(11) if delayed_by(rows, got + offset, raw)]
         assert waited, (
@@ -128,7 +128,8 @@ def test_another_car_or_a_broken_file_begins_anew(
 def test_a_short_trip_teaches_nothing_and_a_disk_that_refuses_is_no_crash(
     smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path, rows = tmp_path / "car.json", round(0.9 * LEAST_S * 100)
+    path = tmp_path / "car.json"
+    rows = round(0.9 * LEAST_S * 100)
     driven(Trip(smooth.vehicle, PROFILE, path), replace_rows(smooth, rows))
     assert Trip(smooth.vehicle, PROFILE, path).vehicle.calibration is None
     with caplog.at_level(logging.WARNING):

@@ -138,10 +138,8 @@ def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
 
 def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
     scores = load(FOLDER / "paper-aco-fckf.json").document.scores
-    default, colony = (
-        scores["default"].held_out.log_likelihood,
-        scores["colony"].held_out.log_likelihood,
-    )
+    default = scores["default"].held_out.log_likelihood
+    colony = scores["colony"].held_out.log_likelihood
     assert colony > default + 1.0
     found = study.overall(shipped("paper-aco-fckf"), study.record(study.HELD_OUT))
     assert found == pytest.approx(colony, rel=0.02)

@@ -33,9 +33,10 @@ def smooth() -> Recorded:
 def spoiled(drive: Recorded) -> Recorded:
     for spoil in (
         moved([S.AX], OFF["ax"]),
-        moved([S.YAW_RATE], OFF["yaw_rate"]), moved([S.DELTA, S.DELTA + 1], OFF["steer_offset"]),
+        moved([S.YAW_RATE], OFF["yaw_rate"]),
+        moved([S.DELTA, S.DELTA + 1], OFF["steer_offset"]),
         scaled([S.OMEGA], 1.0 + 4.0 / 3.0 * OFF["radius_fl"]),
-    ):  # fmt: skip
+    ):
         drive = spoil(drive)
     return drive
 
@@ -50,7 +51,8 @@ def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded
     after = learn(parts(spoiled(smooth), 3), smooth.vehicle)
     assert after.drives == 3
     for name, off in OFF.items():
-        one, other = getattr(before, name), getattr(after, name)
+        one = getattr(before, name)
+        other = getattr(after, name)
         assert other[0] - one[0] == pytest.approx(off, abs=2.0 * other[1]), name
         assert abs(one[0]) < 3.0 * one[1], name
         assert 0.0 < other[1] < off
@@ -98,7 +100,8 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
         [one_drive(*part, vehicle) for part in parts(drive, 3)]
         for vehicle in (drive.vehicle, unsaid)
     )
-    ours, theirs = weighed(known, drive.vehicle), weighed(blind, unsaid)
+    ours = weighed(known, drive.vehicle)
+    theirs = weighed(blind, unsaid)
     for name in ("radius_fl", "radius_fr", "radius_rl", "radius_rr"):
         right, wrong = (
             abs(float(np.median([part[name] for part in estimates])))
@@ -158,7 +161,8 @@ def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(
     seconds = float(smooth.t[LATE] - smooth.t[0])
     bad = late(smooth, WHEELS_AND_STEERING[name])
     before, after = (learn(parts(one, 3), smooth.vehicle) for one in (smooth, bad))
-    one, other = getattr(before, name), getattr(after, name)
+    one = getattr(before, name)
+    other = getattr(after, name)
     assert other[0] - one[0] == pytest.approx(seconds, abs=2.0 * other[1])
     assert abs(one[0]) < 3.0 * one[1]
     known = Calibration.model_validate({"drives": 1, name: (seconds, 0.001)})
@@ -179,7 +183,8 @@ def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> N
         drives=1, wheel_lag=(0.013, 0.001), steer_lag=(-0.041, 0.001), ax=(0.2, 0.01)
     )
     vehicle = smooth.vehicle.model_copy(update={"calibration": known})
-    t, signals = smooth.t[:300], smooth.signals[:300]
+    t = smooth.t[:300]
+    signals = smooth.signals[:300]
     whole = corrected(t, signals, vehicle)
     assert not np.array_equal(whole[50:, S.AX], signals[50:, S.AX] - 0.2)
     assert np.array_equal(corrected(t[:150], signals[:150], vehicle), whole[:150], equal_nan=True)
@@ -217,11 +222,9 @@ def write(path: Path, drive: Recorded) -> str:
 def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output
 ) -> None:
-    log, car, better = (
-        write(tmp_path / "a.parquet", spoiled(smooth)),
-        tmp_path / "car.json",
-        tmp_path / "better.json",
-    )
+    log = write(tmp_path / "a.parquet", spoiled(smooth))
+    car = tmp_path / "car.json"
+    better = tmp_path / "better.json"
     car.write_text(smooth.vehicle.model_dump_json(exclude_none=True))
     assert main(["calibrate", log, log, "--vehicle", str(car), "--out", str(better)]) == 0
     assert "steer_offset" in capsys.readouterr().out

@@ -30,7 +30,8 @@ UNKNOWN = np.full(4, np.nan)
 
 
 def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
-    x, y = np.empty(4), np.empty(4)
+    x = np.empty(4)
+    y = np.empty(4)
     tyre_forces(ROW, MOTION, wheel_inputs(DELTA, omega), np.full(4, mu), shape, x, y)
     return x, y
 
@@ -59,7 +60,9 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
     inputs = wheel_inputs(DELTA, omega)
 
     def felt(known: FloatArray) -> tuple[float, float, float]:
-        cos, sin, mu = four(inputs[:, 0]), four(inputs[:, 1]), (0.8, 0.8, 0.8, 0.8)
+        cos = four(inputs[:, 0])
+        sin = four(inputs[:, 1])
+        mu = (0.8, 0.8, 0.8, 0.8)
         return response(
             body(ROW), PlanarMotion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu)
         )
@@ -89,7 +92,8 @@ def test_in_balance_the_drive_wheel_rests() -> None:
 
 
 def test_motor_settles_with_its_time_constant_and_force_is_constant() -> None:
-    torque, slope = 0.0, 5000.0
+    torque = 0.0
+    slope = 5000.0
     for _ in range(1000):
         state = WheelState(torque, 50.0, 0.0, slope)
         torque, _, _, slope = drive_wheel(state, 100.0, 1.2, 0.3, ELECTRIC_S / 1000)

@@ -13,10 +13,19 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 CAR = Vehicle(
-    name="car", mass=1200.0, yaw_inertia=1900.0, cg_to_front_axle=1.1, cg_to_rear_axle=1.5, track_front=1.5,
-    track_rear=1.48, cg_height=0.55, wheel_radius=0.3, wheel_inertia=1.2, longitudinal_stiffness=6e4,
+    name="car",
+    mass=1200.0,
+    yaw_inertia=1900.0,
+    cg_to_front_axle=1.1,
+    cg_to_rear_axle=1.5,
+    track_front=1.5,
+    track_rear=1.48,
+    cg_height=0.55,
+    wheel_radius=0.3,
+    wheel_inertia=1.2,
+    longitudinal_stiffness=6e4,
     cornering_stiffness=5e4,
-)  # fmt: skip
+)
 ROW = parameter_row(CAR)
 
 
@@ -85,14 +94,17 @@ def test_rolling_wheel_has_no_slip_and_a_left_turn_speeds_outer_wheel() -> None:
 
 
 def test_axle_forces_and_accelerations_are_inverse() -> None:
-    force_x, force_y = np.array([100.0, 300.0, -50.0, 80.0]), np.array([500.0, 700.0, 400.0, 450.0])
+    force_x = np.array([100.0, 300.0, -50.0, 80.0])
+    force_y = np.array([500.0, 700.0, 400.0, 450.0])
     _, ay, turn = body.accelerations(ROW, force_x, force_y, np.zeros(4))
     moment = 0.5 * CAR.track_front * (300.0 - 100.0) + 0.5 * CAR.track_rear * (80.0 + 50.0)
     assert body.axle_lateral_forces(ROW, ay, turn, moment) == pytest.approx((1200.0, 850.0))
 
 
 def test_the_exact_rotation_keeps_a_circle_at_constant_speed() -> None:
-    vx, vy, rate = 12.0, 0.5, 0.4
+    vx = 12.0
+    vy = 0.5
+    rate = 0.4
     for _ in range(1000):
         vx, vy = body.advance_velocity(vx, vy, -rate * 0.5, rate * 12.0, rate, 0.01)
     assert (vx, vy) == pytest.approx((12.0, 0.5), abs=1e-9)

@@ -11,7 +11,8 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
 
-TORQUE, OMEGA = slice(S.TORQUE, S.TORQUE + 4), slice(S.OMEGA, S.OMEGA + 4)
+TORQUE = slice(S.TORQUE, S.TORQUE + 4)
+OMEGA = slice(S.OMEGA, S.OMEGA + 4)
 
 
 @cache
@@ -29,7 +30,9 @@ def drive(
 
 def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
     """Drives one after the other, 10 ms apart."""
-    clock, rows, end = [], [], 0.0
+    clock = []
+    rows = []
+    end = 0.0
     for t, signals, _ in parts:
         clock.append(t - t[0] + end)
         rows.append(signals)
@@ -42,7 +45,8 @@ def jointed() -> tuple[FloatArray, FloatArray, Vehicle]:
 
     As in the minute of tests/data/rav4.blf, at 1.7 and 38.4 s.
     """
-    vehicle, rng = drive("straight", 0.85)[2], np.random.default_rng(4)
+    vehicle = drive("straight", 0.85)[2]
+    rng = np.random.default_rng(4)
     t = np.arange(0.0, 12.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))
     signals[:, :3] = rng.normal(0.0, (0.05, 0.05, 0.002), (len(t), 3))

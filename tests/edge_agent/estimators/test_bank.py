@@ -45,7 +45,8 @@ def test_straight_on_at_constant_speed_the_interval_stays_as_wide_as_the_prior()
 
 
 def test_what_was_learned_is_forgotten_over_the_metres_driven_without_excitation() -> None:
-    turn, straight = drive("j-turn", 0.5), drive("straight", 0.5, seconds=40.0)
+    turn = drive("j-turn", 0.5)
+    straight = drive("straight", 0.5, seconds=40.0)
     t, signals = joined(turn, straight)
     reported = run("fckf", t, signals, turn[2])
     width = (reported.mu_upper - reported.mu_lower)[:, 0]
@@ -80,7 +81,8 @@ def test_however_the_samples_are_cut_the_numbers_are_the_same() -> None:
 def test_closing_visits_does_not_change_the_estimates() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     closes = np.arange(len(t)) % 100 == 50
-    plain, closed = run("fckf", t, signals, vehicle), run("fckf", t, signals, vehicle, closes)
+    plain = run("fckf", t, signals, vehicle)
+    closed = run("fckf", t, signals, vehicle, closes)
     for name in COLUMNS:
         assert np.array_equal(getattr(plain, name), getattr(closed, name)), name
     assert closed.evidence is not None
@@ -172,7 +174,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
-    t, signals = t.copy(), signals.copy()
+    t = t.copy()
+    signals = signals.copy()
     harm, flag = FAULTS[fault]
     harm(t, signals)
     reported = run("fckf", t, signals, vehicle)
@@ -204,7 +207,8 @@ def test_a_time_that_is_not_a_number_at_first_is_waited_out() -> None:
 
 def test_the_adaptation_is_what_tells_the_estimators_apart() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
-    fuzzy, plain = run("fckf", t, signals, vehicle), run("ckf", t, signals, vehicle)
+    fuzzy = run("fckf", t, signals, vehicle)
+    plain = run("ckf", t, signals, vehicle)
     assert (plain.adaptation == 1.0).all()
     assert (fuzzy.adaptation != 1.0).any()
     assert not np.array_equal(fuzzy.mu, plain.mu)
@@ -244,7 +248,8 @@ def test_on_a_split_road_the_sides_are_told_apart() -> None:
     reported = run("fckf", t, signals, vehicle)
     assert reported.mu_wheel is not None
     braking = (t > 2.0) & (t < 4.0)
-    left, right = reported.mu_wheel[braking, 0, 0], reported.mu_wheel[braking, 0, 1]
+    left = reported.mu_wheel[braking, 0, 0]
+    right = reported.mu_wheel[braking, 0, 1]
     assert ((left[:, 1] <= 0.8) & (left[:, 2] >= 0.8)).mean() > 0.85
     assert np.abs(right[:, 0] - 0.3).mean() < 0.12
     assert (right[:, 2] < left[:, 1]).all()
@@ -272,7 +277,8 @@ def test_a_single_false_acceleration_is_told_refused_and_bridged(size: float) ->
     t, signals, vehicle = drive("slalom", 0.3)
     broken = signals.copy()
     broken[200::10, [S.AX, S.AY]] += size
-    plain, reported = run("fckf", t, signals, vehicle), run("fckf", t, broken, vehicle)
+    plain = run("fckf", t, signals, vehicle)
+    reported = run("fckf", t, broken, vehicle)
     assert (reported.health[200::10] & Health.OUTLIER).all()
     assert not (reported.health[201::10] & Health.OUTLIER).any()
     assert np.abs(reported.vy - plain.vy).max() < 0.05

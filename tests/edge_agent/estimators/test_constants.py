@@ -24,9 +24,14 @@ SAMPLES = 400  # of the short drives
 FIRST = 100  # sample from which figures are taken
 CUT = 20  # samples between two looks into the filters
 SHORT: dict[str, float | None] = {
-    "j-turn": 0.4, "braking": 0.3, "acceleration": 0.3, "gaining-slalom": 0.9, "pulses": 0.6, "slalom": 0.3,
+    "j-turn": 0.4,
+    "braking": 0.3,
+    "acceleration": 0.3,
+    "gaining-slalom": 0.9,
+    "pulses": 0.6,
+    "slalom": 0.3,
     "split-braking": None,
-}  # fmt: skip
+}
 
 
 class Move(NamedTuple):
@@ -187,7 +192,8 @@ def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
     """t (T,), signals (T, 18) and vehicle of a drive."""
     if name in SHORT:
         t, signals, vehicle = drive(name, SHORT[name])
-        t, signals = t[:SAMPLES], signals[:SAMPLES].copy()
+        t = t[:SAMPLES]
+        signals = signals[:SAMPLES].copy()
         if name == "pulses":
             signals[FIRST:, TORQUE] = np.nan
         if name == "slalom":
@@ -244,7 +250,8 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
     bank = mixture_bank(
         parameter_table([vehicle]), design_of(Memberships(), adaptive=True, constants=constants)
     )
-    parts, looks = [], []
+    parts = []
+    looks = []
     for k in range(0, len(t), CUT):
         parts.append(bank.advance(t[k : k + CUT, None], signals[k : k + CUT, None]).values)
         looks.append(bank._filters.copy())
@@ -269,15 +276,19 @@ def reported(estimates: Estimates) -> dict[str, float]:
 
 def inside(filters: np.ndarray) -> dict[str, float]:
     """Figures of the filter of one drive, looked into again and again."""
-    weight, split = filters["weight"], filters["split"]
-    chain, halves = weight[:, :NODES], weight[split][:, NODES:].sum(axis=1)
+    weight = filters["weight"]
+    split = filters["split"]
+    chain = weight[:, :NODES]
+    halves = weight[split][:, NODES:].sum(axis=1)
     best = chain.argmax(axis=1)
     apart = np.abs(
         filters["mean"][:, :NODES, :2] - filters["mean"][np.arange(len(best)), best][:, None, :2]
     )
     overall = filters["overall_mean"]
-    std, mean = np.sqrt(np.diag(filters["overall_covariance"][-1])), overall[-1]
-    rolling, trust = filters["rolling"], filters["trust"]
+    std = np.sqrt(np.diag(filters["overall_covariance"][-1]))
+    mean = overall[-1]
+    rolling = filters["rolling"]
+    trust = filters["trust"]
     return {
         "least probabilities": geometric(chain),
         "penalty": float(np.abs(filters["penalty"][:, :NODES]).mean()),

@@ -20,9 +20,11 @@ CAR = PRESETS["sedan"].vehicle
 @pytest.mark.parametrize("every_s", [0.004, 0.01, 0.05, 0.3])
 def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: float) -> None:
     (memory,) = new_filters(PaperMemory, [CAR])
-    rng, slots = np.random.default_rng(5), [(-math.inf, 0.0)]
+    rng = np.random.default_rng(5)
+    slots = [(-math.inf, 0.0)]
     for k in range(600):
-        sample, time = np.zeros(len(CHANNELS)), -1.0 + k * every_s
+        sample = np.zeros(len(CHANNELS))
+        time = -1.0 + k * every_s
         sample[S.AY] = 8.0 * rng.random() ** 3 * (0.2 if k > 300 else 1.0)
         _, kind, _ = take(memory["track"], memory["row"], time, sample)
         assert kind == (BEGUN if k == 0 else STEPPED)

@@ -48,7 +48,8 @@ def test_tyres_are_those_of_the_compiled_model(proportional: bool) -> None:
     row = parameter_row(given.vehicle)
     row[Parameter.PROPORTIONAL] = float(proportional)
     mu = np.array([0.3, 0.5, 0.7, 0.9])
-    x, y = np.empty(4), np.empty(4)
+    x = np.empty(4)
+    y = np.empty(4)
     wheels = wheel_inputs(
         given.signals[0, S.DELTA : S.DELTA + 4], given.signals[0, S.OMEGA : S.OMEGA + 4]
     )

@@ -36,11 +36,9 @@ def test_rows_taken_in_one_by_one_are_the_textbook_s_update(
     seed: int, missing: tuple[int, ...]
 ) -> None:
     rng = np.random.default_rng(seed)
-    before, mean, node = (
-        np.linalg.cholesky(covariance(seed)),
-        rng.normal(size=STATES),
-        records(NodeWorkspace, 1)[0],
-    )
+    before = np.linalg.cholesky(covariance(seed))
+    mean = rng.normal(size=STATES)
+    node = records(NodeWorkspace, 1)[0]
     # deviations that only the first ACTIVE axes of the factor see: rows = H*x with H = A*L^-1
     node["deviation"] = rng.normal(size=(ROWS, ACTIVE))
     node["residual"], node["inflated"] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
@@ -61,7 +59,8 @@ def test_rows_taken_in_one_by_one_are_the_textbook_s_update(
 
 
 def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
-    c, e = Constants().curve_c, Constants().curve_e
+    c = Constants().curve_c
+    e = Constants().curve_e
     curve = curve_tables(partial(magic_formulas, c=c, e=e))
     for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):
         assert ratio_at(curve, theta) * theta == pytest.approx(magic_formula(theta, c, e), abs=5e-4)
@@ -80,7 +79,8 @@ def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have
     slope: float,
 ) -> None:
     rng = np.random.default_rng(0)
-    slip, force = rng.normal(0.0, 0.03, 100_000), rng.normal(0.0, 0.01, 100_000)
+    slip = rng.normal(0.0, 0.03, 100_000)
+    force = rng.normal(0.0, 0.01, 100_000)
     distance = (force - slope * slip) / np.hypot(1.0, slope)
     felt = (0.5 - unfelt(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
     assert distance.var() == pytest.approx(felt, rel=0.02)

@@ -52,7 +52,8 @@ def test_on_a_slalom_the_motion_is_found(name: str) -> None:
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_vehicle_has_the_same_numbers_alone_and_among_many(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=1.5)
-    bank, crowd = bank_of(name, [vehicle] * 3), np.repeat(signals[:, None], 3, axis=1)
+    bank = bank_of(name, [vehicle] * 3)
+    crowd = np.repeat(signals[:, None], 3, axis=1)
     crowd[:, :2] += 0.01 * np.random.default_rng(0).normal(size=(1, 2, crowd.shape[2]))
     together = bank.advance(np.repeat(t[:, None], 3, axis=1), crowd)
     alone = run(name, t, signals, vehicle)
@@ -63,7 +64,8 @@ def test_a_vehicle_has_the_same_numbers_alone_and_among_many(name: str) -> None:
 @pytest.mark.parametrize("name", PAPERS)
 def test_however_the_samples_are_cut_the_numbers_are_the_same_and_causal(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=1.5)
-    whole, bank = run(name, t, signals, vehicle), bank_of(name, [vehicle])
+    whole = run(name, t, signals, vehicle)
+    bank = bank_of(name, [vehicle])
     parts = [
         bank.advance(t[a:b, None], signals[a:b, None])
         for a, b in pairwise([0, 1, 2, 37, 90, len(t)])
@@ -81,7 +83,8 @@ def test_however_the_samples_are_cut_the_numbers_are_the_same_and_causal(name: s
 @pytest.mark.parametrize("fault", FAULTS)
 def test_no_fault_makes_a_nan_and_health_says_what_happened(name: str, fault: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
-    t, signals = t.copy(), signals.copy()
+    t = t.copy()
+    signals = signals.copy()
     harm, flag = FAULTS[fault]
     harm(t, signals)
     reported = run(name, t, signals, vehicle)
@@ -103,7 +106,8 @@ def test_slow_sampling_and_standing_still_are_survived(name: str, rate: int) -> 
 @pytest.mark.parametrize("name", PAPERS)
 def test_without_evidence_the_observer_tells_friction_with_its_interval(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
-    t, signals = t[:, None], signals[:, None]
+    t = t[:, None]
+    signals = signals[:, None]
     _, located = locate(new_tracks(1), t, signals)
     reported = bank_of(name, [vehicle]).advance(t, signals, located.closes)
     _, output, _ = observe(

@@ -28,7 +28,8 @@ def without_torque(signals: FloatArray) -> FloatArray:
 
 
 def at_rest(seconds: float, ax: float, torque: float) -> tuple[FloatArray, FloatArray]:
-    rng, t = np.random.default_rng(3), np.arange(0.0, seconds, 0.01)
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, seconds, 0.01)
     signals = np.zeros((len(t), 18))
     signals[:, :3] = rng.normal(0.0, (0.05, 0.05, 0.002), (len(t), 3))
     signals[:, S.AX] += ax
@@ -104,11 +105,9 @@ def test_steering_that_is_late_contradicts_and_then_the_interval_is_the_priors()
 
 def test_a_wheel_speed_that_is_decoded_wrong_is_refused() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=8.0)
-    wrong, silent, hit = (
-        signals.copy(),
-        signals.copy(),
-        np.random.default_rng(5).random(len(t)) < 0.7,
-    )
+    wrong = signals.copy()
+    silent = signals.copy()
+    hit = np.random.default_rng(5).random(len(t)) < 0.7
     wrong[hit, S.OMEGA] += 142.0 / vehicle.wheel_radius
     silent[hit, S.OMEGA] = np.nan
     said = run(t, wrong, vehicle)

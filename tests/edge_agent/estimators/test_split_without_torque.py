@@ -12,8 +12,12 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from tests.edge_agent.estimators.drives import TORQUE
 
-FIRST_SIDES, LAST_SIDES = 0.5, 0.9  # shares of the stop between which the estimates are judged
-DRY, SNOW = 0.8, 0.3  # true frictions of the manoeuvre "split-braking", left and right
+# shares of the stop between which the estimates are judged
+FIRST_SIDES = 0.5
+LAST_SIDES = 0.9
+# true frictions of the manoeuvre "split-braking", left and right
+DRY = 0.8
+SNOW = 0.3
 
 
 def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:

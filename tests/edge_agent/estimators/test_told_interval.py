@@ -36,7 +36,8 @@ def _tell(
     patch: FloatArray,
     likeness: float,
 ) -> tuple[float, float, float]:
-    context, friction = contexts[0], filters[0].friction
+    context = contexts[0]
+    friction = filters[0].friction
     find_interval(context.design, weight, patch, context.scratch.blended, likeness, friction)
     return friction.lower, friction.median, friction.upper
 
@@ -74,7 +75,8 @@ def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_a
     mu: float,
 ) -> None:
     weight = about(mu, 0.1)
-    rough, alike = told(weight), told(weight, likeness=0.7)
+    rough = told(weight)
+    alike = told(weight, likeness=0.7)
     assert alike[:2] == rough[:2]
     assert alike[2] <= rough[2] - (0.02 if mu > 0.4 else 0.0)
     assert (alike[2] < SLIPPERY_MU) == (rough[2] < SLIPPERY_MU)

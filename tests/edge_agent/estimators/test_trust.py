@@ -102,7 +102,8 @@ def test_side_force_that_nothing_turns_contradicts_for_as_long_as_patience_and_a
     signals[:, S.OMEGA : S.OMEGA + 4] = 60.0
     signals[:, S.AY] = np.where(t < 4.0, 3.0 * np.sin(2.0 * t), 0.0)
     said = after(signals, t, vehicle)[1]
-    began, ended = t[said.argmax()], t[len(t) - 1 - said[::-1].argmax()]
+    began = t[said.argmax()]
+    ended = t[len(t) - 1 - said[::-1].argmax()]
     assert 0.5 < began < 4.0
     assert ended - began == pytest.approx(CONSTANTS.patience, abs=0.2)
 

@@ -22,7 +22,8 @@ def belief(seed: int) -> tuple[FloatArray, FloatArray]:
 
 def test_columns_are_the_points_of_the_rule() -> None:
     mean, root = belief(0)
-    points, rows = np.empty((N, 2 * N)), np.empty((2 * N, N))
+    points = np.empty((N, 2 * N))
+    rows = np.empty((2 * N, N))
     columns.spread(mean, root, points)
     sigma_points(mean, root, RULE.xi, rows)
     assert points == pytest.approx(rows.T, abs=1e-12)
@@ -31,26 +32,38 @@ def test_columns_are_the_points_of_the_rule() -> None:
 @pytest.mark.parametrize("offset", [0.0, 5.4e6])
 def test_gathering_is_the_square_root_prediction(offset: float) -> None:
     points = np.random.default_rng(1).normal(size=(N, 2 * N)) + offset
-    std, mean, root = np.linspace(0.1, 0.6, N), np.empty(N), np.empty((N, N))
-    expected, expected_root = np.empty(N), np.empty((N, N))
+    std = np.linspace(0.1, 0.6, N)
+    mean = np.empty(N)
+    root = np.empty((N, N))
+    expected = np.empty(N)
+    expected_root = np.empty((N, N))
     householder.predict(
-        np.ascontiguousarray(points.T), RULE.w_mean, RULE.w_cov, 0.5 * np.diag(std), expected, expected_root,
+        np.ascontiguousarray(points.T),
+        RULE.w_mean,
+        RULE.w_cov,
+        0.5 * np.diag(std),
+        expected,
+        expected_root,
         np.empty((N, 3 * N)),
-    )  # fmt: skip
+    )
     columns.gather(points, std, 0.5, mean, root)
     assert mean == pytest.approx(expected, rel=1e-14, abs=1e-12)
     assert root == pytest.approx(expected_root, abs=1e-8 if offset else 1e-12)
 
 
 def test_points_that_all_agree_leave_the_noise_alone() -> None:
-    mean, root, std = np.empty(N), np.empty((N, N)), np.linspace(1e-9, 1e-3, N)
+    mean = np.empty(N)
+    root = np.empty((N, N))
+    std = np.linspace(1e-9, 1e-3, N)
     columns.gather(np.full((N, 2 * N), 3.7), std, 1.0, mean, root)
     assert root == pytest.approx(np.diag(std), rel=1e-12)
 
 
 def test_a_pivot_is_never_less_than_its_noise_however_alike_the_states_are() -> None:
     points = np.outer(np.ones(N), np.random.default_rng(2).normal(size=2 * N))
-    mean, root, std = np.empty(N), np.empty((N, N)), np.full(N, 1e-9)
+    mean = np.empty(N)
+    root = np.empty((N, N))
+    std = np.full(N, 1e-9)
     columns.gather(points, std, 1.0, mean, root)
     assert (np.diag(root) >= std).all()
     assert np.isfinite(root).all()

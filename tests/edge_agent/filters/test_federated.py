@@ -32,7 +32,8 @@ def textbook(
 ) -> tuple[FloatArray, FloatArray]:
     """One turn of the Kalman filter with whole covariances."""
     f, q, h, noise = system
-    mean, cov = f @ mean, f @ cov @ f.T + q
+    mean = f @ mean
+    cov = f @ cov @ f.T + q
     s = h @ cov @ h.T + np.diag(noise**2)
     gain = cov @ h.T @ np.linalg.inv(s)
     return mean + gain @ (z - h @ mean), cov - gain @ s @ gain.T
@@ -40,8 +41,11 @@ def textbook(
 
 @pytest.mark.parametrize("beta", [0.1, 0.5, 0.83])
 def test_share_then_fuse_is_the_identity(beta: float) -> None:
-    root, mean = root_of(covariance(5, 0)), np.arange(5.0)
-    first, second, work = np.empty((5, 5)), np.empty((5, 5)), np.empty((10, 10))
+    root = root_of(covariance(5, 0))
+    mean = np.arange(5.0)
+    first = np.empty((5, 5))
+    second = np.empty((5, 5))
+    work = np.empty((10, 10))
     share(root, beta, first)
     share(root, 1.0 - beta, second)
     fused = mean.copy()
@@ -51,9 +55,12 @@ def test_share_then_fuse_is_the_identity(beta: float) -> None:
 
 
 def test_fusing_adds_information() -> None:
-    p, q = covariance(4, 1), covariance(4, 2)
-    x, y = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.5, 1.0, 3.0, 5.0])
-    mean, root = x.copy(), root_of(p)
+    p = covariance(4, 1)
+    q = covariance(4, 2)
+    x = np.array([1.0, 2.0, 3.0, 4.0])
+    y = np.array([1.5, 1.0, 3.0, 5.0])
+    mean = x.copy()
+    root = root_of(p)
     fuse(mean, root, y, root_of(q), np.empty((8, 8)))
     information = np.linalg.inv(p) + np.linalg.inv(q)
     assert root @ root.T == pytest.approx(np.linalg.inv(information), abs=1e-12)
@@ -63,11 +70,17 @@ def test_fusing_adds_information() -> None:
 
 def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filter() -> None:
     """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the textbook filter."""
-    rng, n = np.random.default_rng(3), 3
-    f, h = np.eye(n) + 0.1 * rng.normal(size=(n, n)), rng.normal(size=(2, n))
-    q, noise = 0.05 * covariance(n, 4), np.array([0.2, 0.3])
-    mean, cov = np.ones(n), covariance(n, 5)
-    x, root, rule = mean.copy(), root_of(cov), cubature(n)
+    rng = np.random.default_rng(3)
+    n = 3
+    f = np.eye(n) + 0.1 * rng.normal(size=(n, n))
+    h = rng.normal(size=(2, n))
+    q = 0.05 * covariance(n, 4)
+    noise = np.array([0.2, 0.3])
+    mean = np.ones(n)
+    cov = covariance(n, 5)
+    x = mean.copy()
+    root = root_of(cov)
+    rule = cubature(n)
     for _ in range(10):
         z = rng.normal(size=2)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
@@ -77,14 +90,22 @@ def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filte
 
 
 def _federated_turn(
-    xi: FloatArray, weight: FloatArray, state: tuple[FloatArray, FloatArray],
-    system: System, z: FloatArray, beta: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    (mean, root), (f, q, h, noise) = state, system
-    n, work = len(mean), np.empty((20, 40))
+    xi: FloatArray,
+    weight: FloatArray,
+    state: tuple[FloatArray, FloatArray],
+    system: System,
+    z: FloatArray,
+    beta: float,
+) -> tuple[FloatArray, FloatArray]:
+    (mean, root) = state
+    (f, q, h, noise) = system
+    n = len(mean)
+    work = np.empty((20, 40))
     parts = []
     for sub, part in enumerate((beta, 1.0 - beta)):
-        own, own_root, points = np.empty(n), np.empty((n, n)), np.empty((2 * n, n))
+        own = np.empty(n)
+        own_root = np.empty((n, n))
+        points = np.empty((2 * n, n))
         share(root, part, own_root)
         axis_points(mean, own_root, xi, points)
         predict(
@@ -96,7 +117,8 @@ def _federated_turn(
             own_root,
             work,
         )
-        innovation, std = z - h @ own, noise * np.array([1.0, np.sqrt(2.0)])
+        innovation = z - h @ own
+        std = noise * np.array([1.0, np.sqrt(2.0)])
         if sub == 1:
             innovation[0] = np.nan
         update(
@@ -114,7 +136,9 @@ def _federated_turn(
 
 
 def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
-    rule, root, mean = cubature(4), root_of(covariance(4, 6)), np.arange(4.0)
+    rule = cubature(4)
+    root = root_of(covariance(4, 6))
+    mean = np.arange(4.0)
     points = np.empty((8, 4))
     axis_points(mean, root, rule.xi, points)
     assert rule.w_mean @ points == pytest.approx(mean, abs=1e-12)
@@ -131,7 +155,8 @@ def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
 
 
 def test_a_downdate_takes_a_column_away() -> None:
-    cov, column = covariance(5, 8), 0.2 * np.random.default_rng(9).normal(size=5)
+    cov = covariance(5, 8)
+    column = 0.2 * np.random.default_rng(9).normal(size=5)
     root = root_of(cov)
     assert downdate(root, column, np.empty(5))
     assert root @ root.T == pytest.approx(cov - np.outer(column, column), abs=1e-12)
@@ -149,8 +174,10 @@ def _measured(
     seed: int, noise: float
 ) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
     rng = np.random.default_rng(seed)
-    root, mean = root_of(covariance(4, seed)), rng.normal(size=4)
-    h, innovation = rng.normal(size=(3, 4)), rng.normal(size=3)
+    root = root_of(covariance(4, seed))
+    mean = rng.normal(size=4)
+    h = rng.normal(size=(3, 4))
+    innovation = rng.normal(size=3)
     innovation[1] = np.nan
     args = (
         root.copy(),
@@ -159,7 +186,8 @@ def _measured(
         np.full(3, noise),
         np.empty((12, 12)),
     )
-    other, other_root = mean.copy(), root.copy()
+    other = mean.copy()
+    other_root = root.copy()
     told = update_by_downdate(mean, root, *args)
     plain = update(other, other_root, *args)
     assert told[:3] == pytest.approx(plain, rel=1e-9)
@@ -174,15 +202,19 @@ def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
 
 
 def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_system() -> None:
-    rng, n = np.random.default_rng(21), 4
-    f, h, q = (
-        0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n)),
-        rng.normal(size=(3, n)),
-        0.01 * covariance(n, 22),
-    )
-    noise, rule = np.array([0.2, 0.3, 0.4]), cubature(n)
-    mean, cov = np.ones(n), covariance(n, 23)
-    x, root, points, work = mean.copy(), root_of(cov), np.empty((2 * n, n)), np.empty((20, 40))
+    rng = np.random.default_rng(21)
+    n = 4
+    f = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n))
+    h = rng.normal(size=(3, n))
+    q = 0.01 * covariance(n, 22)
+    noise = np.array([0.2, 0.3, 0.4])
+    rule = cubature(n)
+    mean = np.ones(n)
+    cov = covariance(n, 23)
+    x = mean.copy()
+    root = root_of(cov)
+    points = np.empty((2 * n, n))
+    work = np.empty((20, 40))
     for _ in range(50):
         z = rng.normal(size=3)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)

@@ -24,14 +24,16 @@ RULES = [
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_a_rule_integrates_a_random_quadratic_exactly(rule: SigmaRule) -> None:
     rng = np.random.default_rng(1)
-    a, b = rng.normal(size=(4, 4)), rng.normal(size=4)
+    a = rng.normal(size=(4, 4))
+    b = rng.normal(size=4)
     values = np.einsum("pi,ij,pj->p", rule.xi, a, rule.xi) + rule.xi @ b + 3.0
     assert rule.w_mean @ values == pytest.approx(np.trace(a) + 3.0, abs=1e-9)
 
 
 def test_cubature_is_unscented_with_alpha_one_and_beta_and_kappa_zero() -> None:
     for n in range(1, 9):
-        left, right = cubature(n), unscented(n, 1.0, 0.0, 0.0)
+        left = cubature(n)
+        right = unscented(n, 1.0, 0.0, 0.0)
         assert np.array_equal(left.xi, right.xi)
         assert np.array_equal(left.w_mean, right.w_mean)
         assert np.array_equal(left.w_cov, right.w_cov)
@@ -68,7 +70,9 @@ def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(
     "rule", [cubature(2), unscented(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name
 )
 def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: SigmaRule) -> None:
-    points, mean, work = np.empty((len(rule.xi), 2)), np.empty(2), np.zeros((2, 8))
+    points = np.empty((len(rule.xi), 2))
+    mean = np.empty(2)
+    work = np.zeros((2, 8))
     root = np.zeros((2, 2))
     sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
     householder.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
@@ -87,7 +91,8 @@ def _moved(
     count = len(rule.xi)
     points = np.empty((count, n))
     sigma_points(mean, factor_of(cov), rule.xi, points)
-    new, root = np.empty(n), np.zeros((n, n))
+    new = np.empty(n)
+    root = np.zeros((n, n))
     noise = factor_of(q)
     householder.predict(
         points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n))
@@ -103,14 +108,18 @@ def _corrected(
     std: FloatArray,
     z: FloatArray,
 ) -> tuple[FloatArray, FloatArray, tuple[int, float, float]]:
-    n, count, rows = len(mean), len(rule.xi), len(z)
+    n = len(mean)
+    count = len(rule.xi)
+    rows = len(z)
     points = np.empty((count, n))
     sigma_points(mean, root, rule.xi, points)
-    x, y = np.empty((n, count)), np.empty((rows, count))
+    x = np.empty((n, count))
+    y = np.empty((rows, count))
     deviations(points, mean, rule.w_cov, x, 0)
     seen = points @ h.T
     deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
-    new, factor = mean.copy(), root.copy()
+    new = mean.copy()
+    factor = root.copy()
     work = np.zeros((rows + n, count + rows))
     said = householder.update(new, factor, x, y, z - rule.w_mean @ seen, std, work)
     return new, factor, said
@@ -119,19 +128,25 @@ def _corrected(
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> None:
     rng = np.random.default_rng(2)
-    f, h = 0.9 * np.eye(4) + 0.05 * rng.normal(size=(4, 4)), rng.normal(size=(3, 4))
-    q, std = 0.01 * np.eye(4), np.array([0.1, 0.2, 0.3])
-    mean, cov = rng.normal(size=4), np.eye(4)
-    ours, ours_cov = mean, cov
+    f = 0.9 * np.eye(4) + 0.05 * rng.normal(size=(4, 4))
+    h = rng.normal(size=(3, 4))
+    q = 0.01 * np.eye(4)
+    std = np.array([0.1, 0.2, 0.3])
+    mean = rng.normal(size=4)
+    cov = np.eye(4)
+    ours = mean
+    ours_cov = cov
     for _ in range(50):
         z = rng.normal(size=3)
-        mean, cov = f @ mean, f @ cov @ f.T + q
+        mean = f @ mean
+        cov = f @ cov @ f.T + q
         s = h @ cov @ h.T + np.diag(std**2)
         k = cov @ h.T @ np.linalg.inv(s)
         nu = z - h @ mean
         expected = -0.5 * (nu @ np.linalg.solve(s, nu) + np.linalg.slogdet(2 * np.pi * s)[1])
         rest = np.eye(4) - k @ h
-        mean, cov = mean + k @ nu, rest @ cov @ rest.T + k @ np.diag(std**2) @ k.T
+        mean = mean + k @ nu
+        cov = rest @ cov @ rest.T + k @ np.diag(std**2) @ k.T
         ours, root = _moved(rule, ours, ours_cov, f, q)
         ours, root, said = _corrected(rule, ours, root, h, std, z)
         ours_cov = root @ root.T
@@ -144,7 +159,8 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
     rule = cubature(3)
     rng = np.random.default_rng(4)
     a = rng.normal(size=(3, 3))
-    mean, cov = rng.normal(size=3), a @ a.T
+    mean = rng.normal(size=3)
+    cov = a @ a.T
     points = mean + rule.xi @ np.linalg.cholesky(cov).T
     seen = np.stack([np.sin(points[:, 0]), points[:, 1] * points[:, 2]], axis=1)
     centre = seen.mean(0)
@@ -153,7 +169,8 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
     c = (points - mean).T @ (seen - centre) / 6
     nu = np.array([0.2, -0.5])
     k = c @ np.linalg.inv(s)
-    new, root = mean.copy(), factor_of(cov)
+    new = mean.copy()
+    root = factor_of(cov)
     householder.update(
         new,
         root,
@@ -193,10 +210,15 @@ def look(x: FloatArray) -> FloatArray:
 
 
 def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance_filter() -> None:
-    rule, rng = cubature(2), np.random.default_rng(8)
-    q, r = 1e-3 * np.array([[1.0, 0.3], [0.3, 2.0]]), np.array([0.1, 0.2])
-    mean, cov = np.array([0.8, 0.0]), 0.1 * np.eye(2)
-    ours, root, work = mean.copy(), factor_of(cov), np.zeros((8, 16))
+    rule = cubature(2)
+    rng = np.random.default_rng(8)
+    q = 1e-3 * np.array([[1.0, 0.3], [0.3, 2.0]])
+    r = np.array([0.1, 0.2])
+    mean = np.array([0.8, 0.0])
+    cov = 0.1 * np.eye(2)
+    ours = mean.copy()
+    root = factor_of(cov)
+    work = np.zeros((8, 16))
     points = np.empty((4, 2))
     for _ in range(100):
         z = rng.normal(0.3, 0.3, size=2)
@@ -204,7 +226,9 @@ def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance
         sigma_points(ours, root, rule.xi, points)
         householder.predict(swing(points), rule.w_mean, rule.w_cov, factor_of(q), ours, root, work)
         sigma_points(ours, root, rule.xi, points)
-        seen, x, y = look(points), np.empty((2, 4)), np.empty((2, 4))
+        seen = look(points)
+        x = np.empty((2, 4))
+        y = np.empty((2, 4))
         deviations(points, ours, rule.w_cov, x, 0)
         deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
         householder.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
@@ -214,8 +238,10 @@ def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance
 
 def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:
     rule = cubature(2)
-    mean, root = np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.3, 0.5]])
-    h, std = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]), np.array([0.1, 0.2, 0.3])
+    mean = np.array([1.0, 2.0])
+    root = np.array([[1.0, 0.0], [0.3, 0.5]])
+    h = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    std = np.array([0.1, 0.2, 0.3])
     gappy = _corrected(rule, mean, root, h, std, np.array([1.5, math.nan, 3.0]))
     whole = _corrected(rule, mean, root, h[[0, 2]], std[[0, 2]], np.array([1.5, 3.0]))
     assert np.array_equal(gappy[0], whole[0])

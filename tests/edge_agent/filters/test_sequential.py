@@ -12,7 +12,8 @@ from edge_agent.filters.householder import update
 from edge_agent.filters.sequential import carlson, potter, project
 from schemas.numeric import FloatArray
 
-N, ROWS = 6, 3
+N = 6
+ROWS = 3
 SEEDS = (0, 1, 2)
 
 
@@ -29,7 +30,8 @@ def covariance(seed: int) -> FloatArray:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
-    root, again = np.full((N, N), np.nan), np.empty((N, N))
+    root = np.full((N, N), np.nan)
+    again = np.empty((N, N))
     factorize(covariance(seed), root, 1e-18)
     assert root == pytest.approx(np.linalg.cholesky(covariance(seed)), abs=1e-12)
     multiply(root, np.zeros(N), again)
@@ -41,7 +43,8 @@ def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
 
 def test_noise_is_added_to_the_diagonal_of_a_product() -> None:
     mean, root = belief(1)
-    plain, noisy = np.empty((N, N)), np.empty((N, N))
+    plain = np.empty((N, N))
+    noisy = np.empty((N, N))
     multiply(root, np.zeros(N), plain)
     multiply(root, mean**2, noisy)
     assert noisy - plain == pytest.approx(np.diag(mean**2), abs=1e-12)
@@ -58,15 +61,20 @@ def test_a_pivot_that_rounding_took_is_what_is_surely_there() -> None:
 def test_rows_taken_in_one_by_one_by_potter_are_the_textbook_s_update(seed: int, seen: int) -> None:
     rng = np.random.default_rng(seed)
     mean, root = belief(seed)
-    f, nu, r = rng.normal(size=(ROWS, seen)), rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
-    spread, cross = f @ f.T + np.diag(r), root[:, :seen] @ f.T
+    f = rng.normal(size=(ROWS, seen))
+    nu = rng.normal(size=ROWS)
+    r = rng.uniform(0.1, 1.0, ROWS)
+    spread = f @ f.T + np.diag(r)
+    cross = root[:, :seen] @ f.T
     expected = mean + cross @ np.linalg.solve(spread, nu)
     left = root @ root.T - cross @ np.linalg.solve(spread, cross.T)
-    square, log_det = nu @ np.linalg.solve(spread, nu), np.linalg.slogdet(spread)[1]
+    square = nu @ np.linalg.solve(spread, nu)
+    log_det = np.linalg.slogdet(spread)[1]
     for row in range(ROWS):
         a, gain = potter(f[row], r[row])
         step = nu[row] / a
-        square, log_det = square - nu[row] * step, log_det - math.log(a)
+        square = square - nu[row] * step
+        log_det = log_det - math.log(a)
         project(mean, root, f[row], step, gain)
         project(nu[row + 1 :], f[row + 1 :], f[row], -step, gain)
     assert mean == pytest.approx(expected, abs=1e-9)
@@ -77,7 +85,9 @@ def test_rows_taken_in_one_by_one_by_potter_are_the_textbook_s_update(seed: int,
 @pytest.mark.parametrize("state", [0, 2, 5])
 def test_carlson_s_update_by_a_state_is_the_orthogonal_one(state: int) -> None:
     mean, root = belief(3)
-    ours, ours_root, gain = mean.copy(), root.copy(), np.empty(N)
+    ours = mean.copy()
+    ours_root = root.copy()
+    gain = np.empty(N)
     far, expected = carlson(ours, ours_root, state, mean[state] + 0.7, 0.04, gain)
     used, log_likelihood, square = update(
         mean,

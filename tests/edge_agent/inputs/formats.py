@@ -9,7 +9,9 @@ import can
 from edge_agent.lab.evaluation.formats import as_bag, as_csv, as_log, as_mf4
 
 DATA = Path(__file__).parents[2] / "data"
-BLF, NMEA, VEHICLE = DATA / "rav4.blf", DATA / "rav4.nmea", DATA / "rav4.json"
+BLF = DATA / "rav4.blf"
+NMEA = DATA / "rav4.nmea"
+VEHICLE = DATA / "rav4.json"
 
 
 def frames(most: int | None = None) -> list[can.Message]:

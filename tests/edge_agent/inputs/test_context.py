@@ -37,9 +37,12 @@ from tests.edge_agent.inputs.test_live_rows import Scripted, Steered
 from tests.waiting import until
 
 CAR = PRESETS["sedan"].vehicle
-SECONDS, RATE = 20, 50  # of the drives here
+# of the drives here
+SECONDS = 20
+RATE = 50
 START_S = 1_700_000_000.0
-AIR, WIPES = -3.5, 1.0
+AIR = -3.5
+WIPES = 1.0
 ENOUGH = 0.9  # share of rows that a profile with these signals must fill
 FLAGS_AT = {"abs_active": (5.0, 7.0), "esc_active": (9.0, 10.0), "tcs_active": (12.0, 15.0)}
 OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> what it tells
@@ -136,7 +139,8 @@ def assert_filled(log: SignalLog) -> None:
 def test_a_bus_fills_the_context_that_its_profile_reads(
     tmp_path: Path, name: str, kind: str
 ) -> None:
-    frames, profile = frames_of(name), load_profile(name)[0]
+    frames = frames_of(name)
+    profile = load_profile(name)[0]
     writers: dict[str, Any] = {"blf": formats.as_log, "mf4": formats.as_mf4, "bag": formats.as_bag}
     path = writers[kind](tmp_path / ("bag" if kind == "bag" else f"a.{kind}"), frames)
     assert_filled(imported(path, profile, tmp_path / "o.parquet"))
@@ -175,14 +179,18 @@ def test_topics_of_a_bag_fill_the_context(tmp_path: Path) -> None:
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    flag, number = store.types["std_msgs/msg/Bool"], store.types["std_msgs/msg/Float32"]
+    flag = store.types["std_msgs/msg/Bool"]
+    number = store.types["std_msgs/msg/Float32"]
     names = {"omega_fl": "/wheel.data", **{name: f"/{name}.data" for name in CONTEXT}}
     with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
         topics = {
-            topic: writer.add_connection(topic, f"std_msgs/msg/{'Bool' if topic[1:] in FLAGS else 'Float32'}",
-                                         typestore=store)
+            topic: writer.add_connection(
+                topic,
+                f"std_msgs/msg/{'Bool' if topic[1:] in FLAGS else 'Float32'}",
+                typestore=store,
+            )
             for topic in ("/wheel", *(f"/{name}" for name in CONTEXT))
-        }  # fmt: skip
+        }
         for k in range(SECONDS * RATE):
             ns = round(START_S * NS) + k * NS // RATE
             for topic, connection in topics.items():
@@ -314,7 +322,8 @@ def test_values_that_cannot_be_true_are_unknown() -> None:
 
 
 def test_context_changes_no_other_column_of_a_log(tmp_path: Path) -> None:
-    frames, name = frames_of("hyundai-can"), "hyundai-can"
+    frames = frames_of("hyundai-can")
+    name = "hyundai-can"
     profile = load_profile(name)[0]
     bare = profile.model_copy(
         update={"channels": {n: c for n, c in profile.channels.items() if n not in CONTEXT}}
@@ -388,9 +397,12 @@ def test_shipped_profiles_with_controllers_read_all_context() -> None:
 
 def test_names_of_context_signals_are_drafted() -> None:
     names = {
-        "TCS11.ABS_ACT": "abs_active", "ESP_21.ESP_Eingriff": "esc_active", "ESP_21.ASR_Anf": "tcs_active",
-        "FATC11.CR_Fatc_OutTemp": "air_temperature", "Gateway_72.Wischer_vorne_aktiv": "wiper",
-    }  # fmt: skip
+        "TCS11.ABS_ACT": "abs_active",
+        "ESP_21.ESP_Eingriff": "esc_active",
+        "ESP_21.ASR_Anf": "tcs_active",
+        "FATC11.CR_Fatc_OutTemp": "air_temperature",
+        "Gateway_72.Wischer_vorne_aktiv": "wiper",
+    }
     others = [
         "TCS11.ABS_DEF",
         "TCS11.ESP_PAS",

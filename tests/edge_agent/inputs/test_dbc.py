@@ -36,8 +36,10 @@ def columns(data: list[bytes]) -> Bytes:
 def test_made_frames_of_a_shipped_profile_decode_as_by_cantools_to_the_last_bit(name: str) -> None:
     profile, folder = load_profile(name)
     assert profile.dbc is not None
-    ours, oracle = read_dbc(folder / profile.dbc), oracle_of(folder / profile.dbc)
-    rng, compared = np.random.default_rng(1), 0
+    ours = read_dbc(folder / profile.dbc)
+    oracle = oracle_of(folder / profile.dbc)
+    rng = np.random.default_rng(1)
+    compared = 0
     for message in oracle:
         data = [rng.bytes(message.length) for _ in range(MADE)]
         decoded = frames_of(message, data)
@@ -50,7 +52,8 @@ def test_made_frames_of_a_shipped_profile_decode_as_by_cantools_to_the_last_bit(
 
 
 def test_recorded_frames_decode_as_by_cantools() -> None:
-    ours, oracle = read_dbc(FOLDER / "toyota.dbc"), oracle_of(FOLDER / "toyota.dbc")
+    ours = read_dbc(FOLDER / "toyota.dbc")
+    oracle = oracle_of(FOLDER / "toyota.dbc")
     recorded = frames()
     for message in oracle:
         data = [bytes(m.data) for m in recorded if m.arbitration_id == message.frame_id]

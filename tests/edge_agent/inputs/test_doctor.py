@@ -68,7 +68,8 @@ def test_a_fix_makes_the_drive_pass(
     rough: Recorded, tmp_path: Path, name: str, capsys: Output
 ) -> None:
     log = write(tmp_path / "bad.parquet", PLANTED[name].spoil(rough))
-    page, profile = tmp_path / "page.html", tmp_path / "fixed.json"
+    page = tmp_path / "page.html"
+    profile = tmp_path / "fixed.json"
     assert main(["check", *log, "--fix", str(profile), "--out", str(page)]) == 1
     assert PLANTED[name].kind in capsys.readouterr().out
     assert page.read_text().count("<svg") >= 5

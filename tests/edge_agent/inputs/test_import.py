@@ -106,9 +106,12 @@ def test_a_measurement_file_and_a_bag_of_sensors_are_drafted_from_their_names(
     t = np.arange(300) / 100.0
     mdf = asammdf.MDF(version="4.10")
     for name, unit, value in (
-        ("LongAcc", "g", 0.1), ("LatAcc", "m/s²", 0.2), ("YawRate", "°/s", 3.0), ("WheelSpeed_FL", "km/h", 36.0),
+        ("LongAcc", "g", 0.1),
+        ("LatAcc", "m/s²", 0.2),
+        ("YawRate", "°/s", 3.0),
+        ("WheelSpeed_FL", "km/h", 36.0),
         ("SteeringWheelAngle", "deg", 16.0),
-    ):  # fmt: skip
+    ):
         mdf.append(asammdf.Signal(np.full(300, value), t, name=name, unit=unit))
     mdf.save(tmp_path / "lab.mf4")
     mdf.close()
@@ -148,19 +151,28 @@ def test_sensor_topics_of_a_bag_keep_their_own_stamps(tmp_path: Path) -> None:
 
     types = get_typestore(Stores.ROS2_HUMBLE)
     header, time, vector, quaternion, imu = (
-        types.types[name] for name in (
-            "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Vector3",
-            "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu",
+        types.types[name]
+        for name in (
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+            "geometry_msgs/msg/Vector3",
+            "geometry_msgs/msg/Quaternion",
+            "sensor_msgs/msg/Imu",
         )
-    )  # fmt: skip
+    )
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topic = writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=types)
         for k in range(200):
             ns = 10**18 + k * 10_000_000
             message = imu(
-                header(time(ns // 10**9, ns % 10**9), ""), quaternion(0, 0, 0, 1), np.zeros(9), vector(0, 0, 0.01 * k),
-                np.zeros(9), vector(1.0, 2.0, 9.81), np.zeros(9),
-            )  # fmt: skip
+                header(time(ns // 10**9, ns % 10**9), ""),
+                quaternion(0, 0, 0, 1),
+                np.zeros(9),
+                vector(0, 0, 0.01 * k),
+                np.zeros(9),
+                vector(1.0, 2.0, 9.81),
+                np.zeros(9),
+            )
             late = ns + (k % 7) * 3_000_000
             writer.write(topic, late, types.serialize_cdr(message, "sensor_msgs/msg/Imu"))
     table = bring(tmp_path / "imu.parquet", tmp_path / "bag", more=())
@@ -358,7 +370,8 @@ def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
 def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
     tmp_path: Path, kind: str
 ) -> None:
-    few, rng = formats.frames(60), np.random.default_rng(5)
+    few = formats.frames(60)
+    rng = np.random.default_rng(5)
     good = tmp_path / f"good.{kind}"
     if kind in ("csv", "parquet"):
         bring(tmp_path / "good.parquet", formats.as_log(tmp_path / "g.blf", few))
@@ -371,7 +384,9 @@ def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
         good.write_text("".join(NMEA.read_text().splitlines(keepends=True)[:20]))
     else:
         formats.as_log(good, few)
-    data, bad, refused = good.read_bytes(), tmp_path / f"bad.{kind}", 0
+    data = good.read_bytes()
+    bad = tmp_path / f"bad.{kind}"
+    refused = 0
     profile, database = (
         (None, None)
         if kind in ("csv", "parquet", "nmea")
@@ -403,14 +418,13 @@ def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None
 def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(
     tmp_path: Path, part: str
 ) -> None:
-    folder, rng, refused = (
-        formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3"),
-        np.random.default_rng(6),
-        0,
-    )
+    folder = formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3")
+    rng = np.random.default_rng(6)
+    refused = 0
     file = next(folder.glob(part))
     data = file.read_bytes()
-    profile, database = load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc")
+    profile = load_profile("toyota")[0]
+    database = read_dbc(FOLDER / "toyota.dbc")
     assert read_source(folder, profile, database).signals
     for k in range(18):
         file.write_bytes(broken(data, ("cut", "full", "changed")[k % 3], rng))
@@ -424,8 +438,10 @@ def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(
 def test_a_hostile_database_or_profile_is_one_clear_error_or_what_is_left_of_it(
     tmp_path: Path,
 ) -> None:
-    rng, refused = np.random.default_rng(7), 0
-    dbc, profile = (FOLDER / "toyota.dbc").read_bytes(), (FOLDER / "toyota.json").read_bytes()
+    rng = np.random.default_rng(7)
+    refused = 0
+    dbc = (FOLDER / "toyota.dbc").read_bytes()
+    profile = (FOLDER / "toyota.json").read_bytes()
     for k in range(60):
         kind = ("cut", "full", "changed")[k % 3]
         (tmp_path / "p.dbc").write_bytes(broken(dbc, kind, rng))

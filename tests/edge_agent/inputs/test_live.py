@@ -170,12 +170,18 @@ def test_a_databroker_is_asked_for_what_it_knows_and_old_values_are_no_readings(
 @pytest.mark.parametrize(
     ("source", "profile", "named"),
     [
-        ("can:socketcan", "toyota", "channel"), ("can:virtual/a", "vss", "dbc"), ("gpsd:here:there", "toyota", "port"),
-        ("can:virtual/a", None, "profile"), ("ros2:?domain=x", "vss", "domain"), ("ros2:", "vss", "topic"),
-        ("can:virtual/a?bus", "toyota", "options"), ("vss:?token=/nowhere", None, "token|nowhere"),
-        ("can:virtual/a", "no such profile", "profile"), ("ros2:?messages=/nowhere", "vss", "topic"),
+        ("can:socketcan", "toyota", "channel"),
+        ("can:virtual/a", "vss", "dbc"),
+        ("gpsd:here:there", "toyota", "port"),
+        ("can:virtual/a", None, "profile"),
+        ("ros2:?domain=x", "vss", "domain"),
+        ("ros2:", "vss", "topic"),
+        ("can:virtual/a?bus", "toyota", "options"),
+        ("vss:?token=/nowhere", None, "token|nowhere"),
+        ("can:virtual/a", "no such profile", "profile"),
+        ("ros2:?messages=/nowhere", "vss", "topic"),
     ],
-)  # fmt: skip
+)
 def test_a_source_that_makes_no_sense_is_one_clear_error(
     source: str, profile: str | None, named: str
 ) -> None:
@@ -196,7 +202,8 @@ def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
 
 @pytest.mark.timeout(600)  # kernels may have to be compiled
 def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
-    (bus, can), (receiver, gpsd) = addresses("can"), addresses("gpsd")
+    (bus, can) = addresses("can")
+    (receiver, gpsd) = addresses("gpsd")
     name, dbc = written("can", tmp_path)
     (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
     config = {

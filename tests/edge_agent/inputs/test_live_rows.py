@@ -68,7 +68,8 @@ def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None =
 def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> (
     None
 ):
-    own, other = Stamps(), Stamps()
+    own = Stamps()
+    other = Stamps()
     delays = [0.3, 0.05, 0.2, 0.11]
     assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [
         10.0,
@@ -96,7 +97,8 @@ def test_a_clock_that_is_set_under_way_is_followed() -> None:
 def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(
     clock: Steered,
 ) -> None:
-    feed, last = Scripted("bus", clock), 4.0
+    feed = Scripted("bus", clock)
+    last = 4.0
     ticks = iter(np.arange(0.0, last + 0.01, 0.02).tolist())  # 50 Hz
     due = [next(ticks)]
 
@@ -140,7 +142,8 @@ def test_a_host_that_slept_leaves_rows_out(clock: Steered) -> None:
 
 
 def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> None:
-    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    bus = Scripted("bus", clock)
+    receiver = Scripted("receiver", clock)
     rows = rows_of(clock, bus, receiver)
     blocks = rows.blocks()
     for _ in range(8):
@@ -162,7 +165,8 @@ def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> N
 
 
 def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> None:
-    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    bus = Scripted("bus", clock)
+    receiver = Scripted("receiver", clock)
     rows = rows_of(clock, bus, receiver)
     blocks = rows.blocks()
     next(blocks)
@@ -199,8 +203,9 @@ def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
     feed.close()
     assert feed.losses == 2
     assert [record.getMessage() for record in caplog.records] == [
-        "bus: lost (no such device); trying again", "bus: lost (it ended); trying again",
-    ]  # fmt: skip
+        "bus: lost (no such device); trying again",
+        "bus: lost (it ended); trying again",
+    ]
 
 
 def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counted(
@@ -228,7 +233,8 @@ class Hanging(Scripted):
 
     def __init__(self, name: str, clock: Steered) -> None:
         super().__init__(name, clock)
-        self.entered, self.released = threading.Event(), threading.Event()
+        self.entered = threading.Event()
+        self.released = threading.Event()
 
     def listen(self) -> None:
         self.entered.set()
@@ -239,7 +245,8 @@ def test_a_source_that_hangs_is_left_behind_and_known_to_be(
     clock: Steered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "LEAVE_S", 0.01)
-    hanging, other = Hanging("hanging", clock), Scripted("other", clock)
+    hanging = Hanging("hanging", clock)
+    other = Scripted("other", clock)
     for source in (hanging, other):
         source.start()
     hanging.entered.wait()

@@ -76,10 +76,8 @@ def test_without_fixes_the_vehicle_is_nowhere_until_the_next() -> None:
 
 def test_between_fixes_the_last_one_is_held() -> None:
     east, north, yaw = straight(400, speed=1.0)
-    dense, sparse = (
-        ground(east, north, yaw, rate_hz=100.0),
-        ground(east, north, yaw, rate_hz=100.0, fix_every=10),
-    )
+    dense = ground(east, north, yaw, rate_hz=100.0)
+    sparse = ground(east, north, yaw, rate_hz=100.0, fix_every=10)
     _, often = locate(new_tracks(1), dense.t, dense.signals)
     _, seldom = locate(new_tracks(1), sparse.t, sparse.signals)
     assert np.isfinite(seldom.latitude).all()

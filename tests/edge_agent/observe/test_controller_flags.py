@@ -94,7 +94,8 @@ def test_any_split_of_the_samples_gives_the_same_flags(seed: int) -> None:
     t, signals, context = drive(on, np.repeat(rng.choice([0.0, 40.0], 60), RATE))
     _, whole = trusted_context(new_flag_records(1), t, signals, context)
     cuts = [0, *np.sort(rng.choice(np.arange(1, len(on)), 9, replace=False)).tolist(), len(on)]
-    records, parts = new_flag_records(1), []
+    records = new_flag_records(1)
+    parts = []
     for a, b in pairwise(cuts):
         records, part = trusted_context(records, t[a:b], signals[a:b], context[a:b])
         parts.append(part)

@@ -40,7 +40,8 @@ def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
 
 
 def test_one_observation_for_each_finished_visit() -> None:
-    block, reported = wanderers(400, 5), estimates(400, 5)
+    block = wanderers(400, 5)
+    reported = estimates(400, 5)
     located, observations, _ = Watch.of(5).step(block, reported)
     visits = 0
     for n in range(5):
@@ -52,14 +53,16 @@ def test_one_observation_for_each_finished_visit() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    block, reported = wanderers(300, 4, seed), estimates(300, 4, seed)
+    block = wanderers(300, 4, seed)
+    reported = estimates(300, 4, seed)
     _, *whole = Watch.of(4).step(block, reported)
     cuts = [0, *np.sort(rng.choice(np.arange(1, 300), 12, replace=False)).tolist(), 300]
     watch = Watch.of(4)
     rows = [slice(a, b) for a, b in pairwise(cuts)]
     pieces = [watch.step(part(block, r), reported.part(r))[1:] for r in rows]
     for kind in (0, 1):
-        expected, found = joined([whole[kind]]), joined([piece[kind] for piece in pieces])
+        expected = joined([whole[kind]])
+        found = joined([piece[kind] for piece in pieces])
         for name, column in expected.items():
             assert np.array_equal(column, found[name], equal_nan=column.dtype.kind == "f"), name
 
@@ -68,7 +71,8 @@ def test_an_observation_tells_its_visit() -> None:
     """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the second visit."""
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
-    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
+    block = ground(east, np.zeros_like(east), np.zeros_like(east))
+    reported = estimates(samples, 1)
     located, observations, _ = Watch.of(1).step(block, reported)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     columns = observations.columns
@@ -101,14 +105,16 @@ def test_columns_have_the_types_of_the_wire() -> None:
 
 
 def test_a_bank_without_evidence_sends_no_likelihood() -> None:
-    block, reported = wanderers(100, 2), estimates(100, 2)
+    block = wanderers(100, 2)
+    reported = estimates(100, 2)
     bare = type(reported)(**{**vars(reported), "evidence": None})
     _, observations, _ = Watch.of(2).step(block, bare)
     assert observations.columns["log_likelihood"].shape == (len(observations.vehicle), 0)
 
 
 def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
-    block, reported = wanderers(100, 2), estimates(100, 2)
+    block = wanderers(100, 2)
+    reported = estimates(100, 2)
     unknown = type(reported)(
         **{**vars(reported), "evidence": np.full_like(reported.evidence, np.nan)}
     )
@@ -135,10 +141,8 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     """Braking ends just before the border; the estimator's window still shows it for a second."""
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
-    block, reported = (
-        ground(east, np.zeros_like(east), np.zeros_like(east)),
-        estimates(samples, 1, mu=0.9),
-    )
+    block = ground(east, np.zeros_like(east), np.zeros_like(east))
+    reported = estimates(samples, 1, mu=0.9)
     used = np.full((samples, 1), 0.1)
     located, *_ = Watch.of(1).step(block, reported)
     border = np.flatnonzero(located.closes[:, 0])[1]
@@ -153,10 +157,8 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
     """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of the ice."""
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
-    block, reported = (
-        ground(east, np.zeros_like(east), np.zeros_like(east)),
-        estimates(samples, 1, mu=0.9),
-    )
+    block = ground(east, np.zeros_like(east), np.zeros_like(east))
+    reported = estimates(samples, 1, mu=0.9)
     used = type(reported)(**{**vars(reported), "mu_utilised": np.full((samples, 1), 0.8)})
     told = []
     for felt in (0.1, 0.8, np.nan):
@@ -174,10 +176,8 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
 def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
     """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and feels `observed` (T,) g."""
     flat = np.zeros_like(east)
-    block, reported = (
-        ground(east, flat, flat, rate_hz=100.0, fix_every=10),
-        estimates(len(east), 1, used=0.9),
-    )
+    block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
+    reported = estimates(len(east), 1, used=0.9)
     signals = block.signals.copy()
     signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
     _, located = locate(Watch.of(1).tracks, block.t, signals)
@@ -195,7 +195,9 @@ def test_grip_that_was_felt_at_the_border_of_a_cell_may_be_of_the_cell_beside() 
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
     _, located = locate(Watch.of(1).tracks, block.t, block.signals)
     border = int(np.flatnonzero(located.closes[:, 0])[1])
-    gentle, at_border, inside = np.full(450, 0.1), np.full(450, 0.1), np.full(450, 0.1)
+    gentle = np.full(450, 0.1)
+    at_border = np.full(450, 0.1)
+    inside = np.full(450, 0.1)
     at_border[border : border + 8] = 0.6
     inside[border + 30 : border + 60] = 0.6
     plain, near, far = (felt(observed, east)[1] for observed in (gentle, at_border, inside))
@@ -205,7 +207,8 @@ def test_grip_that_was_felt_at_the_border_of_a_cell_may_be_of_the_cell_beside() 
 
 
 def test_the_noise_of_accelerometers_is_no_grip() -> None:
-    east, rng = np.arange(450)[:, None] * 0.1, np.random.default_rng(3)
+    east = np.arange(450)[:, None] * 0.1
+    rng = np.random.default_rng(3)
     noisy = 0.1 + 0.05 * rng.normal(size=450)
     assert max(felt(noisy, east)) < WHEEL_SHARE * 0.16 + FELT_STD < WHEEL_SHARE * noisy.max()
 
@@ -218,20 +221,21 @@ def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_
     though the brakes took .7 before the change was seen."""
     samples = 40
     east = np.arange(samples)[:, None] * 0.5
-    block, reported = (
-        ground(east, np.zeros_like(east), np.zeros_like(east)),
-        estimates(samples, 1, mu=0.8),
-    )
+    block = ground(east, np.zeros_like(east), np.zeros_like(east))
+    reported = estimates(samples, 1, mu=0.8)
     located, *_ = Watch.of(1).step(block, reported)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     ice, dry = (-0.5 * np.square((mugrid.CENTRES - mu) / 0.05) for mu in (0.15, 0.8))
-    evidence, jumps = np.full((samples, 1, mugrid.BINS), np.nan), np.zeros((samples, 1), np.bool_)
+    evidence = np.full((samples, 1, mugrid.BINS), np.nan)
+    jumps = np.zeros((samples, 1), np.bool_)
     evidence[located.closes[:, 0], 0] = dry
     jump = (first + second) // 2
     evidence[jump, 0], jumps[jump] = ice, True
     made = {"evidence": evidence, "jumps": jumps, "mu_utilised": np.full((samples, 1), 0.7)}
     reported = type(reported)(**{**vars(reported), **made})
-    watch, told, used = Watch.of(1), [], []
+    watch = Watch.of(1)
+    told = []
+    used = []
     for rows in [slice(None)] if cut is None else [slice(0, cut), slice(cut, None)]:
         _, observations, _ = watch.step(part(block, rows), reported.part(rows))
         told += list(observations.columns["log_likelihood"])
@@ -266,7 +270,8 @@ def test_an_observation_tells_what_controllers_and_surroundings_said_in_its_visi
     """East through cells at 10 m/s; the first visit has an intervention, the second hardly any reading."""
     samples = 40
     east = np.arange(samples)[:, None] * 1.0
-    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
+    block = ground(east, np.zeros_like(east), np.zeros_like(east))
+    reported = estimates(samples, 1)
     _, located = locate(Watch.of(1).tracks, block.t, block.signals)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     given = {

@@ -173,7 +173,8 @@ def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) 
     while not (probe := outbox.due(now, limit=64)):
         now += 1.0
     outbox.settle(stream(), [(probe[0].seq, probe[0].seq)])
-    rounds, out = [], outbox.due(now, limit=10**6)
+    rounds = []
+    out = outbox.due(now, limit=10**6)
     assert seqs(out) == sorted(seqs(out))
     while out:
         rounds.append(len(out))
@@ -327,7 +328,8 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("edge_agent.publish.outbox.PASSED_OVER", 40)
-    outbox, now = Outbox(path, boot=BOOT), 0.0
+    outbox = Outbox(path, boot=BOOT)
+    now = 0.0
     for turn in range(60):
         now += 1.0
         fresh = outbox.store([draft(records=2)], now)

@@ -114,7 +114,8 @@ def test_what_the_service_does_not_answer_is_sent_again_until_it_does(
 
 def test_a_lost_router_is_waited_for_and_nothing_is_lost(router: Router, tmp_path: Path) -> None:
     publisher = publisher_of(settings(router, tmp_path))
-    before, after = drive(1)[0], drive(2)[0]
+    before = drive(1)[0]
+    after = drive(2)[0]
     with Service(router) as service:
         publisher.offer(before)
         service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(before.vehicle))

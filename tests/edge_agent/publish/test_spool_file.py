@@ -40,7 +40,8 @@ def found(batches: list[StoredBatch]) -> dict[int, bytes]:
 def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) -> None:
     whole = stored(tmp_path / "whole.sqlite")
     image = (tmp_path / "whole.sqlite").read_bytes()
-    noticed, least = 0, BATCHES
+    noticed = 0
+    least = BATCHES
     pages = len(image) // PAGE
     for page in [*range(8), *range(8, pages, 3)]:
         folder = tmp_path / str(page)
@@ -63,7 +64,8 @@ def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) 
 
 
 def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
-    path, random_ = tmp_path / "spool.sqlite", random.Random(3)
+    path = tmp_path / "spool.sqlite"
+    random_ = random.Random(3)
     whole = stored(path)
     image = bytearray(path.read_bytes())
     places = [image.find(whole[seq]) + random_.randrange(60) for seq in (20, 70, 110)]

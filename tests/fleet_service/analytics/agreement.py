@@ -15,7 +15,8 @@ from schemas import grid
 from schemas.numeric import IntArray
 
 # Sums are added in another order. Everything else (percentiles, counts, times) is exact in both.
-RELATIVE, ABSOLUTE = 1e-9, 1e-9
+RELATIVE = 1e-9
+ABSOLUTE = 1e-9
 Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
@@ -42,9 +43,11 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     ]
     one, other = (order_rows(table, question) for table in (one, other))
     if by:
-        one, other = one.sort_by(by), other.sort_by(by)
+        one = one.sort_by(by)
+        other = other.sort_by(by)
     for name in one.schema.names:
-        a, b = one[name].to_pylist(), other[name].to_pylist()
+        a = one[name].to_pylist()
+        b = other[name].to_pylist()
         if pa.types.is_floating(one[name].type):
             x, y = (
                 np.array([np.nan if v is None else float(v) for v in column]) for column in (a, b)

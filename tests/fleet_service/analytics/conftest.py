@@ -77,9 +77,10 @@ def stations(archive: Path) -> Path:
     columns: dict[str, Any] = {
         "station": np.repeat(["inland", "coast"], len(hours)),
         "time": (np.tile(hours, 2) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
-        "latitude": np.repeat([57.70, 57.71], len(hours)), "longitude": np.repeat([11.99, 13.9], len(hours)),
+        "latitude": np.repeat([57.70, 57.71], len(hours)),
+        "longitude": np.repeat([11.99, 13.9], len(hours)),
         "temperature": np.concatenate([inland, np.full(len(hours), 40.0)]),
-    }  # fmt: skip
+    }
     path = archive.parent / "stations.csv"
     pacsv.write_csv(pa.table(columns), path)
     return path

@@ -57,7 +57,8 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 @pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
     """Days of very unlike rates, mean RATE: the pairs of a day are no independent witnesses."""
-    held, trials = 0, 20
+    held = 0
+    trials = 20
     for trial in range(trials):
         rng = np.random.default_rng([7, trial])
         days = [pairs_of_a_day(rng, RATE * rng.uniform(0.4, 1.6), 800) for _ in range(12)]

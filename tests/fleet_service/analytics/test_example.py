@@ -15,8 +15,12 @@ def test_the_example_draws_its_figures(
 ) -> None:
     assert example.main(["--archive", str(archive), "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {
-        "grip.html", "worst.html", "spells.png", "before-after.png", "vehicles.png",
-    }  # fmt: skip
+        "grip.html",
+        "worst.html",
+        "spells.png",
+        "before-after.png",
+        "vehicles.png",
+    }
     assert "worst: the worst stretches" in capsys.readouterr().out
 
 

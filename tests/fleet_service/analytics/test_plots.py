@@ -90,8 +90,12 @@ def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
     )
     (axes,) = drawn("calibration", table).axes
     assert set(named(axes)) == {
-        "measured: held", "measured: compatible", "bound: held", "bound: compatible", "published: 90%",
-    }  # fmt: skip
+        "measured: held",
+        "measured: compatible",
+        "bound: held",
+        "bound: compatible",
+        "published: 90%",
+    }
     published = next(line for line in axes.lines if line.get_label() == "published: 90%")
     assert np.asarray(published.get_ydata()).tolist() == [0.9, 0.9]
 

@@ -70,10 +70,17 @@ def test_worst_finds_the_planted_ice_and_only_it(asked: Ask) -> None:
 def test_touching_cells_of_one_sector_are_one_stretch() -> None:
     x = np.array([100, 101, 102, 104, 100])
     cell = grid.interleave(x, np.array([7, 8, 8, 8, 9]))
-    table = pa.table({
-        "cell": cell, "sector": pa.array([0, 0, 0, 0, 1], pa.int8()), "observations": [5] * 5, "values": [4] * 5,
-        "slippery": [4, 2, 4, 4, 4], "mu_sum": [1.0, 0.5, 1.0, 1.0, 1.0], "witnesses": [2] * 5,
-    })  # fmt: skip
+    table = pa.table(
+        {
+            "cell": cell,
+            "sector": pa.array([0, 0, 0, 0, 1], pa.int8()),
+            "observations": [5] * 5,
+            "values": [4] * 5,
+            "slippery": [4, 2, 4, 4, 4],
+            "mu_sum": [1.0, 0.5, 1.0, 1.0, 1.0],
+            "witnesses": [2] * 5,
+        }
+    )
     found = stretches(table)
     assert sorted(found["cells"].to_numpy().tolist()) == [1, 1, 3]
     row = found.to_pylist()[found["cells"].to_pylist().index(3)]
@@ -139,9 +146,11 @@ def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
     from fleet_service.analytics.questions.before_after import expression
 
     rng = np.random.default_rng(5)
-    covered, runs = 0, 50
+    covered = 0
+    runs = 50
     for _ in range(runs):
-        vehicles, each = 25, 16
+        vehicles = 25
+        each = 16
         vehicle = np.repeat(np.arange(vehicles), each)
         after = np.repeat(
             rng.random(vehicles) < 0.5, each
@@ -152,10 +161,16 @@ def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
             + rng.normal(0, 0.05, vehicles)[vehicle]
             + rng.normal(0, 0.05, len(vehicle))
         )
-        table = pa.table({
-            "cell": rng.integers(0, 4, len(vehicle)), "sector": np.zeros(len(vehicle), np.int8),
-            "vehicle": vehicle.astype(str).tolist(), "time": np.where(after, 200, 100), "mu": mu, "mu_utilised": mu,
-        })  # fmt: skip
+        table = pa.table(
+            {
+                "cell": rng.integers(0, 4, len(vehicle)),
+                "sector": np.zeros(len(vehicle), np.int8),
+                "vehicle": vehicle.astype(str).tolist(),
+                "time": np.where(after, 200, 100),
+                "mu": mu,
+                "mu_utilised": mu,
+            }
+        )
         (row,) = expression(ibis.memtable(table), 150).to_pyarrow().to_pylist()
         std = np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1)) / row["w"]
         covered += abs((row["later"] - row["before"]) / row["w"] - 0.1) < Z_95 * std
@@ -171,12 +186,14 @@ def test_vehicles_shows_the_planted_bias_of_each(asked: Ask, rows: pd.DataFrame)
     assert (met["meetings"] > 5).all()
     assert np.corrcoef(met["bias"].astype(float), planted)[0, 1] > 0.5
     told = rows[rows["value"]].assign(hour=lambda r: r["time"] // 3600)
-    one, differences = names[3], []
+    one = names[3]
+    differences = []
     there = [*PLACE, "hour"]
     for _, group in told.merge(
         told[told["vehicle"] == one][there].drop_duplicates(), on=there
     ).groupby(there):
-        mine, others = group[group["vehicle"] == one]["mu"], group[group["vehicle"] != one]["mu"]
+        mine = group[group["vehicle"] == one]["mu"]
+        others = group[group["vehicle"] != one]["mu"]
         if len(mine) and len(others):
             differences.append(mine.mean() - others.mean())
     assert found.loc[one, "bias"] == pytest.approx(np.mean(differences), abs=1e-9)
@@ -241,7 +258,9 @@ def test_replay_is_the_map_of_the_service(asked: Ask, archive: Path) -> None:
 
 
 def test_the_map_of_a_box_is_that_box_of_the_map(asked: Ask) -> None:
-    at, west, east = START_NS + 40 * HOUR_NS, 11.972, 11.979
+    at = START_NS + 40 * HOUR_NS
+    west = 11.972
+    east = 11.979
     whole = asked("replay", at=at)
     part = asked("replay", at=at, part=Extract(PART.since, PART.until, (west, 57.0, east, 58.0)))
     inside = (whole["east"].to_numpy() > west) & (whole["west"].to_numpy() < east)

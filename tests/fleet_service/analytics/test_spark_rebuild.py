@@ -56,7 +56,8 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     archive: Path,
     tmp_path: Path,
 ) -> None:
-    out, tries = tmp_path / "out", tmp_path / "tries"
+    out = tmp_path / "out"
+    tries = tmp_path / "tries"
     out.mkdir()
     dying = spark_sessions.killed_at_first(
         partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries

@@ -18,7 +18,9 @@ from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch, key
 
-HOUR, DAY, YEAR = 3600 * SECOND, 86_400 * SECOND, 365 * 86_400 * SECOND
+HOUR = 3600 * SECOND
+DAY = 86_400 * SECOND
+YEAR = 365 * 86_400 * SECOND
 
 
 @dataclass

@@ -34,7 +34,8 @@ from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
 
 PATIENCE_S = 120.0  # a start, on a machine that is busy
-VEHICLES, BATCHES = 4, 12
+VEHICLES = 4
+BATCHES = 12
 
 
 def settings(bucket: BucketServer) -> ServiceConfig:
@@ -66,8 +67,11 @@ def known(engine: Engine) -> dict[str, pa.Table]:
 def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
     bucket: BucketServer, tmp_path: Path, with_checkpoint: bool
 ) -> None:
-    root, new, config = tmp_path / "archive", tmp_path / "new", settings(bucket)
-    first, second = reports(0.15, 1, 4), reports(0.15, 5, 9)
+    root = tmp_path / "archive"
+    new = tmp_path / "new"
+    config = settings(bucket)
+    first = reports(0.15, 1, 4)
+    second = reports(0.15, 5, 9)
     with closing(Engine(config, root)) as engine:
         take(engine, first)
         assert len(engine.settlement.flush()) == VEHICLES
@@ -105,7 +109,9 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
 def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
-    root, config, sent = tmp_path / "archive", settings(bucket), reports(0.15, 1, 4)
+    root = tmp_path / "archive"
+    config = settings(bucket)
+    sent = reports(0.15, 1, 4)
     with closing(Engine(config, root)) as engine:
         take(engine, sent)
         engine.settlement.flush()
@@ -159,7 +165,7 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
 @contextmanager
 def service(
     router: ZenohSettings, folder: Path, bucket: BucketServer
-) -> Iterator[tuple[subprocess.Popen[bytes], str]]:  # fmt: skip
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """A service process with a copy that is ready, and its health's address; it is gone after the block."""
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
@@ -204,8 +210,10 @@ def drive(fleet: Fleet, sent: list[Batch]) -> bool:
 def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
-    root, fleet = tmp_path / "archive", Fleet(session)
-    before, during = reports(0.8, 1, BATCHES), reports(0.6, BATCHES + 1, 2 * BATCHES)
+    root = tmp_path / "archive"
+    fleet = Fleet(session)
+    before = reports(0.8, 1, BATCHES)
+    during = reports(0.6, BATCHES + 1, 2 * BATCHES)
     with service(router, tmp_path, bucket) as (process, address):
         until(lambda: drive(fleet, before), PATIENCE_S)
         assert "does not take segments" not in health(address)
@@ -230,8 +238,10 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
 def test_service_killed_between_disk_and_bucket_loses_nothing(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
-    root, fleet = tmp_path / "archive", Fleet(session)
-    before, during = reports(0.8, 1, BATCHES), reports(0.6, BATCHES + 1, 2 * BATCHES)
+    root = tmp_path / "archive"
+    fleet = Fleet(session)
+    before = reports(0.8, 1, BATCHES)
+    during = reports(0.6, BATCHES + 1, 2 * BATCHES)
     with service(router, tmp_path, bucket) as (process, _):
         until(lambda: drive(fleet, before), PATIENCE_S)
         written = len(archived(tmp_path))
@@ -260,7 +270,9 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
     tmp_path: Path,
     beside: bool,
 ) -> None:
-    root, fleet, sent = tmp_path / "archive", Fleet(session), reports(0.8, 1, BATCHES)
+    root = tmp_path / "archive"
+    fleet = Fleet(session)
+    sent = reports(0.8, 1, BATCHES)
     words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", "sim-001", "--yes"]
     with service(router, tmp_path, bucket) as (process, _):
         until(lambda: drive(fleet, sent), PATIENCE_S)
@@ -293,7 +305,8 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
 
 
 def _same_in_the_bucket(bucket: BucketServer, root: Path) -> None:
-    there, here = bucket.objects(), held(root)
+    there = bucket.objects()
+    here = held(root)
     log = {name for name in here if name.startswith(("inbox/", "keys/"))}
     assert {name for name in there if name.startswith(("inbox/", "keys/"))} == log
     assert all(there[name] == here[name] for name in log)

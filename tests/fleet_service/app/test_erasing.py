@@ -36,7 +36,8 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, TILE, batch, key
 from tests.waiting import until
 
-GONE, OTHERS = "sim-009", ("sim-001", "sim-002", "sim-003")
+GONE = "sim-009"
+OTHERS = ("sim-001", "sim-002", "sim-003")
 ALONE = LATITUDE - 0.002  # a cell that nobody else visits, in the same tile
 PATIENCE_S = 120.0  # a start, and a process that imports everything, on a machine that is busy
 MONTH = f"{datetime.now(UTC):%Y-%m}"
@@ -73,7 +74,8 @@ def shown(session: zenoh.Session) -> dict[int, int]:
 def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
-    root, fleet = tmp_path / "archive", Fleet(session)
+    root = tmp_path / "archive"
+    fleet = Fleet(session)
     sent = [sent_by(vehicle, seq) for seq in range(1, 21) for vehicle in (GONE, *OTHERS)]
     alone = int(grid.cell_of(ALONE, LONGITUDE))
 

@@ -23,7 +23,9 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import SECOND, batch
 from tests.waiting import until
 
-VEHICLES, BATCHES, KILLS = 6, 60, 3
+VEHICLES = 6
+BATCHES = 60
+KILLS = 3
 
 
 @contextmanager
@@ -78,7 +80,8 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
     """Boot as it is archived, seq and row of everything acknowledged."""
-    pseudonyms, now = Pseudonyms(folder / "archive" / "keys"), time.time_ns()
+    pseudonyms = Pseudonyms(folder / "archive" / "keys")
+    now = time.time_ns()
     boots = {
         name: pseudonyms.boot(name, batch(name, 1, 0, [0.8]).boot, now) for name in fleet.durable
     }

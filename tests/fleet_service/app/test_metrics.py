@@ -63,7 +63,8 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
 
 
 def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Path) -> None:
-    config, pulse = ServiceConfig(), Pulse(turn_age_s=0.1, queued=0, routers=1, clock_lag_s=0.0)
+    config = ServiceConfig()
+    pulse = Pulse(turn_age_s=0.1, queued=0, routers=1, clock_lag_s=0.0)
     engine = Engine(config, tmp_path)
 
     def damaged() -> object:

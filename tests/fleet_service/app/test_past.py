@@ -92,19 +92,18 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     monkeypatch.setattr(files, "ROW_GROUP", group)
     files.write_table(table, path, files.COMPACTED)
     assert pq.read_metadata(path).num_row_groups == -(-400 // group)
-    schema, begin = (
-        segments.SCHEMAS[Kind.OBSERVATION],
-        table["leave_time"].cast(pa.int64()).to_numpy(),
-    )
+    schema = segments.SCHEMAS[Kind.OBSERVATION]
+    begin = table["leave_time"].cast(pa.int64()).to_numpy()
     wanted: list[tuple[ValueRange, NDArray[Any]]] = [
         (ValueRange("seq", 2, 3), np.isin(table["seq"], [2, 3])),
         (ValueRange("leave_time", most=int(np.median(begin))), begin <= np.median(begin)),
-        (ValueRange("vehicle", table["vehicle"][7].as_py(), table["vehicle"][7].as_py()), np.array([
-            one == table["vehicle"][7].as_py() for one in table["vehicle"].to_pylist()
-        ])),
+        (
+            ValueRange("vehicle", table["vehicle"][7].as_py(), table["vehicle"][7].as_py()),
+            np.array([one == table["vehicle"][7].as_py() for one in table["vehicle"].to_pylist()]),
+        ),
         (ValueRange("latitude", LATITUDE - 1.0, LATITUDE + 1.0), np.ones(400, bool)),
         (ValueRange("seq", 100), np.zeros(400, bool)),
-    ]  # fmt: skip
+    ]
     for where, right in wanted:
         for columns in (["vehicle", "seq", "row", "leave_time", "latitude"], None):
             found = load(path, schema, columns, [where])

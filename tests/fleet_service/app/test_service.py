@@ -293,7 +293,8 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
         fleet.settle(*sent)
         before = first.service.engine.state.fusion
     with running(router, tmp_path) as second:
-        after, counts = second.service.engine.state.fusion, second.service.engine.counts
+        after = second.service.engine.state.fusion
+        counts = second.service.engine.counts
         at = int(before.live.time.max())
         slots = np.arange(before.size)
         there = after.slots_of(before.cell[slots], before.sector[slots])
@@ -310,9 +311,11 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
 
 def test_states_are_archived_and_acknowledged(fleet: Fleet, tmp_path: Path) -> None:
     columns = {
-        "time": np.array([now()]), "latitude": np.array([LATITUDE]), "longitude": np.array([LONGITUDE]),
+        "time": np.array([now()]),
+        "latitude": np.array([LATITUDE]),
+        "longitude": np.array([LONGITUDE]),
         "vx": np.array([15.0], np.float32),
-    }  # fmt: skip
+    }
     state = Batch(Kind.STATE, "sim-001", 5, REGION, 1, 1, columns, "ckf")
     fleet.session.put(
         keys.state_key(REGION, "sim-001"), wire.encode(state), encoding=wire.ENCODING[Kind.STATE]
@@ -325,9 +328,15 @@ def test_states_are_archived_and_acknowledged(fleet: Fleet, tmp_path: Path) -> N
 
 def test_a_person_can_publish_with_one_line_of_json(fleet: Fleet, service: Running) -> None:
     text = {
-        "vehicle": "by-hand", "boot": "1", "seq": "1", "enterTime": [str(now())], "latitude": [LATITUDE],
-        "longitude": [LONGITUDE], "mu": [0.3], "muUtilised": [0.29],
-    }  # fmt: skip
+        "vehicle": "by-hand",
+        "boot": "1",
+        "seq": "1",
+        "enterTime": [str(now())],
+        "latitude": [LATITUDE],
+        "longitude": [LONGITUDE],
+        "mu": [0.3],
+        "muUtilised": [0.29],
+    }
     fleet.session.put(key("by-hand"), json.dumps(text), encoding=wire.JSON)
     until(lambda: 1 in fleet.durable["by-hand"])
     assert service.service.engine.state.fusion.live.visits[0] == 1
@@ -340,7 +349,8 @@ def test_three_formats_say_the_same(fleet: Fleet) -> None:
         ask(fleet.session, f"format={form}")[0] for form in ("geojson", "json")
     )
     assert (geo_encoding, encoding) == (wire.GEOJSON, wire.JSON)
-    geo, plain = json.loads(geo_text), json.loads(text)
+    geo = json.loads(geo_text)
+    plain = json.loads(text)
     assert geo["type"] == "FeatureCollection"
     (feature,) = geo["features"]
     assert feature["geometry"]["coordinates"][0][0] == [arrow["longitude"], arrow["latitude"]]
@@ -383,7 +393,8 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
     between = time.time_ns()
     fleet.settle(*(batch(vehicle, 2, now(), [0.2]) for vehicle in VEHICLES))
     at = np.datetime_as_string(np.datetime64(between, "ns"), "us", "UTC")
-    (_, _, past), (_, _, present) = ask(fleet.session, f"at={at}")[0], ask(fleet.session)[0]
+    (_, _, past) = ask(fleet.session, f"at={at}")[0]
+    (_, _, present) = ask(fleet.session)[0]
     then, here = (
         pa.ipc.open_stream(payload).read_all().to_pylist()[0] for payload in (past, present)
     )

@@ -92,8 +92,11 @@ def by_spark(root: Path) -> Seen:
 READERS: dict[str, Callable[[Path], Seen]] = {
     name: reader
     for name, reader in (
-        ("pyarrow", by_pyarrow), ("pandas", by_pandas), ("polars", by_polars), ("duckdb", by_duckdb),
+        ("pyarrow", by_pyarrow),
+        ("pandas", by_pandas),
+        ("polars", by_polars),
+        ("duckdb", by_duckdb),
         ("ibis", by_ibis),
     )
     if find_spec(name)
-}  # fmt: skip
+}

@@ -53,7 +53,8 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
-    fsync, rename = os.fsync, Path.rename
+    fsync = os.fsync
+    rename = Path.rename
 
     def seen_fsync(handle: int) -> None:
         order.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")  # noqa: PTH112
@@ -207,7 +208,8 @@ def test_a_pseudonym_is_its_number_and_its_number_is_the_pseudonym(tmp_path: Pat
 
 def test_pseudonym_holds_for_its_month_across_restarts_not_beyond(tmp_path: Path) -> None:
     now = time.time_ns()
-    first, again = Pseudonyms(tmp_path), Pseudonyms(tmp_path)
+    first = Pseudonyms(tmp_path)
+    again = Pseudonyms(tmp_path)
     name = first.of("sim-001", now)
     assert again.of("sim-001", now) == name
     assert first.of("sim-002", now) != name
@@ -233,8 +235,10 @@ def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_
     assert engine.counts["late"] == 1
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
-        (False, 0.75), (False, 0.75), (True, 0.75),
-    ]  # fmt: skip
+        (False, 0.75),
+        (False, 0.75),
+        (True, 0.75),
+    ]
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         np.testing.assert_array_equal(

@@ -30,7 +30,8 @@ from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill, identities, rows_of
 from tests.fleet_service.archive.test_archive import sent, settled
 
-SEGMENTS, ROWS = 4, 50
+SEGMENTS = 4
+ROWS = 50
 
 
 class DiedError(BaseException):
@@ -125,7 +126,8 @@ def test_it_may_die_before_any_change_of_the_disk(
     whole = {kind: identities(tmp_path / "0", kind) for kind in Kind}
     later = {kind: [(7, k) for k in range(1, 17)] for kind in Kind}
     monkeypatch.setattr(os, "fsync", lambda _: None)
-    instant, died = 0, True
+    instant = 0
+    died = True
     while died:
         instant += 1
         root = shutil.copytree(tmp_path / "0", tmp_path / str(instant))
@@ -162,7 +164,9 @@ def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
 def test_readers_see_every_row_once_while_it_runs(tmp_path: Path) -> None:
     fill(tmp_path, 30, 5)
     whole = identities(tmp_path, Kind.OBSERVATION)
-    over, wrong, reads = threading.Event(), [], 0
+    over = threading.Event()
+    wrong = []
+    reads = 0
 
     def watch() -> None:
         nonlocal reads
@@ -189,7 +193,8 @@ def test_a_reader_that_is_overtaken_begins_again(
 ) -> None:
     fill(tmp_path, 3, ROWS)
     whole = identities(tmp_path, Kind.OBSERVATION)
-    load, loaded = loading.load, []
+    load = loading.load
+    loaded = []
 
     def overtaken(path: Path, *args: object, **named: object) -> pa.Table | None:
         loaded.append(path)

@@ -130,7 +130,8 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
 def test_readers_elsewhere_are_told_of_the_mirror(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, there = tmp_path / "archive", tmp_path / "there"
+    root = tmp_path / "archive"
+    there = tmp_path / "there"
     fill(root, 1, 50)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
     assert exported(root, capsys, "--at", there.as_uri())["rows"] == 100

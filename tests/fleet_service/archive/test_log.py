@@ -58,7 +58,8 @@ def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]
 def test_failed_writes_are_not_settled_and_come_once_with_the_next(
     log: SegmentLog[str], tmp_path: Path
 ) -> None:
-    inbox, away = (segments.folder(tmp_path, Kind.STATE), tmp_path / "away")
+    inbox = segments.folder(tmp_path, Kind.STATE)
+    away = tmp_path / "away"
     add(log, "seen", 1)
     add(log, "state", 2, Kind.STATE)
     inbox.rename(away)
@@ -88,7 +89,8 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
     """A batch that is acknowledged under a forgotten key would come in again under another."""
     for seed in range(20):
-        live, after = tmp_path / f"live-{seed}", tmp_path / f"after-{seed}"
+        live = tmp_path / f"live-{seed}"
+        after = tmp_path / f"after-{seed}"
         live.mkdir()
         disk = CrashDisk(live, random.Random(seed), None, range(0))
         with disk.mounted():

@@ -95,7 +95,8 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
 
 
 def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: Path) -> None:
-    root, there = tmp_path / "archive", tmp_path / "there"
+    root = tmp_path / "archive"
+    there = tmp_path / "there"
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
     with closing(Engine(ServiceConfig(), root)) as engine:
@@ -170,11 +171,9 @@ def rows_kept(root: Path) -> int:
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
-    old, away, after = (
-        batch("car-001", 1, NOON, [0.8]),
-        batch("car-002", 1, NOON - DAY, [0.8]),
-        NOON + 3 * DAY,
-    )
+    old = batch("car-001", 1, NOON, [0.8])
+    away = batch("car-002", 1, NOON - DAY, [0.8])
+    after = NOON + 3 * DAY
     later = batch("car-001", 2, after, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert told(engine, old, after + SECOND) == ["durable"]
@@ -243,7 +242,8 @@ def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_pa
 
 
 def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> None:
-    seen, new = batch("car-001", 1, NOON - DAY, [0.8]), batch("car-001", 2, NOON, [0.8])
+    seen = batch("car-001", 1, NOON - DAY, [0.8])
+    new = batch("car-001", 2, NOON, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert told(engine, seen, NOON) == ["durable"]
     assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
@@ -269,7 +269,8 @@ def test_nothing_is_forgotten_beside_a_running_service(tmp_path: Path) -> None:
 
 
 def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_path: Path) -> None:
-    root, there = tmp_path / "archive", tmp_path / "there"
+    root = tmp_path / "archive"
+    there = tmp_path / "there"
     fill(root, 2, 50)
     assert main(["compact", "--archive", str(root), "--to", there.as_uri()]) == 0
     copies = {path.relative_to(there): path.read_bytes() for path in there.rglob("*.parquet")}
@@ -288,7 +289,8 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
 def test_parts_are_exported(
     tmp_path: Path, what: str, ending: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, out = tmp_path / "archive", tmp_path / f"out{ending}"
+    root = tmp_path / "archive"
+    out = tmp_path / f"out{ending}"
     fill(root, 2, 50)
     assert main(["compact", "--archive", str(root)]) == 0
     capsys.readouterr()

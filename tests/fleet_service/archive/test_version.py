@@ -241,8 +241,12 @@ def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) ->
 
 
 AHEAD = {
-    "inbox": SEGMENT, "inbox/states": SEGMENT, "observations": COMPACTED, "states": COMPACTED, "weather": SEGMENT,
-}  # fmt: skip
+    "inbox": SEGMENT,
+    "inbox/states": SEGMENT,
+    "observations": COMPACTED,
+    "states": COMPACTED,
+    "weather": SEGMENT,
+}
 
 
 @pytest.mark.parametrize("folder", AHEAD)
@@ -294,8 +298,13 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
         pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type
         == pa.int32()
     )
-    rewritten(next(layout.compacted_files(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
-        t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)), "1.2")  # fmt: skip
+    rewritten(
+        next(layout.compacted_files(tmp_path, Kind.OBSERVATION)),
+        lambda t: t.set_column(
+            t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)
+        ),
+        "1.2",
+    )
     with pytest.raises(InputError, match="^archive: column health is string and not int32; "):
         list(reading.read(tmp_path, Kind.OBSERVATION))
 

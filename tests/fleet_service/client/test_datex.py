@@ -34,8 +34,11 @@ from tests.structure import ROOT
 SCHEMA = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
 OURS = Supplier("se", "GripMap test")
 NOW = 1_800_000_100 * NS
-SPACES = {"sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing",
-          "com": "http://datex2.eu/schema/3/common"}  # fmt: skip
+SPACES = {
+    "sit": "http://datex2.eu/schema/3/situation",
+    "loc": "http://datex2.eu/schema/3/locationReferencing",
+    "com": "http://datex2.eu/schema/3/common",
+}
 
 
 @cache
@@ -67,9 +70,10 @@ ICE = [alert(x, sector=s, at=x) for x in range(20) for s in (0, 2)]
 
 
 @pytest.mark.parametrize(
-    "alerts", [ICE, [alert(0)], [alert(0, y, sector=3) for y in range(9)], [*ICE, alert(90, mu=0.05)], []],
+    "alerts",
+    [ICE, [alert(0)], [alert(0, y, sector=3) for y in range(9)], [*ICE, alert(90, mu=0.05)], []],
     ids=["road", "cell", "southward", "two", "none"],
-)  # fmt: skip
+)
 def test_every_publication_is_valid_also_when_it_ended(alerts: list[Alert]) -> None:
     begun = publication(OURS, stretches(*alerts), NOW)
     for document in (begun, publication(OURS, [], NOW + NS, begun)):
@@ -136,7 +140,8 @@ def test_an_end_is_told_for_an_hour_and_then_no_more() -> None:
 def test_a_reader_that_begins_anew_goes_on_with_the_same_situation() -> None:
     first = publication(OURS, stretches(*ICE), NOW)
     without_its_first = publication(OURS, stretches(*ICE[6:]), NOW + NS, first)
-    (a,), (b,) = records(first), records(without_its_first)
+    (a,) = records(first)
+    (b,) = records(without_its_first)
     assert (a.get("id"), b.get("version")) == (b.get("id"), "2")
 
 
@@ -171,10 +176,8 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
     start: Callable[..., AbstractContextManager[Running]],
     tmp_path: Path,
 ) -> None:
-    out, words = (
-        tmp_path / "situations.xml",
-        ["--country", "se", "--supplier", "test", "--connect", router.connect[0]],
-    )
+    out = tmp_path / "situations.xml"
+    words = ["--country", "se", "--supplier", "test", "--connect", router.connect[0]]
     words = ["export", "datex", "--out", str(out), *words]
     with start(tmp_path / "archive"):
         command = [sys.executable, "-m", "fleet_service.cli", *words, "--follow"]

@@ -46,7 +46,8 @@ def test_quantiles_are_those_of_the_contract_bit_for_bit(bins: list[float], leve
 def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
     evidence: np.ndarray, seconds: float, contamination: float, power: float
 ) -> None:
-    p, vote = mugrid.PRIOR.copy(), np.empty(32)
+    p = mugrid.PRIOR.copy()
+    vote = np.empty(32)
     for _ in range(3):
         forget(p, seconds)
         convolve_bias(evidence, b.kind_of(evidence), vote)
@@ -71,7 +72,8 @@ def test_time_keeps_a_rising_belief_rising(p: np.ndarray, seconds: float) -> Non
 
 @given(_steps.filter(lambda e: int(e[-1]) - int(e.min()) < 16), st.integers(1, 30))
 def test_no_number_of_bounds_lowers_the_upper_end(evidence: np.ndarray, votes: int) -> None:
-    p, vote = mugrid.PRIOR.copy(), np.empty(32)
+    p = mugrid.PRIOR.copy()
+    vote = np.empty(32)
     assert b.kind_of(evidence) == b.BOUND
     convolve_bias(evidence, b.BOUND, vote)
     for _ in range(votes):
@@ -106,7 +108,8 @@ def test_the_bias_kernel_is_a_probability_for_every_road() -> None:
 def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
     evidence = np.full(32, 255, np.uint8)
     evidence[4] = 0
-    vote, p = np.empty(32), mugrid.PRIOR.copy()
+    vote = np.empty(32)
+    p = mugrid.PRIOR.copy()
     convolve_bias(evidence, b.VALUE, vote)
     vote_for(p, vote, 1.0 - c.CONTAMINATION)
     assert p.max() / p.min() < 32 / c.CONTAMINATION

@@ -31,7 +31,8 @@ def test_a_backlog_of_an_hour_is_fused_and_its_order_of_arrival_is_nothing() -> 
 
 
 def test_a_late_visit_to_a_cell_where_nobody_was_counts_as_it_would_have_in_time() -> None:
-    o, found = observations([600.0], [1], value([0.2])), []
+    o = observations([600.0], [1], value([0.2]))
+    found = []
     for parts in ((o, LIVE), (LIVE, o)):
         fusion = Fusion(120.0)
         for part in parts:
@@ -52,7 +53,8 @@ def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> N
 
 def test_a_replay_fuses_what_was_late_where_it_was_fused() -> None:
     fusion, told = late(np.random.default_rng(2).permutation(400), 5)
-    o, n = drive(7, 400, 3000.0), 400
+    o = drive(7, 400, 3000.0)
+    n = 400
     found = Before(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
     for rows, updated in told:
         found.late[rows], found.late_by[rows] = updated.late, updated.late_by

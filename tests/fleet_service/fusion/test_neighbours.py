@@ -124,7 +124,8 @@ def test_a_message_is_of_a_neighbours_own_reports() -> None:
 
 def test_reading_leaves_a_cells_own_belief_as_it_is() -> None:
     fusion = road({0: UNTESTED, 1: snow()})
-    before, alone = fusion.live.belief.copy(), road({0: UNTESTED})
+    before = fusion.live.belief.copy()
+    alone = road({0: UNTESTED})
     assert slippery(belief(fusion)) > 0.4
     np.testing.assert_array_equal(fusion.live.belief, before)
     np.testing.assert_array_equal(fusion.live.belief[0], alone.live.belief[0])
@@ -133,8 +134,10 @@ def test_reading_leaves_a_cells_own_belief_as_it_is() -> None:
 
 def test_what_the_weather_says_of_a_region_is_not_told_again() -> None:
     prior = np.where(mugrid.CENTRES < 0.4, 1.0, 0.1)
-    one, nan = np.ones(1, np.int64), np.full(1, np.nan)
-    alone, among = road({}), road({})
+    one = np.ones(1, np.int64)
+    nan = np.full(1, np.nan)
+    alone = road({})
+    among = road({})
     for fusion, cells in ((alone, [0]), (among, [-1, 0, 1])):
         fusion.update_weather(Reports(one * REGION, one * START, nan, nan, nan, prior[None]))
         for steps in cells:

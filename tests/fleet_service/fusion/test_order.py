@@ -78,7 +78,8 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     o = drive(3, 3000, 4000.0)
     order = delayed(o, 300.0, 4)
     fusion, told = fold_in(o, order, 300)
-    late, weight = np.zeros(3000, bool), np.zeros(3000, np.float32)
+    late = np.zeros(3000, bool)
+    weight = np.zeros(3000, np.float32)
     late_by = np.zeros(3000, np.int64)
     for rows, updated in told:
         late[rows], weight[rows] = updated.late, updated.weight

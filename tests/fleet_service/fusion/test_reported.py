@@ -36,7 +36,8 @@ def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
 
 def test_who_lies_is_compared_with_what_others_reported_and_not_with_what_is_used_of_it() -> None:
     rng = np.random.default_rng(2)
-    fusion, n = Fusion(120.0), 1200
+    fusion = Fusion(120.0)
+    n = 1200
     who = rng.integers(0, 12, n)
     reading = np.where(who == 0, 0.25, 0.85 + 0.04 * rng.normal(size=n))
     steps = mugrid.encode_log_likelihood(value(reading))

@@ -40,7 +40,8 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
     """Of the interval, after thirty vehicles that agree."""
-    fusion, n = Fusion(120.0), len(manoeuvres)
+    fusion = Fusion(120.0)
+    n = len(manoeuvres)
     o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))
     o = dataclasses.replace(
         o, used=np.full(n, used, np.float32), manoeuvre=manoeuvres.astype(np.int8)
@@ -51,7 +52,8 @@ def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
 
 
 def test_many_who_do_the_same_are_no_certainty_and_other_manoeuvres_make_it_surer() -> None:
-    same, mixed = np.full(30, shared.BRAKING), np.arange(30) % 4
+    same = np.full(30, shared.BRAKING)
+    mixed = np.arange(30) % 4
     spread = np.hypot(c.COMMON_ALWAYS, c.COMMON_MANOEUVRE) * 0.6
     assert width(0.6, same) > 3.0 * spread
     assert width(0.6, mixed) < 0.95 * width(0.6, same)
@@ -65,6 +67,7 @@ def test_who_does_not_tell_what_it_did_did_the_same_as_all_others() -> None:
 
 
 def test_a_manoeuvre_is_told_by_the_larger_part_of_the_grip_used() -> None:
-    along, across = np.array([0.5, -0.5, 0.1, 0.1, np.nan]), np.array([0.1, 0.1, 0.5, -0.5, 0.5])
+    along = np.array([0.5, -0.5, 0.1, 0.1, np.nan])
+    across = np.array([0.1, 0.1, 0.5, -0.5, 0.5])
     expected = [shared.DRIVING, shared.BRAKING, shared.LEFT, shared.RIGHT, shared.UNKNOWN]
     assert shared.manoeuvre_of(along, across).tolist() == expected

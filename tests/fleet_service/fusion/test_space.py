@@ -84,7 +84,8 @@ def test_a_visit_is_not_spread_into_another_region() -> None:
 def test_all_cells_together_learn_no_more_than_one_would(
     std: float, mu: float, width: float, yaw: float
 ) -> None:
-    sure, unsure = Fusion(120.0), Fusion(120.0)
+    sure = Fusion(120.0)
+    unsure = Fusion(120.0)
     o = observations([0.0], [1], value([mu], width))
     cells, share = space.other_cells(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
     sure.update(o)

@@ -68,7 +68,8 @@ def road_after(slope: float, used: float) -> FloatArray:
 
 
 def test_shape_widens_a_gentle_value_upwards_and_lifts_no_lower_end() -> None:
-    flat, steep = interval(road_after(0.0, 0.25)), interval(road_after(0.5, 0.25))
+    flat = interval(road_after(0.0, 0.25))
+    steep = interval(road_after(0.5, 0.25))
     assert steep[1] > flat[1] + 0.05
     assert steep[0] < flat[0] + 0.02
     hard = interval(road_after(0.5, 0.5))

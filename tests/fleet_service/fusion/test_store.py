@@ -28,7 +28,8 @@ def test_a_table_of_any_length_finds_every_row_and_no_other(places: int) -> None
 
 
 def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() -> None:
-    fusion, vehicles = Fusion(LATENESS_S), 3000
+    fusion = Fusion(LATENESS_S)
+    vehicles = 3000
     for step in range(3):
         fusion.update(
             observations(
@@ -65,8 +66,10 @@ def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_
     None
 ):
     """A fusion that dropped them takes what comes next as one that has them all."""
-    fusion, whole = Fusion(LATENESS_S), Fusion(LATENESS_S)
-    cells, week = CELL + np.arange(40), 7 * 24 * HOUR
+    fusion = Fusion(LATENESS_S)
+    whole = Fusion(LATENESS_S)
+    cells = CELL + np.arange(40)
+    week = 7 * 24 * HOUR
     visits = [
         observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells),
         observations(week + np.arange(10.0), np.arange(10), value([0.7] * 10), cells[:10]),

@@ -11,12 +11,14 @@ from fleet_service.fusion.trust import initial_trust
 from fleet_service.serve.alerts import Alerts
 from tests.fleet_service.examples import belief, observations, slippery, value
 
-HONEST, LIARS = np.arange(20), np.arange(100, 108)
+HONEST = np.arange(20)
+LIARS = np.arange(100, 108)
 
 
 def driven(private: int = 0) -> Fusion:
     """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in `private` others."""
-    rng, fusion = np.random.default_rng(4), Fusion(120.0)
+    rng = np.random.default_rng(4)
+    fusion = Fusion(120.0)
     for minute in range(30):
         who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
         cells = np.concatenate(

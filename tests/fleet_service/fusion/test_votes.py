@@ -37,7 +37,8 @@ def width(fusion: Fusion) -> float:
 
 def test_five_vehicles_narrow_a_cell_more_than_fifty_visits_of_one() -> None:
     rng = np.random.default_rng(1)
-    one, five = Fusion(120.0), Fusion(120.0)
+    one = Fusion(120.0)
+    five = Fusion(120.0)
     for visit in range(50):
         one.update(observations([30.0 * visit], [1], value(0.8 + 0.03 * rng.normal(size=1))))
     for vehicle in range(5):
@@ -79,7 +80,8 @@ def test_ice_is_believed_after_few_passes_of_vehicles_that_had_said_dry() -> Non
 
 
 def test_a_repeated_value_hardly_counts_and_a_changed_one_counts_whole() -> None:
-    same, changed = Fusion(120.0), Fusion(120.0)
+    same = Fusion(120.0)
+    changed = Fusion(120.0)
     for fusion, second in ((same, 0.8), (changed, 0.3)):
         fusion.update(observations([0.0, 30.0], [1, 1], value([0.8, second])))
     assert same.live.values[0] < 0.77
@@ -162,7 +164,8 @@ def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() 
 
 
 def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused() -> None:
-    fusion, n = Fusion(120.0), 500
+    fusion = Fusion(120.0)
+    n = 500
     rng = np.random.default_rng(2)
     o = observations(60.0 * rng.random(n), np.full(n, 7), value(rng.uniform(0.1, 1.1, n)))
     updated = [fusion.update(o.take(part)) for part in np.array_split(np.arange(n), 10)]

@@ -23,7 +23,9 @@ from tests.fleet_service.examples import (
 
 HOUR = 3600 * 10**9
 KEY = CELL * grid.SECTORS
-RAIN, FREEZING, STEADY = (8.0, 6.0, 2.0), (np.nan, -1.0, 0.5), (15.0, np.nan, 0.0)
+RAIN = (8.0, 6.0, 2.0)
+FREEZING = (np.nan, -1.0, 0.5)
+STEADY = (15.0, np.nan, 0.0)
 
 
 def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGION) -> w.Reports:
@@ -123,7 +125,8 @@ def test_weather_that_acts_on_what_was_not_folded_yet_gives_the_map_of_weather_k
         rng.integers(0, 9, n),
         value(rng.uniform(0.3, 0.9, n)),
     )
-    known, told = Fusion(120.0), Fusion(120.0)
+    known = Fusion(120.0)
+    told = Fusion(120.0)
     arriving = [reports((0.0, RAIN)), reports((0.0, FREEZING)), reports((0.0, STEADY))]
     used = []
     for part, rows in enumerate(np.array_split(np.arange(n), 3)):

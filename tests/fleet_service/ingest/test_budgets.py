@@ -120,7 +120,9 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
 
 
 def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
-    pseudonyms, witnesses, now = Pseudonyms(tmp_path), VehicleIds(tmp_path), time.time_ns()
+    pseudonyms = Pseudonyms(tmp_path)
+    witnesses = VehicleIds(tmp_path)
+    now = time.time_ns()
     names = {f"car-{k:03}": number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
     known = {p: witnesses.id_of(name, pseudonyms.month(now), p) for name, p in names.items()}
     assert read(tmp_path) == known
@@ -144,7 +146,8 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
         engine.settlement.flush()
         assert engine.counts["witnesses_damaged"] == 0
     path = next(tmp_path.glob("keys/*.witnesses"))
-    whole, data = read(path.parent), bytearray(path.read_bytes())
+    whole = read(path.parent)
+    data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data + b"half a li")  # what a full disk leaves of an append
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
@@ -159,7 +162,9 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
 def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now, synced, fsync = time.time_ns(), [], os.fsync
+    now = time.time_ns()
+    synced = []
+    fsync = os.fsync
 
     def noted(handle: int) -> None:
         synced.append(Path(f"/proc/self/fd/{handle}").readlink().suffix)
@@ -176,18 +181,28 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
 def everywhere(seq: int, count: int, now: int) -> Batch:
     """Visits to as many new cells side by side, one after the other at 12 m/s."""
     at = np.arange(count) + seq * count
-    latitude, longitude = 57.60 + 2e-4 * (at // 400), 11.75 + 2e-4 * (at % 400)
+    latitude = 57.60 + 2e-4 * (at // 400)
+    longitude = 11.75 + 2e-4 * (at % 400)
     leave = now - np.arange(count)[::-1] * SECOND
     cell = grid.cell_of(latitude, longitude)
     one = batch(
-        "car-001", seq + 1, now, [0.5] * count, leave_time=leave, enter_time=leave, latitude=latitude,
-        longitude=longitude, cell=cell,
-    )  # fmt: skip
+        "car-001",
+        seq + 1,
+        now,
+        [0.5] * count,
+        leave_time=leave,
+        enter_time=leave,
+        latitude=latitude,
+        longitude=longitude,
+        cell=cell,
+    )
     return replace(one, region=int(grid.region_of(cell[0])))
 
 
 def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
-    now, sent, at_once = time.time_ns(), 0, 3_000
+    now = time.time_ns()
+    sent = 0
+    at_once = 3_000
     engine.intake._places = NewCells(at_once)
     for seq in range(200):
         at = now - (200 - seq) * 200 * SECOND
@@ -213,7 +228,8 @@ def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
 
 def test_new_cells_are_counted_once_and_by_vehicle() -> None:
     budgets = NewCells(3)
-    vehicle, cell = np.array([2, 1, 1, 2, 1, 1, 1]), np.array([5, 1, 2, 5, 1, 3, 4])
+    vehicle = np.array([2, 1, 1, 2, 1, 1, 1])
+    cell = np.array([5, 1, 2, 5, 1, 3, 4])
     assert budgets.beyond(vehicle, cell, 0.0).tolist() == [
         False,
         False,

@@ -19,7 +19,9 @@ STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(
     steps: list[tuple[int, int]],
 ) -> None:
-    stream, accepted, floor = SequenceTracker(KEY), set(), 0
+    stream = SequenceTracker(KEY)
+    accepted = set()
+    floor = 0
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
         stream.raise_to(min(held, seq))
@@ -53,7 +55,8 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
 def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
     rows: list[tuple[int, int, int]],
 ) -> None:
-    before, after = SequenceTrackers(), SequenceTrackers()
+    before = SequenceTrackers()
+    after = SequenceTrackers()
     for vehicle, seq, held in rows:
         stream = before[vehicle, 5, Kind.STATE, 7]
         stream.raise_to(min(seq, held))
@@ -63,7 +66,8 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
     held = np.minimum(columns[1], columns[2])
     after.restore(Kind.STATE, columns[0], 5 * fixed, 7 * fixed, columns[1], held, 100 + columns[1])
     for vehicle in {row[0] for row in rows}:
-        one, other = before[vehicle, 5, Kind.STATE, 7], after[vehicle, 5, Kind.STATE, 7]
+        one = before[vehicle, 5, Kind.STATE, 7]
+        other = after[vehicle, 5, Kind.STATE, 7]
         assert (one.low, set(one.seen), one.newest) == (other.low, set(other.seen), other.newest)
     assert len(before) == len(after)
 

@@ -38,7 +38,8 @@ def test_leaps_of_all_rows_share_one_budget() -> None:
     step = LEAP_M - 100.0
     walk = find(VehiclePaths(), np.arange(210) * 1e-3, np.arange(210) * step)
     assert walk == [False] + [False] + [True] * 208
-    in_batches, known = [], VehiclePaths()
+    in_batches = []
+    known = VehiclePaths()
     for k in range(210):
         in_batches += find(known, [k * 1e-3], [k * step])
     assert in_batches == walk
@@ -66,7 +67,8 @@ def test_backlogs_in_any_order_are_plausible() -> None:
     east = np.cumsum(random.uniform(0, 30, len(seconds)) * 20)
     live = find(VehiclePaths(), seconds, east)
     newest_first = find(VehiclePaths(), seconds[::-1], east[::-1])
-    known, between = VehiclePaths(), []
+    known = VehiclePaths()
+    between = []
     late = (seconds > 1200) & (seconds < 2400)
     between += find(known, seconds[~late], east[~late])
     between += find(known, seconds[late], east[late])
@@ -83,13 +85,16 @@ def test_a_gap_of_dropped_anchors_allows_no_far_place() -> None:
 
 @pytest.mark.parametrize("start", [179.9999, -179.9999])
 def test_the_date_line_is_no_leap(start: float) -> None:
-    known, time = VehiclePaths(), START + np.arange(2) * SECOND
+    known = VehiclePaths()
+    time = START + np.arange(2) * SECOND
     found = known.find_implausible(np.full(2, CAR), time, np.zeros(2), np.array([start, -start]))
     assert found.tolist() == [False, False]
 
 
 def test_each_vehicle_is_compared_with_itself() -> None:
-    known, cars, far = VehiclePaths(), np.arange(1000, 0, -1), 10.0
+    known = VehiclePaths()
+    cars = np.arange(1000, 0, -1)
+    far = 10.0
     longitude = cars / 1000.0
     for step in range(3):
         time = np.full(1000, START + (step + 1) * SECOND)

@@ -23,7 +23,8 @@ from tests.fleet_service.examples import SECOND, batch, key
 from tests.secured import enrolment
 from tests.waiting import matched, until
 
-RATE, BURST = 10_000.0, 50_000.0
+RATE = 10_000.0
+BURST = 50_000.0
 
 
 class Clock:
@@ -93,14 +94,16 @@ def test_invented_names_share_one_bucket_and_fill_no_memory(
 
 
 def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
-    acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
+    acks = Acks()
+    sent = [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
         head = Head(
             one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator
         )
         acks.record_rejected("sim-001", head, 0, "x" * 120)
     stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
-    stream.vehicle, stream.boot = "sim-001", sent[0].boot
+    stream.vehicle = "sim-001"
+    stream.boot = sent[0].boot
     acks.record_durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
     told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]

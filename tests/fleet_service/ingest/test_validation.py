@@ -144,8 +144,11 @@ def test_what_is_absent_or_just_beside_is_let_in(
 
 def test_controllers_and_surroundings_are_taken_as_they_were_sent(desk: Desk) -> None:
     told: dict[str, Any] = {
-        "abs_active": [1, -1], "esc_active": [0, 1], "wiper": [0.5, np.nan], "air_temperature": [-3.5, np.nan],
-    }  # fmt: skip
+        "abs_active": [1, -1],
+        "esc_active": [0, 1],
+        "wiper": [0.5, np.nan],
+        "air_temperature": [-3.5, np.nan],
+    }
     accepted = desk.intake.accept(
         [message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **told))], CLOCK
     )

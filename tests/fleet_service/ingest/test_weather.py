@@ -59,11 +59,16 @@ def test_a_report_survives_the_wire_and_what_is_left_out_is_unknown() -> None:
 
 @pytest.mark.parametrize(
     ("report", "field"),
-    [(Report(1), "weather"), (Report(1, road_temperature=400.0), "road_temperature"),
-     (Report(1, precipitation=-1.0), "precipitation"), (Report(1, air_temperature=float("inf")), "air_temperature"),
-     (Report(1, prior=np.ones(3) / 3), "prior"), (Report(1, prior=np.ones(mugrid.BINS)), "prior"),
-     (Report(1, prior=np.r_[-1.0, 2.0, np.zeros(mugrid.BINS - 2)]), "prior")],
-)  # fmt: skip
+    [
+        (Report(1), "weather"),
+        (Report(1, road_temperature=400.0), "road_temperature"),
+        (Report(1, precipitation=-1.0), "precipitation"),
+        (Report(1, air_temperature=float("inf")), "air_temperature"),
+        (Report(1, prior=np.ones(3) / 3), "prior"),
+        (Report(1, prior=np.ones(mugrid.BINS)), "prior"),
+        (Report(1, prior=np.r_[-1.0, 2.0, np.zeros(mugrid.BINS - 2)]), "prior"),
+    ],
+)
 def test_a_report_that_breaks_a_rule_is_refused_by_name(report: Report, field: str) -> None:
     with pytest.raises(WireError, match=f"^{field}: .*; "):
         weather.decode(weather.encode(report))
@@ -76,12 +81,17 @@ def file(path: Path, **columns: object) -> Path:
 
 @pytest.mark.parametrize(
     ("columns", "complaint"),
-    [({"region": ["1202300230"]}, "row 0: no region, time and numbers"),
-     ({"region": ["1202300230"], "time": [1], "wind": [3.0]}, "wind is no column"),
-     ({"region": ["1202300230"], "time": [1], "precipitation": [-9999.0]}, "row 0, precipitation: -9999 lies outside"),
-     ({"region": [-1], "time": [1], "precipitation": [1.0]}, "row 0, region: is no z10 region"),
-     ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: no region")],
-)  # fmt: skip
+    [
+        ({"region": ["1202300230"]}, "row 0: no region, time and numbers"),
+        ({"region": ["1202300230"], "time": [1], "wind": [3.0]}, "wind is no column"),
+        (
+            {"region": ["1202300230"], "time": [1], "precipitation": [-9999.0]},
+            "row 0, precipitation: -9999 lies outside",
+        ),
+        ({"region": [-1], "time": [1], "precipitation": [1.0]}, "row 0, region: is no z10 region"),
+        ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: no region"),
+    ],
+)
 def test_a_wrong_weather_file_is_refused_with_row_and_column(
     tmp_path: Path, columns: dict[str, list[Any]], complaint: str
 ) -> None:
@@ -109,9 +119,12 @@ def beliefs(engine: Engine, now: int) -> np.ndarray:
 def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> None:
     start = time.time_ns() - 7200 * SECOND
     path = file(
-        tmp_path / "w.parquet", region=[grid.quadkey(REGION, grid.REGION_ZOOM)],
-        time=pa.array([start - 600 * SECOND], pa.timestamp("ns", "UTC")), air_temperature=[5.0], precipitation=[3.0],
-    )  # fmt: skip
+        tmp_path / "w.parquet",
+        region=[grid.quadkey(REGION, grid.REGION_ZOOM)],
+        time=pa.array([start - 600 * SECOND], pa.timestamp("ns", "UTC")),
+        air_temperature=[5.0],
+        precipitation=[3.0],
+    )
     config = ServiceConfig(weather=path)
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
@@ -124,7 +137,8 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     drive(engine, start + 3000 * SECOND, 2)
     assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
     engine.close()
-    again, dry = Engine(config, tmp_path / "a"), Engine(ServiceConfig(), tmp_path / "b")
+    again = Engine(config, tmp_path / "a")
+    dry = Engine(ServiceConfig(), tmp_path / "b")
     drive(dry, start, 1)
     drive(dry, start + 3000 * SECOND, 2)
     now = start + 5000 * SECOND
@@ -139,7 +153,8 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
 
 
 def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -> None:
-    start, root = time.time_ns() - 7200 * SECOND, tmp_path / "a"
+    start = time.time_ns() - 7200 * SECOND
+    root = tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
             told = weather.encode(
@@ -153,7 +168,8 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
             if k == 3:
                 checkpoints.save(root, taken(engine))
         now = start + 5000 * SECOND
-        right, before = beliefs(engine, now), archived_reports(root)
+        right = beliefs(engine, now)
+        before = archived_reports(root)
     path = files(root)[2]
     shutil.copy(path, tmp_path / path.name)
     assert (join_daily_files(root), join_daily_files(root), len(files(root))) == (5, 0, 1)
@@ -191,8 +207,10 @@ def test_a_running_service_takes_weather_over_its_key(
 
 def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path: Path) -> None:
     counts: Counter[str] = Counter()
-    inbox, now = WeatherInbox(tmp_path, "fleet", Fusion(120.0), counts), 10**18
-    many, key = WAITING + 50, keys.weather_key(REGION)
+    inbox = WeatherInbox(tmp_path, "fleet", Fusion(120.0), counts)
+    now = 10**18
+    many = WAITING + 50
+    key = keys.weather_key(REGION)
     for k in range(many):
         payload = weather.encode(Report(now + k * 1000, precipitation=2.0))
         inbox.enqueue(WeatherMessage(key, payload, wire.WEATHER_ENCODING))

@@ -52,12 +52,21 @@ def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
     """Cells beside CELL, seconds, and friction."""
     cell, seconds, mu = np.array(rows).T
-    return pa.table({
-        "cell": CELL + cell.astype(np.int64), "sector": np.zeros(len(rows), np.int8),
-        "leave_time": pa.array(START + (seconds * 1e9).astype(np.int64), pa.timestamp("ns", "UTC")), "mu": mu,
-        "enter_time": pa.array(START + (seconds * 1e9).astype(np.int64) - NS, pa.timestamp("ns", "UTC")),
-        "utilisation": np.where(mu > 0.5, 0.9, 0.1), "vehicle": [f"v{k % 2}" for k in range(len(rows))],
-    })  # fmt: skip
+    return pa.table(
+        {
+            "cell": CELL + cell.astype(np.int64),
+            "sector": np.zeros(len(rows), np.int8),
+            "leave_time": pa.array(
+                START + (seconds * 1e9).astype(np.int64), pa.timestamp("ns", "UTC")
+            ),
+            "mu": mu,
+            "enter_time": pa.array(
+                START + (seconds * 1e9).astype(np.int64) - NS, pa.timestamp("ns", "UTC")
+            ),
+            "utilisation": np.where(mu > 0.5, 0.9, 0.1),
+            "vehicle": [f"v{k % 2}" for k in range(len(rows))],
+        }
+    )
 
 
 def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> (

@@ -32,11 +32,20 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A campaign of seconds: few minutes, few vehicles. Its values mean nothing."""
     brief = tuple(fleet._replace(begin=0, minutes=6) for fleet in fleets.FLEETS)
     for module, name, value in (
-        (fleets, "FLEETS", brief), (fleets, "AT", (6,)), (changes, "MINUTES", 5), (changes, "CHANGE", 3),
-        (attacks, "BEGIN", 4), (attacks, "MINUTES", 6), (exact, "MINUTES", 5), (exact, "UNEXCITED", (3,)),
-        (attacks, "ENOUGH", 0), (third_party, "MINUTES", 5), (third_party, "CHANGE_VISITS", 30),
-        (third_party, "COLD_SEEDS", 2), (third_party, "VISITS", 5),
-    ):  # fmt: skip
+        (fleets, "FLEETS", brief),
+        (fleets, "AT", (6,)),
+        (changes, "MINUTES", 5),
+        (changes, "CHANGE", 3),
+        (attacks, "BEGIN", 4),
+        (attacks, "MINUTES", 6),
+        (exact, "MINUTES", 5),
+        (exact, "UNEXCITED", (3,)),
+        (attacks, "ENOUGH", 0),
+        (third_party, "MINUTES", 5),
+        (third_party, "CHANGE_VISITS", 30),
+        (third_party, "COLD_SEEDS", 2),
+        (third_party, "VISITS", 5),
+    ):
         monkeypatch.setattr(module, name, value)
 
 
@@ -72,8 +81,11 @@ def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plo
     assert found["fusion.replay.max_difference"]["holds"]
     assert "DOES NOT HOLD" in (tmp_path / "figures.md").read_text()
     assert {path.name for path in tmp_path.glob("*.png")} == {
-        "reliability.png", "rmse.png", "delay.png", "misbehaving.png",
-    }  # fmt: skip
+        "reliability.png",
+        "rmse.png",
+        "delay.png",
+        "misbehaving.png",
+    }
 
 
 def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> None:
@@ -100,7 +112,8 @@ def test_a_missing_figure_fails_the_campaign() -> None:
 def test_a_single_visit_without_bias_is_calibrated() -> None:
     rng = np.random.default_rng(1)
     n = 4000
-    mu, who = rng.uniform(0.2, 1.0, n), np.zeros(n, np.int64)
+    mu = rng.uniform(0.2, 1.0, n)
+    who = np.zeros(n, np.int64)
     exactly = agent.Errors(np.zeros(1), np.zeros(1), np.zeros(1))
     along = np.tile(np.arange(4), n // 4)
     sure = np.ones(n, bool)
@@ -118,9 +131,11 @@ def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it
     rng = np.random.default_rng(4)
     common = np.concatenate([town.build(rng, 1, 0.0).common for _ in range(40)])
     assert np.std(common) == pytest.approx(agent.COMMON, rel=0.15)
-    n, mu = 4000, 0.6
+    n = 4000
+    mu = 0.6
     errors = agent.Errors(np.zeros(n), np.zeros(n), np.zeros(n))
-    who, sure = np.arange(n), np.ones(n, bool)
+    who = np.arange(n)
+    sure = np.ones(n, bool)
     passes = agent.Passes(
         who, np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n), 0 * who, sure
     )
@@ -130,7 +145,8 @@ def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it
 
 def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> None:
     rng = np.random.default_rng(2)
-    n, who = 500, np.arange(500)
+    n = 500
+    who = np.arange(500)
     passes = agent.Passes(
         who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n), 0 * who, who < 0
     )
@@ -151,8 +167,10 @@ def test_what_is_delivered_twice_is_admitted_once() -> None:
 def test_the_federated_reset_is_the_inverse_variance_of_readings_and_the_newest_report_the_last() -> (
     None
 ):
-    seconds, place = np.arange(3.0), np.zeros(3, np.int64)
-    reading, std = np.array([0.5, 0.7, np.nan]), np.array([0.1, 0.1, np.nan])
+    seconds = np.arange(3.0)
+    place = np.zeros(3, np.int64)
+    reading = np.array([0.5, 0.7, np.nan])
+    std = np.array([0.1, 0.1, np.nan])
     sent = np.array([[0.5, 0.01], [0.7, 0.01], [0.6, 0.05]])
     found = rules.fuse(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
     federated, newest = (

@@ -14,7 +14,8 @@ from schemas import mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
-VEHICLES, MINUTES = 4, 6
+VEHICLES = 4
+MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
@@ -22,9 +23,12 @@ def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisit
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]
     reports = SimulatedReports(
-        reading, 0.05 * mu, 0.5 * mu, np.zeros(len(mu), np.int64),
+        reading,
+        0.05 * mu,
+        0.5 * mu,
+        np.zeros(len(mu), np.int64),
         -0.5 * np.square((mugrid.CENTRES - reading[:, None]) / 0.05),
-    )  # fmt: skip
+    )
     return DrivenVisits(vehicle, mu, excited, reports)
 
 
@@ -68,12 +72,21 @@ def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
         np.array([0.1, 0.9, 0.7]),
     )
     nan = np.full(4, np.nan, np.float32)
-    found = resampled.driven({
-        "vehicle": np.array([1, 0, 0, 0]), "enter_time": np.array([5, 0, 8, 11]) * NS,
-        "leave_time": np.array([6, 4, 16, 12]) * NS, "mu": np.array([np.nan, 0.8, 0.3, 0.2], np.float32),
-        "mu_lower": nan, "mu_upper": nan, "mu_utilised": nan, "used_longitudinal": nan, "used_lateral": nan,
-        "log_likelihood": np.zeros((4, mugrid.BINS), np.uint8),
-    }, truth)  # fmt: skip
+    found = resampled.driven(
+        {
+            "vehicle": np.array([1, 0, 0, 0]),
+            "enter_time": np.array([5, 0, 8, 11]) * NS,
+            "leave_time": np.array([6, 4, 16, 12]) * NS,
+            "mu": np.array([np.nan, 0.8, 0.3, 0.2], np.float32),
+            "mu_lower": nan,
+            "mu_upper": nan,
+            "mu_utilised": nan,
+            "used_longitudinal": nan,
+            "used_lateral": nan,
+            "log_likelihood": np.zeros((4, mugrid.BINS), np.uint8),
+        },
+        truth,
+    )
     assert found.mu.tolist() == [0.5, 0.9, 0.2, 0.2]
     assert found.excited.tolist() == [True, False, True, True]
 

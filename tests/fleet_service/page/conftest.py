@@ -32,7 +32,8 @@ class RunningPage:
 @contextmanager
 def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
     """The address of a page in a thread of this process; it ends with the block."""
-    stop, lines = threading.Event(), list[str]()
+    stop = threading.Event()
+    lines = list[str]()
     settings = PageSettings(connection, port=0, **changed)  # type: ignore[arg-type]
     thread = threading.Thread(target=run, args=(settings, stop, lines.append))
     thread.start()

@@ -81,12 +81,22 @@ def _report(
     found = np.where(bound[:, None], at_least(np.full(len(mu), ROLLED)), value(np.nan_to_num(mu)))
     used = np.where(bound, ROLLED, np.nan_to_num(mu))
     told = batch(
-        car, seq, int(time[-1]), np.where(bound, 0.7, mu).tolist(), latitude=latitude, longitude=longitude, cell=place,
-        sector=heading, yaw=np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])[heading], leave_time=time,
-        enter_time=time - VISIT_NS, log_likelihood=mugrid.encode_log_likelihood(found),
-        mu_utilised=used, used_longitudinal=used * WAYS[CARS.index(car) % 3][0],
+        car,
+        seq,
+        int(time[-1]),
+        np.where(bound, 0.7, mu).tolist(),
+        latitude=latitude,
+        longitude=longitude,
+        cell=place,
+        sector=heading,
+        yaw=np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])[heading],
+        leave_time=time,
+        enter_time=time - VISIT_NS,
+        log_likelihood=mugrid.encode_log_likelihood(found),
+        mu_utilised=used,
+        used_longitudinal=used * WAYS[CARS.index(car) % 3][0],
         used_lateral=used * WAYS[CARS.index(car) % 3][1],
-    )  # fmt: skip
+    )
     send(session, told)
 
 
@@ -94,8 +104,12 @@ def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
     """Cell, heading and mu of each visit, in the order of a drive: east, west, north, south."""
     found = []
     for heading in (EAST, WEST, NORTH, SOUTH):
-        way = [(cell, heading, np.nan if part.mu is None else part.mu)
-               for part in parts if heading in part.headings for cell in cells(part).tolist()]  # fmt: skip
+        way = [
+            (cell, heading, np.nan if part.mu is None else part.mu)
+            for part in parts
+            if heading in part.headings
+            for cell in cells(part).tolist()
+        ]
         found += way if heading in (EAST, SOUTH) else way[::-1]
     cell, sector, mu = zip(*found, strict=True)
     return np.array(cell, np.int64), np.array(sector, np.int64), np.array(mu)

@@ -92,7 +92,9 @@ def test_pages_follow_each_other_and_nothing_is_there_twice(
     page: RunningPage, drive: Drive
 ) -> None:
     drawn(page, drive, "ice", "wet")
-    found, path, pages = [], f"{ITEMS}?limit=7", 0
+    found = []
+    path = f"{ITEMS}?limit=7"
+    pages = 0
     while path:
         answer = told(page, path)
         assert answer["numberReturned"] == len(answer["features"]) <= 7
@@ -168,10 +170,19 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
 
 @pytest.mark.parametrize(
     "asked",
-    ["?bbox=1,2", "?bbox=9,2,1,3", "?limit=0", "?limit=x", "?datetime=yesterday",
-     "?datetime=2026-01-02T00:00Z/2026-01-01T00:00Z",
-     "?colour=red", "?after=7", "/x", "/1-9"],
-)  # fmt: skip
+    [
+        "?bbox=1,2",
+        "?bbox=9,2,1,3",
+        "?limit=0",
+        "?limit=x",
+        "?datetime=yesterday",
+        "?datetime=2026-01-02T00:00Z/2026-01-01T00:00Z",
+        "?colour=red",
+        "?after=7",
+        "/x",
+        "/1-9",
+    ],
+)
 def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str) -> None:
     status, _, body = ask(bare, ITEMS + asked)
     assert status == 400

@@ -59,8 +59,10 @@ def kinds(seen: Opened) -> list[int]:
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
     """Look at a cell, near enough for headings."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
-    seen.page.evaluate("([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
-                       [longitude, latitude, zoom])  # fmt: skip
+    seen.page.evaluate(
+        "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
+        [longitude, latitude, zoom],
+    )
 
 
 def waits(seen: Opened, script: str) -> None:

@@ -106,7 +106,8 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
 
 
 def test_what_changed_laid_over_what_was_is_what_is(table: pa.Table) -> None:
-    before, after = records.of_table(table)[:700], records.of_table(table)[300:].copy()
+    before = records.of_table(table)[:700]
+    after = records.of_table(table)[300:].copy()
     after["mu"][::7] = 11
     change = records.changed_records(before, after)
     held = {int(one["place"]): one for one in before} | {int(one["place"]): one for one in change}

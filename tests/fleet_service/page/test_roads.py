@@ -41,7 +41,8 @@ def test_a_gap_of_two_cells_is_bridged_and_one_of_four_is_not() -> None:
 
 
 def test_streets_that_cross_stay_two_lines() -> None:
-    east, north = [(k, 0) for k in range(-10, 11)], [(0, k) for k in range(-10, 11)]
+    east = [(k, 0) for k in range(-10, 11)]
+    north = [(0, k) for k in range(-10, 11)]
     cell = np.concatenate([cells(*east), cells(*north)])
     sector = np.repeat([EAST, NORTH], 21)
     assert len(learned_lines(cell, sector)) == 2
@@ -91,7 +92,8 @@ def test_recent_moments_are_kept_in_steps_and_thinned_with_age() -> None:
 
 
 def test_nothing_is_kept_twice_while_nothing_changes() -> None:
-    recent, tile = RecentMoments(), np.zeros(3, np.void)
+    recent = RecentMoments()
+    tile = np.zeros(3, np.void)
     for second in range(0, 100, 10):
         recent.keep(float(second), {7: tile})
     assert recent.times() == [0]

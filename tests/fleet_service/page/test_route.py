@@ -21,7 +21,8 @@ from tests.fleet_service.page import street
 
 def told() -> pa.Table:
     """Ice for five cells eastward, then cells that were only passed."""
-    ice, passed = street.cells(street.PARTS["ice"]), street.cells(street.PARTS["passed"])
+    ice = street.cells(street.PARTS["ice"])
+    passed = street.cells(street.PARTS["passed"])
     cells = np.concatenate([ice, passed])
     found = np.concatenate([value([0.12] * len(ice)), at_least([0.25] * len(passed))])
     fusion = Fusion(120.0)

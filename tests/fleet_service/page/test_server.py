@@ -65,7 +65,8 @@ def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[st
     answer = connection.getresponse()
 
     def events() -> Iterator[tuple[str, Any]]:
-        name, lines = "", list[str]()
+        name = ""
+        lines = list[str]()
         for line in answer:
             text = line.decode().rstrip("\n")
             if text.startswith("event: "):
@@ -94,9 +95,19 @@ def test_every_answer_forbids_what_the_page_does_not_need(bare: str) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["/blocks?tiles=x", "/blocks?tiles=-1", "/blocks?level=22", "/tiles?at=yesterday", "/tiles?at=1", "/cell/7/9",
-     "/events?bbox=1,2", "/route?points=1,2", "/route?points=1,2|3,95|x", "/blocks?tiles=" + "1," * 300],
-)  # fmt: skip
+    [
+        "/blocks?tiles=x",
+        "/blocks?tiles=-1",
+        "/blocks?level=22",
+        "/tiles?at=yesterday",
+        "/tiles?at=1",
+        "/cell/7/9",
+        "/events?bbox=1,2",
+        "/route?points=1,2",
+        "/route?points=1,2|3,95|x",
+        "/blocks?tiles=" + "1," * 300,
+    ],
+)
 def test_a_wrong_question_is_told_its_field_and_the_fix(bare: str, path: str) -> None:
     status, _, body = ask(bare, path)
     assert status == 400
@@ -152,7 +163,8 @@ def test_who_connects_is_told_what_stands_and_then_what_changes(
     drive("ice")
     until(lambda: json.loads(ask(page.address, "/tiles")[2]))
     with listening(page.address) as events:
-        first, second = next(events), next(events)
+        first = next(events)
+        second = next(events)
         assert (first[0], second[0]) == ("alerts", "beat")
         assert second[1]["router"]
         drive("avenue")
@@ -161,10 +173,12 @@ def test_who_connects_is_told_what_stands_and_then_what_changes(
     tiles = json.loads(ask(page.address, "/tiles")[2])
     _, headers, body = ask(page.address, f"/blocks?tiles={','.join(map(str, tiles))}")
     assert headers["content-type"] == "application/vnd.gripmap.blocks"
-    heads, at = 0, 0
+    heads = 0
+    at = 0
     while at < len(body):
         count = HEAD.unpack_from(body, at)[3]
-        heads, at = heads + count, at + HEAD.size + (13 * count + 3) // 4 * 4
+        heads = heads + count
+        at = at + HEAD.size + (13 * count + 3) // 4 * 4
     assert heads >= street.known("ice")
 
 
@@ -296,11 +310,9 @@ def test_a_stranger_on_the_map_ends_nothing(
 def test_every_option_of_the_command_does_what_it_says(
     router: ZenohSettings, tmp_path: Path, way: str
 ) -> None:
-    archive, overlay, config = (
-        tmp_path / "archive",
-        tmp_path / "truth.parquet",
-        tmp_path / "reader.json",
-    )
+    archive = tmp_path / "archive"
+    overlay = tmp_path / "truth.parquet"
+    config = tmp_path / "reader.json"
     with running(router, archive):
         pass
     fusion = Fusion(120.0)

@@ -98,7 +98,8 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
         path = keep(engine, tmp_path)
         engine.intake.ingest(sent[40:], time.time_ns())
         engine.settlement.flush()
-        at, alerts = time.time_ns(), engine.alerts.count
+        at = time.time_ns()
+        alerts = engine.alerts.count
         running = beliefs(engine, at)
     replayed.clear()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
@@ -118,7 +119,8 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 def known(engine: Engine) -> dict[str, NDArray[Any]]:
     """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
-    fusion, rows = engine.state.fusion, engine.state.fusion.store.state.live
+    fusion = engine.state.fusion
+    rows = engine.state.fusion.store.state.live
     order = np.lexsort((fusion.sector, fusion.cell))
     columns = {
         name: rows.cells[name][order]
@@ -134,7 +136,8 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
     tmp_path: Path, oldest_s: float
 ) -> None:
     """Restart after a compaction that joined old and new rows in one file."""
-    config, now = ServiceConfig(oldest_s=oldest_s), time.time_ns()
+    config = ServiceConfig(oldest_s=oldest_s)
+    now = time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
     with closing(Engine(config, tmp_path)) as engine:
         for vehicle, at in (("sim-001", old), ("sim-002", now)):
@@ -155,15 +158,23 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
     """Whatever comes late, in disorder, and last before the checkpoint."""
-    rng, now = np.random.default_rng(3), time.time_ns()
+    rng = np.random.default_rng(3)
+    now = time.time_ns()
     sent = []
     for k in range(120):
         leave = np.sort(now + k * SECOND - rng.integers(0, 700, 5) * SECOND // 100)
-        mu, latitude = rng.uniform(0.2, 0.9, 5), LATITUDE + 2e-4 * rng.integers(0, 6, 5)
+        mu = rng.uniform(0.2, 0.9, 5)
+        latitude = LATITUDE + 2e-4 * rng.integers(0, 6, 5)
         one = batch(
-            f"sim-{k % 6:03}", 1 + k // 6, now, mu.tolist(), leave_time=leave, enter_time=leave - SECOND // 2,
-            latitude=latitude, cell=grid.cell_of(latitude, np.full(5, LONGITUDE)),
-        )  # fmt: skip
+            f"sim-{k % 6:03}",
+            1 + k // 6,
+            now,
+            mu.tolist(),
+            leave_time=leave,
+            enter_time=leave - SECOND // 2,
+            latitude=latitude,
+            cell=grid.cell_of(latitude, np.full(5, LONGITUDE)),
+        )
         sent.append((k + rng.choice([0, 0, 0, 5, 40, 200]), one))
     sent.sort(key=lambda pair: pair[0])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
@@ -254,11 +265,10 @@ def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Pat
         for seq in range(1, 9):
             engine.intake.ingest([icy(k, seq, 0.15) for k in range(6)], time.time_ns())
             engine.settlement.flush()
-        keep_alerts, at = engine.alerts.count, time.time_ns()
-        running, visits = (
-            beliefs(engine, at),
-            engine.state.fusion.live.visits[: engine.state.fusion.size].sum(),
-        )
+        keep_alerts = engine.alerts.count
+        at = time.time_ns()
+        running = beliefs(engine, at)
+        visits = engine.state.fusion.live.visits[: engine.state.fusion.size].sum()
         compact(tmp_path)
     assert keep_alerts > 0
     with closing(Engine(ServiceConfig(), tmp_path)) as again:

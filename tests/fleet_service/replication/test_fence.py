@@ -20,7 +20,8 @@ from tests.standbys import restored
 def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
-    month, known = "2026-11", dict[int, int]()
+    month = "2026-11"
+    known = dict[int, int]()
 
     def meets(one: Machine, pseudonym: int) -> None:
         list_ = VehicleIds(one.root / "keys")

@@ -116,7 +116,8 @@ def _whole(fleet: Fleet, sent: list[Batch], folder: Path) -> None:
 def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path
 ) -> None:
-    fleet, sent = Fleet(session), reports(0.8, 1, BATCHES)
+    fleet = Fleet(session)
+    sent = reports(0.8, 1, BATCHES)
     with hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (
         one,
         two,
@@ -252,7 +253,9 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     with monkeypatch.context() as killed:  # between the disk and the bucket
         killed.setattr(one.log, "_upload", lambda _: None)
         one.write(1)
-    has_read, goes_on, place = threading.Event(), threading.Event(), compaction._place
+    has_read = threading.Event()
+    goes_on = threading.Event()
+    place = compaction._place
 
     def placed(*args: Any) -> int:  # noqa: ANN401
         has_read.set()
@@ -345,7 +348,8 @@ def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(
 
 
 def test_a_copy_of_a_folder_is_somebody_else(tmp_path: Path) -> None:
-    one, two = tmp_path / "one", tmp_path / "two"
+    one = tmp_path / "one"
+    two = tmp_path / "two"
     one.mkdir()
     two.mkdir()
     first, known = holder_of(one, "s3://bucket/a")

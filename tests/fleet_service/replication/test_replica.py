@@ -157,7 +157,8 @@ def test_segment_compacted_before_its_upload_is_settled_by_the_result(
 def test_an_empty_disk_has_all_of_it_again(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
-    root, new = tmp_path / "archive", tmp_path / "new"
+    root = tmp_path / "archive"
+    new = tmp_path / "new"
     copy = make(root)
     with closing(filled(root, copy)):
         compact(root)

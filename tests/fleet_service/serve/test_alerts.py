@@ -43,7 +43,9 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
 
 
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
-    fusion, cells = Fusion(120.0), 64 * np.arange(40)  # too far from each other to tell
+    # too far from each other to tell
+    fusion = Fusion(120.0)
+    cells = 64 * np.arange(40)
     for vehicle in range(3):
         fusion.update(
             observations(
@@ -53,7 +55,8 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
                 CELL + cells,
             )
         )
-    alerts, slots = Alerts(fusion), np.arange(fusion.size)
+    alerts = Alerts(fusion)
+    slots = np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
@@ -109,7 +112,7 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
 
 def called(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
-) -> tuple[Fusion, list[bool]]:  # fmt: skip
+) -> tuple[Fusion, list[bool]]:
     """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it was under an alert."""
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
@@ -141,10 +144,8 @@ def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> No
 def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
     drivers: int, found: int, raised: bool
 ) -> None:
-    fusion, (before, here, behind) = (
-        Fusion(120.0),
-        grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist(),
-    )
+    fusion = Fusion(120.0)
+    (before, here, behind) = grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
     for cell in (before, here, behind):  # of a road where more grip was used than ice has
         seconds = 20.0 * np.arange(drivers)
         fusion.update(
@@ -156,10 +157,8 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
             observations(seconds, 50 + np.arange(vehicles), value([0.2] * vehicles), cell)
         )
     slots = fusion.slots_of(np.array([here]), np.array([0]))
-    own, believed = (
-        float(fusion.slippery(slots)[0]),
-        float(fusion.believed(slots)[0] @ SLIPPERY_SHARE),
-    )
+    own = float(fusion.slippery(slots)[0])
+    believed = float(fusion.believed(slots)[0] @ SLIPPERY_SHARE)
     assert own < 0.5
     assert believed > RAISE_ABOVE or not found
     assert bool(Alerts(fusion).update(slots)) is raised is (own > LIKELY and found == 2)

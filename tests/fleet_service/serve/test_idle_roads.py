@@ -34,7 +34,8 @@ def test_each_vehicle_supports_alerts_in_few_areas() -> None:
 def alerts_of(vehicles: int) -> int:
     """Return the number of alerts when this many vehicles report ice in all cells."""
     fusion = Fusion(120.0)
-    alerts, raised = Alerts(fusion, IdleRoads()), 0
+    alerts = Alerts(fusion, IdleRoads())
+    raised = 0
     for number, cell in enumerate(CELLS):
         for vehicle in range(vehicles):
             seconds = [100.0 * number + vehicle]

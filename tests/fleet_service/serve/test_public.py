@@ -141,7 +141,8 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
     """The vehicles that make a cell public are those of the last hours, in answers, routes, snapshots and tiles."""
-    engine, day = start(3), (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
+    engine = start(3)
+    day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
     names = [f"sim-{k:03}" for k in range(6)]
     route = f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}"
     hear(engine, *names, now=day)
@@ -194,7 +195,8 @@ def taken_from(engine: Engine) -> checkpoints.Taken:
 
 
 def test_visitors_are_never_counted_as_more_than_they_were() -> None:
-    fusion, now = Fusion(60.0), START
+    fusion = Fusion(60.0)
+    now = START
     visitors = Visitors(fusion)
     rng = np.random.default_rng(3)
     for turn in range(4):
@@ -217,8 +219,10 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
 
 
 def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start) -> None:
-    engine, now = start(1), time.time_ns()
-    names, alone = [f"sim-{k:03}" for k in range(4)], LATITUDE - 0.002
+    engine = start(1)
+    now = time.time_ns()
+    names = [f"sim-{k:03}" for k in range(4)]
+    alone = LATITUDE - 0.002
     old = now - 8 * 86_400 * SECOND
     where: dict[str, Any] = {"latitude": [alone], "cell": [grid.cell_of(alone, LONGITUDE)]}
     sent = [

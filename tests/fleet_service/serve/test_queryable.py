@@ -78,11 +78,9 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
 
 
 def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.Session) -> None:
-    key, counts, asked = (
-        keys.map_key(TILE),
-        Counter[str](),
-        Answering(lambda *_: AnswerSize(MOST // COST[Format.JSON] + 1, 1), nothing),
-    )
+    key = keys.map_key(TILE)
+    counts = Counter[str]()
+    asked = Answering(lambda *_: AnswerSize(MOST // COST[Format.JSON] + 1, 1), nothing)
     queryable = session.declare_queryable(key, MapQueryable(asked, counts), complete=True)
     querier = session.declare_querier(key)
     matched(querier)
@@ -111,7 +109,9 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
     """The heavy answer does not end before the light one has come; many tiles of a cell each are heavy too."""
-    key, counts, light_came = keys.map_key(TILE), Counter[str](), threading.Event()
+    key = keys.map_key(TILE)
+    counts = Counter[str]()
+    light_came = threading.Event()
 
     def size(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
         return much if query.min_vehicles == 2 else AnswerSize(1, 1)
@@ -144,7 +144,9 @@ class Half:
     """Answers of two tiles; those that cost most wait for `go` after the first."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.counts, self.go, self.session = Counter[str](), threading.Event(), session
+        self.counts = Counter[str]()
+        self.go = threading.Event()
+        self.session = session
         self.begun = threading.Semaphore(0)
         self.queryable = MapQueryable(Answering(self.size, self.answer), self.counts)
         self.key = keys.map_key(TILE)

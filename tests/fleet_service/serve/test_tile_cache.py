@@ -98,7 +98,8 @@ def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState
 
 
 def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
-    state, rng = MapState(Fusion(120.0)), np.random.default_rng(0)
+    state = MapState(Fusion(120.0))
+    rng = np.random.default_rng(0)
     for vehicle in (1, 2):
         for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):
             visit(state, vehicle, int(cell))
@@ -107,16 +108,18 @@ def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
     west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
     lengths = set()
     for _ in range(200):
-        x, y = (
-            np.sort(rng.uniform(west - 0.02, east + 0.02, 2)),
-            np.sort(rng.uniform(south - 0.01, north + 0.01, 2)),
-        )
+        x = np.sort(rng.uniform(west - 0.02, east + 0.02, 2))
+        y = np.sort(rng.uniform(south - 0.01, north + 0.01, 2))
         query = MapQuery(bbox=(x[0], y[0], x[1], y[1]), min_vehicles=int(rng.integers(1, 3)))
         wanted = {
-            cell["cell"] for cell in cells
-            if cell["east"] > x[0] and cell["west"] < x[1] and cell["north"] > y[0] and cell["south"] < y[1]
+            cell["cell"]
+            for cell in cells
+            if cell["east"] > x[0]
+            and cell["west"] < x[1]
+            and cell["north"] > y[0]
+            and cell["south"] < y[1]
             and cell["vehicles"] >= query.min_vehicles
-        }  # fmt: skip
+        }
         replies = dict(answer(made, query, lambda tile: tile == TILE, NOW, TILE))
         told = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
         assert set(told) == wanted

@@ -13,16 +13,15 @@ class Made:
     """Tiles that change, a clock, and what was put when."""
 
     def __init__(self) -> None:
-        self.now, self.changed, self.puts, self.counts = (
-            100.0,
-            set[int](),
-            list[tuple[int, float]](),
-            Counter[str](),
-        )
+        self.now = 100.0
+        self.changed = set[int]()
+        self.puts = list[tuple[int, float]]()
+        self.counts = Counter[str]()
         self.rounds = TileRounds(1.0, self.take, self.put, self.counts, lambda: self.now)
 
     def take(self) -> list[int]:
-        taken, self.changed = sorted(self.changed), set()
+        taken = sorted(self.changed)
+        self.changed = set()
         return taken
 
     def put(self, tile: int) -> None:

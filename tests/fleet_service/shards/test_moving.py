@@ -41,7 +41,8 @@ class Machine:
             "archive": archive,
             "segment_s": 0.1,
         }
-        self._config, self._root = ServiceConfig.model_validate(told), root
+        self._config = ServiceConfig.model_validate(told)
+        self._root = root
         self.lines: list[str] = []
         self.stop = threading.Event()
         self.service: Service | None = None
@@ -86,7 +87,8 @@ def test_a_region_is_handed_over_with_all_that_was_known(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    fleet, sent = Fleet(session), reports(0.15, 1, BATCHES)
+    fleet = Fleet(session)
+    sent = reports(0.15, 1, BATCHES)
     connect = ["--connect", router.connect[0]]
     with machines(router, bucket, tmp_path, "north-a", "north-b") as (one, two):
         one.start("ready: ")
@@ -102,7 +104,8 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         assert two.service is not None
         engine = two.service.engine
         assert engine.alerts.count > 0
-        expected, found = known(former.engine), known(engine)
+        expected = known(former.engine)
+        found = known(engine)
         assert expected.keys() == found.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         again = Fleet(session)  # what comes again is known there

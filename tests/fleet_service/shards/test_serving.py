@@ -61,7 +61,8 @@ def nobody(session: zenoh.Session) -> None:
 
 def visits(vehicle: str) -> list[Batch]:
     """A batch for each place of the street, of a car for each: one could not be in all at once."""
-    now, out = time.time_ns() - 2 * SECOND, list[Batch]()
+    now = time.time_ns() - 2 * SECOND
+    out = list[Batch]()
     for number, longitude in enumerate(LONGITUDES):
         cell = int(grid.cell_of(LATITUDE, longitude))
         region = int(grid.region_of(cell))
@@ -247,7 +248,8 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
         drive_one(session, service)
-        asked, first = map_client.replies, [True]
+        asked = map_client.replies
+        first = [True]
 
         def replies(*given: Any) -> Iterator[tuple[str, bytes]]:  # noqa: ANN401
             found = [] if first.pop() else list(asked(*given))
@@ -281,7 +283,8 @@ def test_a_leaving_service_may_be_asked_instead_of_its_successor(
         zenoh_session(router) as third,
         announce_regions(other, follows),
     ):
-        held, again = announce_regions(other, frozen), announce_regions(other, frozen)
+        held = announce_regions(other, frozen)
+        again = announce_regions(other, frozen)
         held.__enter__()
         until(lambda: len(tokens.active_tokens(third)) == 2)
 

@@ -30,9 +30,13 @@ def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobu
     """A message with records, some of its columns, and anything in them."""
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](
-        vehicle=draw(st.sampled_from(["sim-001", "", "a" * 200])), estimator=draw(st.sampled_from(["", "ckf"])),
-        boot=draw(_I64), region=draw(_I64), seq=draw(_I64), first_held=draw(_I64),
-    )  # fmt: skip
+        vehicle=draw(st.sampled_from(["sim-001", "", "a" * 200])),
+        estimator=draw(st.sampled_from(["", "ckf"])),
+        boot=draw(_I64),
+        region=draw(_I64),
+        seq=draw(_I64),
+        first_held=draw(_I64),
+    )
     for name, dtype in column_types(kind).items():
         if name not in NEEDED[kind] and not draw(st.booleans()):
             continue

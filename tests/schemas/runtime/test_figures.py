@@ -40,10 +40,8 @@ def test_the_commit_is_that_of_the_source_and_says_whether_it_was_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    source, other = (
-        tmp_path / "house" / "room" / "code.py",
-        tmp_path / "house" / "room" / "site-packages.py",
-    )
+    source = tmp_path / "house" / "room" / "code.py"
+    other = tmp_path / "house" / "room" / "site-packages.py"
     source.parent.mkdir(parents=True)
     source.write_text("1")
     assert commit(source) == "unknown"

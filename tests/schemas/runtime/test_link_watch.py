@@ -40,8 +40,10 @@ def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFi
         assert watch.epoch == 2
         shown = {metric.name: metric.values for metric in link_metrics([watch])}
         assert shown == {
-            "links": {"quic": 0.0, "tls": 0.0, "tcp": 1.0}, "links_opened": {"": 2.0}, "links_lost": {"": 1.0},
-        }  # fmt: skip
+            "links": {"quic": 0.0, "tls": 0.0, "tcp": 1.0},
+            "links_opened": {"": 2.0},
+            "links_lost": {"": 1.0},
+        }
         of_router = {metric.name: metric.values for metric in router_metrics(router)}
         assert of_router["router_sessions"] == {"client": 1.0, "router": 0.0, "peer": 0.0}
         assert of_router["router_links"]["tcp"] == 1.0
@@ -59,7 +61,8 @@ def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFi
 
 def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) -> None:
     with network(tmp_path, protocol="quic") as there:
-        quic, tls = there.endpoints[ROUTERS[0]], there.between[ROUTERS[0]]
+        quic = there.endpoints[ROUTERS[0]]
+        tls = there.between[ROUTERS[0]]
         closed = "quic/127.0.0.1:9"
         for first, used in ((quic, "quic"), (closed, "tls")):
             with there.session_at(READER, [first, tls]) as session:
@@ -70,7 +73,8 @@ def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) 
 
 @pytest.mark.parametrize("capped", [True, False])
 def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: bool) -> None:
-    sent, heard = 200, dict.fromkeys(VEHICLES, 0)
+    sent = 200
+    heard = dict.fromkeys(VEHICLES, 0)
 
     def count(sample: zenoh.Sample) -> None:
         heard[str(sample.key_expr).rpartition("/")[2]] += 1

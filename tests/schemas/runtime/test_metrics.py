@@ -83,7 +83,8 @@ def test_a_taken_port_is_said() -> None:
 
 def test_lines_are_text_for_people_and_json_for_programs() -> None:
     line = LogLine("status: 3 rows", rows=3, counts={"late": 1})
-    plain, structured = io.StringIO(), io.StringIO()
+    plain = io.StringIO()
+    structured = io.StringIO()
     line_logger("text", plain)(line)
     line_logger("json", structured, service="shard-0")(line)
     line_logger("json", structured)("compacted: 7 rows\nof <many>")
@@ -103,7 +104,8 @@ def test_lines_are_text_for_people_and_json_for_programs() -> None:
 
 
 def test_warnings_of_the_program_take_the_same_form() -> None:
-    stream, before = io.StringIO(), logging.root.handlers[:]
+    stream = io.StringIO()
+    before = logging.root.handlers[:]
     level = logging.root.level
     try:
         log_as("json", stream, service="shard-0")

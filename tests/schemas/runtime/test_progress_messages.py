@@ -23,7 +23,8 @@ class Terminal(io.StringIO):
 def test_progress_is_shown_while_the_drawing_library_still_loads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    terminal, loaded = Terminal(), threading.Event()
+    terminal = Terminal()
+    loaded = threading.Event()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)
     monkeypatch.setattr(progress_messages, "TICK_S", 0.01)

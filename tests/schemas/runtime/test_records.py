@@ -48,7 +48,8 @@ class Widest(Wider):
 def fill(rows: Records[Row], first: int, last: int) -> None:
     for n in range(first, last):
         row = rows[n]
-        row.begun, row.seen = True, row.seen + n
+        row.begun = True
+        row.seen = row.seen + n
         row.inner.curve[1] = row.inner.level + n
         for j in range(row.table.shape[1]):
             row.table[1, j] = 10.0 * n + j

@@ -37,7 +37,8 @@ def test_alerts_have_the_highest_priority_and_are_sent_at_once() -> None:
 def test_waiting_for_a_router_is_reported_once_without_build_paths(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tries, stop = list[int](), threading.Event()
+    tries = list[int]()
+    stop = threading.Event()
     configured = zenoh_session.configuration
 
     def counted(settings: ZenohSettings, name: str = "") -> object:

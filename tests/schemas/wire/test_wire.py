@@ -32,8 +32,14 @@ HEADER = {"vehicle", "boot", "region", "seq", "first_held", "estimator"}
 
 def same(a: Batch, b: Batch) -> None:
     assert (a.kind, a.vehicle, a.boot, a.region, a.seq, a.first_held, a.estimator) == (
-        b.kind, b.vehicle, b.boot, b.region, b.seq, b.first_held, b.estimator,
-    )  # fmt: skip
+        b.kind,
+        b.vehicle,
+        b.boot,
+        b.region,
+        b.seq,
+        b.first_held,
+        b.estimator,
+    )
     assert a.columns.keys() == b.columns.keys()
     for name, column in a.columns.items():
         assert column.dtype == b.columns[name].dtype, name
@@ -72,7 +78,8 @@ def test_protobuf_and_arrow_agree_field_by_field(
         if k.startswith("TYPE_")
     }
     for field in on_wire:
-        dtype, sent = wire.column_types(kind)[field.name], names[field.type]
+        dtype = wire.column_types(kind)[field.name]
+        sent = names[field.type]
         if sent == "bytes":
             assert dtype == np.uint8
         elif sent == "int32":
@@ -91,7 +98,8 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
     kept = (DATA / f"{name}.v1.bin").read_bytes()
     if name.endswith("_batch"):
         kind = Kind.OBSERVATION if name.startswith("obs") else Kind.STATE
-        found, sent = decode(kept, wire.ENCODING[kind], kind), batch_of_version_1(kind)
+        found = decode(kept, wire.ENCODING[kind], kind)
+        sent = batch_of_version_1(kind)
         absent = {name: found.columns.pop(name) for name in LATER if name in found.columns}
         assert all(
             (column == -1 if name in FLAGS else np.isnan(column)).all()

@@ -46,7 +46,8 @@ def _path_plot(run: NoisyRun) -> PaperPlot:
 
 
 def _torque_plot(run: NoisyRun) -> PaperPlot:
-    t, torque = run.batch.t[:, 0], run.batch.signals[:, 0, S.TORQUE : S.TORQUE + 4]
+    t = run.batch.t[:, 0]
+    torque = run.batch.signals[:, 0, S.TORQUE : S.TORQUE + 4]
     axles = {"front": torque[:, :2].sum(axis=1), "rear": torque[:, 2:].sum(axis=1)}
     motors = tuple(
         Curve(name, t, np.array([motor_torque(float(value), RATIO, EFFICIENCY) for value in total]))
@@ -67,7 +68,8 @@ def _torque_plot(run: NoisyRun) -> PaperPlot:
 
 
 def _state_plot(run: NoisyRun, name: str, title: str) -> PaperPlot:
-    truth, t = run.batch.truth, run.batch.t[:, 0]
+    truth = run.batch.truth
+    t = run.batch.t[:, 0]
     beta = np.arctan2(truth["true_vy"], truth["true_vx"])[:, 0]
     quantities = (
         ("v_x [m/s]", truth["true_vx"][:, 0], "vx", None),

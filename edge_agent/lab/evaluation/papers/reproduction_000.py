@@ -35,7 +35,8 @@ NEAR: Final = 0.1
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     """Return seconds until the mean friction (T,) is within NEAR, from the start and from the
     change."""
-    t, truth = batch.t[:, 0], batch.mu[:, 0]
+    t = batch.t[:, 0]
+    truth = batch.mu[:, 0]
     near = np.abs(mu - truth) <= NEAR
     change = int(np.argmax(truth == truth[-1]))
     found = []
@@ -197,7 +198,8 @@ NOTES: Final = (
 
 
 def _signal_plot(batch: DriveSet) -> PaperPlot:
-    t, signals = batch.t[:, 0], batch.signals[:, 0]
+    t = batch.t[:, 0]
+    signals = batch.signals[:, 0]
     groups = (
         ("(a)", "a_x [m/s²]", S.AX, 1),
         ("(b)", "a_y [m/s²]", S.AY, 1),

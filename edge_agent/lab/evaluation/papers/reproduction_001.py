@@ -123,7 +123,8 @@ def _table_rows(
     rows = []
     place = 0 if name == "improved" else 1
     prefix = "" if name == "improved" else "fkf."
-    ours, elsewhere = matched.values(name), own.values(name)
+    ours = matched.values(name)
+    elsewhere = own.values(name)
     for measure, printed in PRINTED.items():
         for key, numbers in printed.items():
             full = f"{measure}_{key}"
@@ -208,7 +209,8 @@ def _all_drives(drives: dict[str, MotionRun]) -> tuple[PaperRow, ...]:
 
 
 def _state_plot(name: str, run: MotionRun) -> PaperPlot:
-    truth, t = run.batch.truth, run.batch.t[:, 0]
+    truth = run.batch.truth
+    t = run.batch.t[:, 0]
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], 1.0))[:, 0]
     quantities = (
         ("v_x [m/s]", truth["true_vx"][:, 0], "vx"),

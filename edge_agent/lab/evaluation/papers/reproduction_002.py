@@ -111,12 +111,16 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
     """Drive with perfect sensors; read WCKF-A and the compensated forces after every sample."""
     batch = ideal(spec)
     bank = compensated_wckf.bank(batch.vehicles, float(batch.mu[0, 0]), tyre)
-    fused, first, forces = [], [], []
+    fused = []
+    first = []
+    forces = []
     for k in range(len(batch.t)):
         fused.append(bank.advance(batch.t[k : k + 1], batch.signals[k : k + 1]).values[0, 0])
         first.append(bank.memory("mean")[0])
         forces.append(bank.memory("compensated")[0])
-    b, a, compensated = np.array(fused), np.array(first), np.array(forces)
+    b = np.array(fused)
+    a = np.array(first)
+    compensated = np.array(forces)
     x = DriveWheelState
     true = batch.truth
     exact = given_motion(batch, spec.vehicle).wheel_forces()
@@ -231,7 +235,8 @@ def _with_drag(run: ForceRun) -> tuple[PaperRow, ...]:
 
 
 def _drive_plots(drive: str, run: ForceRun) -> list[PaperPlot]:
-    t, signals = run.batch.t[:, 0], run.batch.signals[:, 0]
+    t = run.batch.t[:, 0]
+    signals = run.batch.signals[:, 0]
     numbers = {"sine": ("4", "5", "6"), "jturn": ("7", "8", "9")}[drive]
     steering = Curve("front left wheel", t, signals[:, S.DELTA])
     inputs = (

@@ -344,7 +344,8 @@ def _low_plot(lows: dict[float, CaseRuns]) -> PaperPlot:
 
 
 def _input_plot(runs: CaseRuns) -> PaperPlot:
-    t, signals = runs.batch.t[:, 0], runs.batch.signals[:, 0]
+    t = runs.batch.t[:, 0]
+    signals = runs.batch.signals[:, 0]
     panels = (
         PlotPanel(
             "",

@@ -68,7 +68,8 @@ class NoisyRun:
             got = getattr(self.reported[name], key)
             found[f"mae_{key}"] = float(np.abs(got - true).mean())
             found[f"rmse_{key}"] = float(np.sqrt(((got - true) ** 2).mean(axis=0)).mean())
-            peak, true_peak = np.abs(got).max(axis=0), np.abs(true).max(axis=0)
+            peak = np.abs(got).max(axis=0)
+            true_peak = np.abs(true).max(axis=0)
             found[f"peak_{key}"] = float((np.abs(peak - true_peak) / true_peak).mean())
         return found
 

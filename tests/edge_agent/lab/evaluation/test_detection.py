@@ -45,7 +45,8 @@ SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
 def drive_saying(lower: float, upper: float) -> DetectionDrive:
     """Return a drive of one car over ice, and an estimator that always reports the same interval."""
     ones = np.ones((SAMPLES, 1), np.float32)
-    mu, theta = 0.9 * ones, np.zeros((SAMPLES, 1, 4), np.float32)
+    mu = 0.9 * ones
+    theta = np.zeros((SAMPLES, 1, 4), np.float32)
     mu[200:600] = 0.15
     theta[300:400, :, :2] = 5.0
     wheels = np.repeat(mu[:, :, None], 4, axis=2)
@@ -123,7 +124,8 @@ def test_slip_flag_and_contradictions_are_counted_in_the_slide() -> None:
 
 
 def test_cars_that_stood_where_ice_appeared_are_judged_apart() -> None:
-    mu, speed = np.full((500, 2), 0.9), np.array([[0.0, 5.0]]).repeat(500, axis=0)
+    mu = np.full((500, 2), 0.9)
+    speed = np.array([[0.0, 5.0]]).repeat(500, axis=0)
     mu[300:400] = 0.15
     stood = stood_where_it_appeared(mu, speed, [3.0])
     assert stood[300:400, 0].all()
@@ -154,7 +156,9 @@ def test_the_slip_flag_sees_a_slide_on_ice_and_nothing_on_dry_road() -> None:
 
 
 def test_the_oracle_finds_the_friction_of_a_slide_and_not_of_rolling() -> None:
-    slip, speed, rng = np.full((50, 4), 0.6), np.full(50, 10.0), np.random.default_rng(0)
+    slip = np.full((50, 4), 0.6)
+    speed = np.full(50, 10.0)
+    rng = np.random.default_rng(0)
     slid = visit_evidence(np.full((50, 4), 0.15), slip, speed, rng)
     calm = visit_evidence(np.full((50, 4), 0.05), np.full((50, 4), 0.05), speed, rng)
     assert slippery_favoured(slid) > 3.0

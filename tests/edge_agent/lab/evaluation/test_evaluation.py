@@ -27,33 +27,57 @@ from schemas.signals import S
 
 # the bars as they were asked for: name -> (bar, better)
 ASKED = {
-    **{f"papers.004.{kind}.mae_{name}": (bar, "less") for kind in ("constant", "variable")
-       for name, bar in (("vx", 0.002), ("vy", 0.007), ("yaw_rate", 0.002))},
-    "default.dlc.mu_error": (0.05, "less"), "default.dlc.coverage90": (0.85, "more"),
-    "papers.001.rmse_vx": (0.02, "less"), "papers.001.rmse_vy": (0.01, "less"),
+    **{
+        f"papers.004.{kind}.mae_{name}": (bar, "less")
+        for kind in ("constant", "variable")
+        for name, bar in (("vx", 0.002), ("vy", 0.007), ("yaw_rate", 0.002))
+    },
+    "default.dlc.mu_error": (0.05, "less"),
+    "default.dlc.coverage90": (0.85, "more"),
+    "papers.001.rmse_vx": (0.02, "less"),
+    "papers.001.rmse_vy": (0.01, "less"),
     "papers.001.rmse_beta": (0.001, "less"),
-    **{f"papers.002.{drive}.rmse_{name}": (0.03, "less") for drive in ("sine", "jturn") for name in ("vx", "vy")},
-    "papers.003.accel.mu_error": (0.08, "less"), "papers.003.turn.mu_error": (0.05, "less"),
-    "papers.003.split.low_error": (0.07, "less"), "papers.003.split.high_coverage90": (0.85, "more"),
+    **{
+        f"papers.002.{drive}.rmse_{name}": (0.03, "less")
+        for drive in ("sine", "jturn")
+        for name in ("vx", "vy")
+    },
+    "papers.003.accel.mu_error": (0.08, "less"),
+    "papers.003.turn.mu_error": (0.05, "less"),
+    "papers.003.split.low_error": (0.07, "less"),
+    "papers.003.split.high_coverage90": (0.85, "more"),
     "papers.000.coverage90": (0.87, "more"),
-    "default.jump.accel_s": (0.1, "less"), "default.jump.brake_s": (0.25, "less"),
+    "default.jump.accel_s": (0.1, "less"),
+    "default.jump.brake_s": (0.25, "less"),
     "default.jump.false_per_hour": (1.0, "less"),
-    "default.straight.width_ratio": (0.8, "more"), "default.straight.coverage90": (0.9, "more"),
+    "default.straight.width_ratio": (0.8, "more"),
+    "default.straight.coverage90": (0.9, "more"),
     "default.foreign_tyres.coverage90": (0.85, "more"),
-    "default.abs.coverage90": (0.80, "more"), "default.spin.coverage90": (0.80, "more"),
-    "real_world.standing_5pct.v_max": (0.2, "less"), "real_world.width": (0.5, "less"),
-    "real_world.false_ice": (0.002, "less"), "real_world.false_ice.of_all": (0.002, "less"),
+    "default.abs.coverage90": (0.80, "more"),
+    "default.spin.coverage90": (0.80, "more"),
+    "real_world.standing_5pct.v_max": (0.2, "less"),
+    "real_world.width": (0.5, "less"),
+    "real_world.false_ice": (0.002, "less"),
+    "real_world.false_ice.of_all": (0.002, "less"),
     "real_world.below": (0.002, "less"),
     "real_world.coverage90": (0.88, "more"),
-    **{f"real_world.coverage90.{name}": (0.80, "more") for name in ("ice", "snow", "wet", "dry", "excited")},
-    **{f"real_world.contradiction_share.{name}.excited": (0.2, "less") for name in ("ice", "snow", "wet", "dry")},
-    "fuzzy.worth": (0.97, "less"), "ants.worth": (1.0, "less"),
-}  # fmt: skip
+    **{
+        f"real_world.coverage90.{name}": (0.80, "more")
+        for name in ("ice", "snow", "wet", "dry", "excited")
+    },
+    **{
+        f"real_world.contradiction_share.{name}.excited": (0.2, "less")
+        for name in ("ice", "snow", "wet", "dry")
+    },
+    "fuzzy.worth": (0.97, "less"),
+    "ants.worth": (1.0, "less"),
+}
 
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
     """Estimates that tell the same friction all the time, and the true motion."""
-    output, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
+    output = np.zeros((*like.t.shape, ONE_FRICTION))
+    truth = like.truth
     output[..., Column.VX], output[..., Column.VY], output[..., Column.YAW_RATE] = (
         truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
     )
@@ -147,7 +171,8 @@ def test_the_noise_of_paper_004_is_on_three_signals_and_follows_its_schedule() -
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_foreign_tyres_make_another_drive(kind: str) -> None:
     usual = DriveSpec("j-turn", SEDAN, 0.4, duration_s=2.0)
-    own, other = ideal(usual), ideal(foreign(usual, kind))
+    own = ideal(usual)
+    other = ideal(foreign(usual, kind))
     assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
 
 

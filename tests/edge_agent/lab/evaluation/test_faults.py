@@ -14,11 +14,17 @@ from schemas.signals import Health, S
 
 # what the issue asks for -> the row that shows it
 ASKED = {
-    "dropout": "inertial-dropout", "stuck": "wheel-speed-stuck", "spike": "spikes-beyond-belief",
-    "bias step": "bias-step", "wrong steering zero": "wrong-steering-zero",
-    "one wheel speed lost": "one-wheel-speed-lost", "no torque at all": "no-torque-at-all",
-    "GNSS gone": "position-gone", "time gap": "time-gap", "out-of-order sample": "sample-out-of-order",
-}  # fmt: skip
+    "dropout": "inertial-dropout",
+    "stuck": "wheel-speed-stuck",
+    "spike": "spikes-beyond-belief",
+    "bias step": "bias-step",
+    "wrong steering zero": "wrong-steering-zero",
+    "one wheel speed lost": "one-wheel-speed-lost",
+    "no torque at all": "no-torque-at-all",
+    "GNSS gone": "position-gone",
+    "time gap": "time-gap",
+    "out-of-order sample": "sample-out-of-order",
+}
 HONEST = 0.75  # of the samples of six drives; one drive that is wrong to its end is a sixth
 
 

@@ -82,7 +82,8 @@ def test_ice_is_false_on_a_road_that_grips_alone_and_contradiction_counts() -> N
 
 @pytest.mark.timeout(600)  # kernels may have to be compiled
 def test_logs_of_a_folder_are_judged_and_reported(tmp_path: Path) -> None:
-    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs = tmp_path / "logs"
+    out = tmp_path / "out"
     logs.mkdir()
     files = ["--out", str(logs / "a.parquet"), "--vehicle-out", str(logs / "a.json")]
     assert main(["simulate", "slalom", "--duration", "8", *files]) == 0

@@ -60,7 +60,8 @@ def test_the_prior_is_always_right_and_never_tells_anything(
 def test_contradiction_is_counted_by_surface_and_by_whether_grip_is_used(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
-    reported, excited = saying(driven[0], *PRIOR), real_world.lately(driven[1]) >= 0.6
+    reported = saying(driven[0], *PRIOR)
+    excited = real_world.lately(driven[1]) >= 0.6
     assert figures(driven, reported)["contradiction_share"] == 0.0
     reported.values[..., Column.HEALTH] = np.where(
         excited & (driven[0].mu > 0.75), Health.CONTRADICTION, Health.OK
@@ -144,7 +145,8 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
     """The file's radius is most of what he misses of the speed; friction he finds to a few hundredths."""
     seeds = range(FIGURES, FIGURES + 4)
-    speeds, (frictions, expected) = oracle.speed(seeds), oracle.friction(seeds)
+    speeds = oracle.speed(seeds)
+    (frictions, expected) = oracle.friction(seeds)
     batch = realistic(PAPERS["002.sine"], seeds)
     true = PAPERS["002.sine"].vehicle.vehicle.wheel_radius
     by_wheels = [

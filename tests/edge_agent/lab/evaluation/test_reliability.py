@@ -103,7 +103,8 @@ def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_
 ) -> None:
     reported = fake(0.35, 0.3, 0.4, turning)
     rng = np.random.default_rng(2)
-    right, wrong = Estimates(reported.values.copy()), Estimates(reported.values.copy())
+    right = Estimates(reported.values.copy())
+    wrong = Estimates(reported.values.copy())
     for one in (right, wrong):
         one.vx[:] += rng.normal(size=reported.vx.shape)
         one.vy[:] += rng.normal(size=reported.vy.shape)
@@ -116,5 +117,6 @@ def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_
 
 
 def test_bounds_close_in_on_one_with_more_drives() -> None:
-    few, many = bounds("nees", 5), bounds("nees", 500)
+    few = bounds("nees", 5)
+    many = bounds("nees", 500)
     assert few[0] < many[0] < 1.0 < many[1] < few[1]

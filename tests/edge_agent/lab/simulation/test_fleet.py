@@ -24,7 +24,8 @@ def drive() -> tuple[SimulatedFleet, FloatArray, FloatArray, Truth]:
 
 
 def test_a_vehicle_drives_the_same_alone_and_among_thirty() -> None:
-    alone, many = SimulatedFleet("demo", 1, 5, 100.0), SimulatedFleet("demo", 30, 5, 100.0)
+    alone = SimulatedFleet("demo", 1, 5, 100.0)
+    many = SimulatedFleet("demo", 30, 5, 100.0)
     _, one = alone.step(2000)
     _, all_of_them = many.step(2000)
     np.testing.assert_array_equal(one[:, 0], all_of_them[:, 0])
@@ -32,7 +33,8 @@ def test_a_vehicle_drives_the_same_alone_and_among_thirty() -> None:
 
 
 def test_blocks_of_any_length_give_the_same_samples() -> None:
-    whole, parts = SimulatedFleet("test", 4, 5, 100.0), SimulatedFleet("test", 4, 5, 100.0)
+    whole = SimulatedFleet("test", 4, 5, 100.0)
+    parts = SimulatedFleet("test", 4, 5, 100.0)
     t, signals = whole.step(500)
     pieces = [parts.step(n) for n in (1, 7, 92, 300, 100)]
     np.testing.assert_array_equal(np.concatenate([p[0] for p in pieces]), t)
@@ -104,7 +106,8 @@ def test_tyres_are_excited_and_most_of_all_where_it_is_slippery(
     drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
 ) -> None:
     _, _, _, truth = drive
-    used, mu = truth.utilisation.max(axis=2), truth.mu_wheel.mean(axis=2)
+    used = truth.utilisation.max(axis=2)
+    mu = truth.mu_wheel.mean(axis=2)
     assert truth.utilisation.max() <= 1 + 1e-9
     share = [
         float((used[(mu > low) & (mu < high)] > 0.6).mean())

@@ -63,7 +63,8 @@ def test_a_double_lane_change_ends_in_the_lane_where_it_began() -> None:
 
 def test_friction_may_jump_along_the_road_and_differ_from_side_to_side() -> None:
     log, _ = simulate_manoeuvre("braking", mu=jump(0.8, 0.3, at=40.0))
-    x, mu = column(log, "true_x"), wheels(log, "true_mu")
+    x = column(log, "true_x")
+    mu = wheels(log, "true_mu")
     assert (mu[x < 35] == 0.8).all()
     assert (mu[x > 45] == 0.3).all()
     log, _ = simulate_manoeuvre("braking", mu=split(0.8, 0.3), duration_s=2.0)

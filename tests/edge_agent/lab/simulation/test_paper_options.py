@@ -55,7 +55,8 @@ def test_friction_jumps_in_time_under_all_wheels_at_once() -> None:
 
 
 def test_motors_give_the_torque_that_is_asked_within_some_milliseconds() -> None:
-    motors, currents = Pmsm(), at_rest()
+    motors = Pmsm()
+    currents = at_rest()
     early = turn_motor(currents[0], motors, 100.0, 30.0, 5e-4)
     late = turn_motor(currents[0], motors, 100.0, 30.0, 0.05)
     assert 0.0 < early < 60.0
@@ -63,7 +64,8 @@ def test_motors_give_the_torque_that_is_asked_within_some_milliseconds() -> None
 
 
 def test_motors_lose_torque_where_the_voltage_ends() -> None:
-    motors, currents = Pmsm(voltage=100.0), at_rest()
+    motors = Pmsm(voltage=100.0)
+    currents = at_rest()
     assert turn_motor(currents[0], motors, 100.0, 100.0, 0.1) < 10.0
 
 

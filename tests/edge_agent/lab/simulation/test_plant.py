@@ -31,7 +31,9 @@ def some_instant(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and filled wheels of a vehicle in the middle of something rough."""
     p = PRESETS["sedan"].row()
-    x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
+    x = np.zeros(STATES)
+    u = np.zeros((len(Control), 4))
+    w = np.zeros((len(Wheel), 4))
     x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = (
         rng.uniform(3, 30),
         rng.normal(0, 1),
@@ -50,7 +52,9 @@ def rolling(
     speed: float, mu: float, vehicle: TrueVehicle | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State, parameters and inputs of a vehicle rolling straight on."""
-    p, x, u = (vehicle or PRESETS["sedan"]).row(), np.zeros(STATES), np.zeros((len(Control), 4))
+    p = (vehicle or PRESETS["sedan"]).row()
+    x = np.zeros(STATES)
+    u = np.zeros((len(Control), 4))
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     u[Control.MU] = mu
     return x, p, u
@@ -143,7 +147,9 @@ def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float)
     circles = []
     for rear in (0.0, share):
         p = replace(PRESETS["sedan"], rear_steer=rear).row()
-        x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
+        x = np.zeros(STATES)
+        u = np.zeros((len(Control), 4))
+        w = np.zeros((len(Wheel), 4))
         start_at(x, p, (0.0, 0.0, 0.0), 2.0)
         u[Control.MU] = 0.9
         command(p, u, 0.1, 0.0)

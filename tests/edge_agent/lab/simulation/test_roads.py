@@ -39,7 +39,8 @@ def test_every_lane_joins_the_next_without_a_gap_or_a_kink(scenario: Scenario) -
     network = scenario.network
     for k in range(len(network.size)):
         for way in onward(network, k):
-            end, start = network.lane(k)[-1], network.lane(way)[0]
+            end = network.lane(k)[-1]
+            start = network.lane(way)[0]
             assert np.hypot(*(end[:2] - start[:2])) < 0.01
             assert (
                 end[LanePoint.COS] * start[LanePoint.COS]
@@ -65,7 +66,8 @@ def test_from_every_lane_one_comes_back_to_it(scenario: Scenario) -> None:
 def test_one_keeps_to_the_right_four_metres_from_the_other_lane(scenario: Scenario) -> None:
     network = scenario.network
     for k in range(0, network.roads, 2):
-        there, back = network.lane(k), network.lane(k + 1)
+        there = network.lane(k)
+        back = network.lane(k + 1)
         for point in there[10:-10]:
             offset = back[:, :2] - point[:2]
             nearest = offset[np.hypot(*offset.T).argmin()]
@@ -79,7 +81,8 @@ def test_the_speed_profile_asks_for_no_more_than_the_budget(scenario: Scenario) 
     network = scenario.network
     for k in range(len(network.size)):
         for number, way in enumerate(onward(network, k)):
-            lane, profile = network.lane(k), network.lane(k)[:, LanePoint.PROFILE + number]
+            lane = network.lane(k)
+            profile = network.lane(k)[:, LanePoint.PROFILE + number]
             assert (profile * np.abs(lane[:, LanePoint.CURVATURE]) <= 1 + 1e-9).all()
             assert (profile[:-1] - profile[1:] <= 2 * BRAKING * network.spacing[k] + 1e-9).all()
             assert profile[-1] <= network.lane(way)[0, LanePoint.PROFILE :].min() + 1e-9
@@ -100,7 +103,8 @@ def test_roads_that_lead_nowhere_are_refused() -> None:
 def test_ice_appears_at_its_time_and_not_before(scenario: Scenario) -> None:
     assert scenario.events
     for event in scenario.events:
-        x, y = np.array([event.x]), np.array([event.y])
+        x = np.array([event.x])
+        y = np.array([event.y])
         before = scenario.friction(event.start - 0.01, x, y)
         after = scenario.friction(event.start, x, y)
         assert before[0] > 0.5
@@ -113,9 +117,16 @@ def test_the_event_of_the_demonstration_is_at_seventy_seconds() -> None:
 
 def test_later_patches_lie_on_top_and_turn_with_their_angle() -> None:
     scenario = Scenario(
-        "here", "", {}, (), 0.9,
-        (Patch("snow", 0.0, 0.0, 100.0, 100.0, 0.35), Patch("ice", 0.0, 0.0, 40.0, 4.0, 0.15, angle=np.pi / 4)),
-    )  # fmt: skip
+        "here",
+        "",
+        {},
+        (),
+        0.9,
+        (
+            Patch("snow", 0.0, 0.0, 100.0, 100.0, 0.35),
+            Patch("ice", 0.0, 0.0, 40.0, 4.0, 0.15, angle=np.pi / 4),
+        ),
+    )
     points = np.array([[10.0, 10.0], [10.0, -10.0], [60.0, 0.0]])
     assert scenario.friction(0.0, points[:, 0], points[:, 1]).tolist() == [0.15, 0.35, 0.9]
 

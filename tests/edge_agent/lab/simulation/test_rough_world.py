@@ -54,8 +54,10 @@ def still(
     slope: float, bank: float = 0.0, mu: float = 0.85
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and wheels of a standing sedan."""
-    p, x = PRESETS["sedan"].row(), np.zeros(STATES)
-    u, w = np.zeros((INPUTS, 4)), np.zeros((len(Wheel), 4))
+    p = PRESETS["sedan"].row()
+    x = np.zeros(STATES)
+    u = np.zeros((INPUTS, 4))
+    w = np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 0.0)
     u[Control.MU], u[Control.TILT, 0], u[Control.TILT, 1] = mu, slope, bank
     return x, p, u, w
@@ -100,7 +102,9 @@ def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
 @pytest.mark.parametrize("slope", [-0.06, 0.03])
 def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> None:
     p = replace(PRESETS["sedan"], drag=0.0, rolling=0.0).row()
-    x, u, w = np.zeros(STATES), np.zeros((INPUTS, 4)), np.zeros((len(Wheel), 4))
+    x = np.zeros(STATES)
+    u = np.zeros((INPUTS, 4))
+    w = np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 15.0)
     u[Control.MU], u[Control.TILT, 0] = 0.9, slope
     command(p, u, 0.0, 0.0)
@@ -186,7 +190,8 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name != "level")
         east, north = slopes[7].tolist()
-        there, back = tilt(east, north, 0.3), tilt(east, north, 0.3 + np.pi)
+        there = tilt(east, north, 0.3)
+        back = tilt(east, north, 0.3 + np.pi)
         np.testing.assert_allclose(
             there, np.negative(back), atol=1e-15
         )  # up one way is down the other
@@ -199,7 +204,8 @@ def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
         climbed = 0.0
         for start, end in (((0.0, 0.0), corner), (corner, (180.0, 120.0))):
             line = np.linspace(start, end, 4001)
-            middle, step = 0.5 * (line[1:] + line[:-1]), (np.array(end) - start) / 4000
+            middle = 0.5 * (line[1:] + line[:-1])
+            step = (np.array(end) - start) / 4000
             climbed += sum(
                 float(np.dot(gradient(table, (x, y), (1.0, 0.0), 0.0), step)) for x, y in middle
             )
@@ -211,7 +217,8 @@ def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
 def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
     table = Relief(crossfall=0.025, banking=0.5).table
     for heading in np.linspace(0, 6, 9).tolist():
-        lane, falls = (float(np.cos(heading)), float(np.sin(heading))), []
+        lane = (float(np.cos(heading)), float(np.sin(heading)))
+        falls = []
         for curvature in (0.0, 0.02, -0.02):
             east, north = gradient(table, (0.0, 0.0), lane, cross_slope(table, curvature))
             falls.append(tilt(east, north, heading))
@@ -221,7 +228,8 @@ def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
 
 def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy() -> None:
     scenario = SCENARIOS["hills"]
-    points, table = scenario.network.points, scenario.relief.table
+    points = scenario.network.points
+    table = scenario.relief.table
     along = []
     for row in points:
         east, north = gradient(
@@ -268,7 +276,8 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
         wanted["ax"] = exact["ax"] + row[Misaligned.AX] + row[Misaligned.TURN] * exact["ay"]
         wanted["ay"] = exact["ay"] + row[Misaligned.AY] - row[Misaligned.TURN] * exact["ax"]
     for i, wheel in enumerate(("fl", "fr", "rl", "rr")):
-        angle, speed = exact[f"delta_{wheel}"], exact[f"omega_{wheel}"]
+        angle = exact[f"delta_{wheel}"]
+        speed = exact[f"omega_{wheel}"]
         if name == "steering" and i < 2:
             bend = 1.0 + row[Misaligned.GAIN] + row[Misaligned.BEND] * np.abs(angle) / WIDE
             wanted[f"delta_{wheel}"] = row[Misaligned.ZERO] + bend * angle
@@ -320,9 +329,11 @@ def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None
 
 
 def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> None:
-    plain, mixed = SimulatedFleet("demo", 6, 5, 50.0), SimulatedFleet("demo", 6, 5, 50.0, rough=0.5)
+    plain = SimulatedFleet("demo", 6, 5, 50.0)
+    mixed = SimulatedFleet("demo", 6, 5, 50.0, rough=0.5)
     assert mixed.rough.tolist() == [False, True, False, True, False, True]
-    (_, usual), (_, reported) = plain.step(2000), mixed.step(2000)
+    (_, usual) = plain.step(2000)
+    (_, reported) = mixed.step(2000)
     np.testing.assert_array_equal(usual[:, ::2], reported[:, ::2])
     assert not np.array_equal(usual[:, 1], reported[:, 1], equal_nan=True)
     assert (mixed.truth.vx[:, 1::2] == 0.0).any()  # their drivers stop now and then
@@ -340,7 +351,8 @@ def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number()
 def test_the_road_under_a_car_is_smooth() -> None:
     fleet = SimulatedFleet("hills", 6, 5, 100.0, rough=0.5)
     fleet.step(3000)
-    slope, speed = fleet.truth.slope, np.abs(fleet.truth.vx)
+    slope = fleet.truth.slope
+    speed = np.abs(fleet.truth.vx)
     driven = np.maximum(speed[1:], 1.0) / 100.0
     assert np.ptp(slope) > 0.06
     assert (
@@ -356,7 +368,8 @@ def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
 
 
 def test_a_town_by_number_is_the_drawn_one_and_another_number_another_town() -> None:
-    one, other = scenario_named("hills-20000"), scenario_named("hills-20001")
+    one = scenario_named("hills-20000")
+    other = scenario_named("hills-20001")
     assert one == scenario_named("hills-20000")
     assert one.background != other.background
     assert one.relief != other.relief

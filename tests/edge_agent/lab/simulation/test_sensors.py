@@ -25,7 +25,8 @@ def error(log: pa.Table, name: str) -> FloatArray:
 
 
 def test_hashed_numbers_are_normal_and_uniform_and_streams_are_unrelated() -> None:
-    key, other = key_of(1, 2), key_of(2, 1)
+    key = key_of(1, 2)
+    other = key_of(2, 1)
     a = np.array([normal(key, k) for k in range(40_000)])
     b = np.array([normal(other, k) for k in range(40_000)])
     u = np.array([uniform(key, k) for k in range(40_000)])
@@ -79,7 +80,8 @@ def test_position_comes_ten_times_a_second_and_wanders_by_metres() -> None:
 
 
 def test_metres_go_to_degrees_and_back() -> None:
-    x, y = np.array([0.0, 200.0, -3e3]), np.array([0.0, -150.0, 4e3])
+    x = np.array([0.0, 200.0, -3e3])
+    y = np.array([0.0, -150.0, 4e3])
     np.testing.assert_allclose(
         GOTHENBURG.from_latlon(*GOTHENBURG.to_latlon(x, y)), (x, y), atol=1e-6
     )

@@ -17,7 +17,11 @@ from edge_agent.lab.tuning.search import Graph, Iteration, Objective, Problem, R
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-VERTICES, POSITIONS, ANTS, ITERATIONS, TRIALS = 8, 6, 12, 14, 24
+VERTICES = 8
+POSITIONS = 6
+ANTS = 12
+ITERATIONS = 14
+TRIALS = 24
 CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 

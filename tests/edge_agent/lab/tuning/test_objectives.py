@@ -84,11 +84,9 @@ def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
 
 
 def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
-    lower, upper, truth = (
-        np.array([0.2, 0.2, 0.2]),
-        np.array([0.6, 0.6, 0.6]),
-        np.array([0.4, 0.1, 0.7]),
-    )
+    lower = np.array([0.2, 0.2, 0.2])
+    upper = np.array([0.6, 0.6, 0.6])
+    truth = np.array([0.4, 0.1, 0.7])
     np.testing.assert_allclose(interval_score(lower, upper, truth), [0.4, 2.4, 2.4])
 
 
@@ -189,7 +187,8 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
     for way in WAYS:
         assert f"\n{way} " in reported
     tuned = load(out)
-    scores, provenance = tuned.document.scores, tuned.document.provenance
+    scores = tuned.document.scores
+    provenance = tuned.document.provenance
     for way in ("random", "colony"):
         gain = OBJECTIVES[objective](TuningScores(**scores[way].train.model_dump()))
         assert gain >= OBJECTIVES[objective](TuningScores(**scores["default"].train.model_dump()))
@@ -241,7 +240,8 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
     """Without a truth: what is measured next judges, on the last third of the recordings."""
-    logs, found = [], []
+    logs = []
+    found = []
     for name, seed in (("one", "1"), ("two", "2")):
         logs.append(str(tmp_path / f"{name}.parquet"))
         words = [

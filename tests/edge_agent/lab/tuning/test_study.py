@@ -46,7 +46,8 @@ def test_drives_that_judge_share_neither_seed_nor_manoeuvre_with_those_that_are_
 
 
 def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: StudySet) -> None:
-    right, schedule = drives.signals["right"], drives.signals["schedule"]
+    right = drives.signals["right"]
+    schedule = drives.signals["schedule"]
     differs = (right != schedule) & ~(np.isnan(right) & np.isnan(schedule))
     assert set(np.flatnonzero(differs.any(axis=(0, 1)))) == {S.AX, S.AY, S.YAW_RATE}
     error = schedule[:, :, S.YAW_RATE] - drives.truth[:, :, 2]

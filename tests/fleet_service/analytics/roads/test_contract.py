@@ -70,7 +70,10 @@ def test_before_the_first_and_after_the_last_measurement_it_is_unknown() -> None
 
 
 def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
-    rng, truth, std, hits = np.random.default_rng(11), 0.5, 0.08, []
+    rng = np.random.default_rng(11)
+    truth = 0.5
+    std = 0.08
+    hits = []
     for n in (1, 2, 3, 8):
         keys = np.repeat(np.arange(2000), n)
         y = truth + rng.normal(0.0, std, len(keys))

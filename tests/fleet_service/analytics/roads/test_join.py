@@ -19,7 +19,8 @@ from schemas.errors import InputError
 from schemas.thresholds import METRES_PER_DEGREE
 from tests.fleet_service.analytics.roads.test_network import extract
 
-LATITUDE, LONGITUDE = 57.7, 11.97
+LATITUDE = 57.7
+LONGITUDE = 11.97
 EAST = METRES_PER_DEGREE * np.cos(np.radians(LATITUDE))
 
 
@@ -125,11 +126,13 @@ def test_the_command_writes_what_the_question_reads(
 
 
 def test_id_and_name_of_lines_are_those_of_the_columns_that_are_given(tmp_path: Path) -> None:
-    (south, west), (north, east) = place(0, 0), place(200, 0)
+    (south, west) = place(0, 0)
+    (north, east) = place(200, 0)
     line = {"type": "LineString", "coordinates": [[west, south], [east, north]]}
     columns = {"id": "1", "name": "First", "nr": "E6", "street": "Avenue"}
     feature = {"type": "Feature", "properties": columns, "geometry": line}
-    lines, out = tmp_path / "lines.geojson", tmp_path / "roads.parquet"
+    lines = tmp_path / "lines.geojson"
+    out = tmp_path / "roads.parquet"
     lines.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
     for more, link, name in (
         ([], "1", "First"),

@@ -42,9 +42,12 @@ def test_an_extract_gives_each_direction_that_cars_may_drive(tmp_path: Path) -> 
     network = read_network(extract(tmp_path / "town.osm"))
     found = [(link.id, link.direction, link.kind) for link in network.links]
     assert found == [
-        ("1", "forward", "residential"), ("1", "backward", "residential"), ("2", "forward", "primary"),
-        ("3", "backward", "service"), ("4", "forward", "tertiary"),
-    ]  # fmt: skip
+        ("1", "forward", "residential"),
+        ("1", "backward", "residential"),
+        ("2", "forward", "primary"),
+        ("3", "backward", "service"),
+        ("4", "forward", "tertiary"),
+    ]
     there, back = network.links[:2]
     assert there.name == "First"
     assert np.array_equal(there.longitude, back.longitude[::-1])
@@ -62,8 +65,9 @@ def test_lines_with_ids_come_from_any_file_in_any_coordinates(tmp_path: Path, en
     ]
     frame = geopandas.GeoDataFrame(
         {"road": ["a", "b", "c"], "called": ["E6", None, None], "oneway": ["no", "forward", "no"]},
-        geometry=lines, crs=4326,
-    )  # fmt: skip
+        geometry=lines,
+        crs=4326,
+    )
     frame = frame if ending == ".geojson" else frame.to_crs(3006)
     path = tmp_path / f"roads{ending}"
     frame.to_parquet(path) if ending == ".parquet" else frame.to_file(path)

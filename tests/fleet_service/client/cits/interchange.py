@@ -28,7 +28,9 @@ class _Handler(MessagingHandler):
         self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector
     ) -> None:
         super().__init__(prefetch=500)
-        self._there, self._offered, self._injector = there, deque(offered), injector
+        self._there = there
+        self._offered = deque(offered)
+        self._injector = injector
         self.listening = threading.Event()
 
     def on_start(self, event: Any) -> None:  # noqa: ANN401
@@ -57,7 +59,8 @@ def free_url() -> str:
 @contextmanager
 def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[Interchange]:
     """Listen at an address."""
-    there, injector = Interchange(url), EventInjector()
+    there = Interchange(url)
+    injector = EventInjector()
     handler = _Handler(there, offered, injector)
     thread = threading.Thread(target=Container(handler).run, daemon=True)
     thread.start()

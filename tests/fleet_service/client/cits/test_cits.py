@@ -46,18 +46,26 @@ def random_denm(draw: np.random.Generator) -> Denm:
     termination = endings[int(draw.integers(0, 4))]
     heading = float(draw.uniform(0, 360)) if termination is None and draw.random() < 0.5 else None
     return Denm(
-        station=int(draw.integers(1, 1 << 32)), sequence=int(draw.integers(0, 1 << 16)),
-        sender=int(draw.integers(1, 1 << 32)), detected=START, referenced=START + int(draw.integers(0, 1 << 40)),
-        termination=termination, position=position,
-        position_std=float(draw.uniform(0, 60)), validity_s=int(draw.integers(0, 86_401)),
-        quality=int(draw.integers(0, 8)), sub_cause=int(draw.integers(0, 11)),
+        station=int(draw.integers(1, 1 << 32)),
+        sequence=int(draw.integers(0, 1 << 16)),
+        sender=int(draw.integers(1, 1 << 32)),
+        detected=START,
+        referenced=START + int(draw.integers(0, 1 << 40)),
+        termination=termination,
+        position=position,
+        position_std=float(draw.uniform(0, 60)),
+        validity_s=int(draw.integers(0, 86_401)),
+        quality=int(draw.integers(0, 8)),
+        sub_cause=int(draw.integers(0, 11)),
         history=tuple(near[: int(draw.integers(0, 30))]),
-        traces=(approach(position, heading or 0.0), *(((),) if draw.random() < 0.5 else ())), heading=heading,
-    )  # fmt: skip
+        traces=(approach(position, heading or 0.0), *(((),) if draw.random() < 0.5 else ())),
+        heading=heading,
+    )
 
 
 def test_second_decoder_reads_and_writes_the_same_bytes() -> None:
-    draw, oracle = np.random.default_rng(42), DENM_PDU_Descriptions.DENM
+    draw = np.random.default_rng(42)
+    oracle = DENM_PDU_Descriptions.DENM
     for _ in range(100):
         sent = random_denm(draw)
         data = encode(sent)
@@ -98,17 +106,34 @@ def stretch(
 ) -> StretchAlert:
     points = tuple((place[0] + 1e-4 * k, place[1]) for k in range(cells))
     return StretchAlert(
-        name, "raised", START, START, 20.0, "north-south", ("north",), *place, (0, 0, 0, 0), cells, mu, 0.1, 0.3, 0.95,
-        3, "", points,
-    )  # fmt: skip
+        name,
+        "raised",
+        START,
+        START,
+        20.0,
+        "north-south",
+        ("north",),
+        *place,
+        (0, 0, 0, 0),
+        cells,
+        mu,
+        0.1,
+        0.3,
+        0.95,
+        3,
+        "",
+        points,
+    )
 
 
 class Run:
     """An output with a clock of its own; `sent` are its messages, `settles` whether the interchange accepts them."""
 
     def __init__(self, path: Path, settles: bool = True) -> None:
-        self.now, self.sent = START, list[Parcel]()
-        self.path, self.settles = path, settles
+        self.now = START
+        self.sent = list[Parcel]()
+        self.path = path
+        self.settles = settles
         self.start()
 
     def start(self) -> None:
@@ -186,7 +211,9 @@ def test_a_quadtree_selector_finds_all_events_of_a_square_and_no_other() -> None
 
 
 def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_path: Path) -> None:
-    url, settled, came = free_url(), list[str](), list[bytes]()
+    url = free_url()
+    settled = list[str]()
+    came = list[bytes]()
     foreign = encode(replace(random_denm(np.random.default_rng(3)), termination=None))
 
     def keep(body: bytes, _: Mapping[str, Any]) -> None:
@@ -234,8 +261,10 @@ def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
     said = json.loads(reports(denm, "cits-se", 5, 1, START)[0][1])
     assert said["mu"] == [0.2]
     for other in (
-        replace(denm, termination="isCancellation"), replace(denm, cause=1), replace(denm, sub_cause=SALTED),
+        replace(denm, termination="isCancellation"),
+        replace(denm, cause=1),
+        replace(denm, sub_cause=SALTED),
         replace(denm, position_std=40.9),
-    ):  # fmt: skip
+    ):
         assert reports(other, "cits-se", 5, 1, START) == []
     assert reports(denm, "cits-se", 5, 1, START + 601 * NS) == []
