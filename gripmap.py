@@ -4,8 +4,9 @@
     log, vehicle = gripmap.simulate_manoeuvre("slalom", mu=0.5)
     bank = gripmap.make_bank("fckf", [vehicle])
 
-The distribution brings four top-level packages with plain names. Another package of such a name, a folder `schemas` of
-one's own for instance, may come first on the path and hide one of them: importing this module tells which and where.
+The distribution brings four top-level packages with plain names. Another package of such a name, a
+folder `schemas` of one's own for instance, may come first on the path and hide one of them:
+importing this module tells which and where.
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ def _check_packages() -> None:
         found = Path(spec.origin).resolve() if spec is not None and spec.origin else None
         if found != here / name / "__init__.py":
             raise ImportError(
-                f"{name}: {found or 'nothing'} stands where GripMap's own package {here / name} should be found; "
-                "rename it, start from another folder, or keep the two in environments of their own",
+                f"{name}: {found or 'nothing'} stands where GripMap's own package {here / name} "
+                "should be found; "
+                "rename it, start from another folder, or keep the two in environments of their "
+                "own",
                 name=name,
             )
 

@@ -1,10 +1,12 @@
-"""Observations of simulated vehicles with the real estimator, without a network, for the fusion's evaluation.
+"""Observations of simulated vehicles with the real estimator, without a network, for the fusion's
+evaluation.
 
-    python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000] [--scenario demo]
+    python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000]
+    [--scenario demo]
         [--rough 0] [--winter 0]
 
-Simulated vehicles with the default estimator drive a scenario. DIR/observations.parquet gets the observations that they
-would send, DIR/truth.parquet the friction under them.
+Simulated vehicles with the default estimator drive a scenario. DIR/observations.parquet gets the
+observations that they would send, DIR/truth.parquet the friction under them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""Town with listening cars, without a network: simulated cars, the fusion and its alerts, cars that receive the map.
+"""Town with listening cars, without a network: simulated cars, the fusion and its alerts, cars that
+receive the map.
 
-    python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario hills-SEED]
+    python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario
+    hills-SEED]
 
-Every second the cars' observations are fused, as in a service. Alerts and, now and then, tiles are passed to the
-listening cars as bytes. Each seed is driven twice from the same start, once with all cars listening and once with none.
-DIR/figures.json gets the figures.
+Every second the cars' observations are fused, as in a service. Alerts and, now and then, tiles are
+passed to the listening cars as bytes. Each seed is driven twice from the same start, once with all
+cars listening and once with none. DIR/figures.json gets the figures.
 """
 
 from __future__ import annotations
@@ -108,7 +110,9 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Return whether the map's interval holds the last truth, for each place that several vehicles visited."""
+        """Return whether the map's interval holds the last truth, for each place that several
+        vehicles visited.
+        """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
         several = slots >= 0
@@ -247,7 +251,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 args.scenario.replace("SEED", str(seed)), args.vehicles, seed, listening=listening
             ).run(args.duration)
             out.append(drive)
-            passes = f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after {drive.alert_passes:.0f}"
+            passes = (
+                f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after "
+                f"{drive.alert_passes:.0f}"
+            )
             more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
             print(
                 f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}",

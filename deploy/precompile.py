@@ -1,7 +1,8 @@
 """`python -m deploy.precompile [papers]`: compile frequently used kernels once on this machine.
 
-`make setup` ends with the kernels of service, agent and simulated vehicle, so that their first start does not wait. The
-tests need the papers' filters too. A kernel that cannot be compiled here is compiled at its first use.
+`make setup` ends with the kernels of service, agent and simulated vehicle, so that their first
+start does not wait. The tests need the papers' filters too. A kernel that cannot be compiled here
+is compiled at its first use.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`gripmap router [--config FILE] [--listen ENDPOINT]`: a Zenoh router in a process of its own.
 
-The Python package of Zenoh contains the router, so no other binary is needed. It prints `router: tcp/…` when it listens
-(with the real port if port 0 was given) and ends on SIGINT or SIGTERM.
+The Python package of Zenoh contains the router, so no other binary is needed. It prints `router:
+tcp/…` when it listens (with the real port if port 0 was given) and ends on SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run a router until a signal ends it."""
-    # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's main thread.
+    # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's
+    # main thread.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         session, endpoints = open_router(args.config, args.listen)
@@ -121,6 +122,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    # Zenoh may hang where one of two connected routers is closed, then or when the interpreter ends; a router has
-    # nothing to save.
+    # Zenoh may hang where one of two connected routers is closed, then or when the interpreter
+    # ends; a router has nothing to save.
     force_exit(main())

@@ -4,7 +4,8 @@
     print(fleet_service.ask_archive("archive", "worst").to_pandas())
     print(fleet_service.ask_map("tcp/127.0.0.1:7447", bbox=(11.9, 57.6, 12.1, 57.8)).to_pandas())
 
-The names of `__all__` are what other programs may rely on; they are loaded when they are first asked for.
+The names of `__all__` are what other programs may rely on; they are loaded when they are first
+asked for.
 """
 
 from __future__ import annotations

@@ -1,1 +1,3 @@
-"""The contract of GripMap: messages, tables on disk, keys and queries, for people and for programs."""
+"""The contract of GripMap: messages, tables on disk, keys and queries, for people and for
+programs.
+"""

@@ -19,7 +19,9 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base of every settings table: unknown names are refused, so that a misspelt one is not silently ignored."""
+    """Base of every settings table: unknown names are refused, so that a misspelt one is not
+    silently ignored.
+    """
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, serialize_by_alias=True
@@ -27,7 +29,9 @@ class Settings(BaseModel):
 
 
 class ZenohSettings(Settings):
-    """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh configuration file)."""
+    """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh
+    configuration file).
+    """
 
     connect: list[str] = Field(
         default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn"
@@ -80,7 +84,8 @@ class AgentConfig(MonitoringSettings):
     )
     resend_s: Positive = Field(
         default=2.0,
-        description="first wait before a batch is sent again; doubles up to 6 s, or to minutes without any answer",
+        description="first wait before a batch is sent again; doubles up to 6 s, or to minutes "
+        "without any answer",
     )
     trip_end_m: float = Field(
         default=0.0,
@@ -112,11 +117,13 @@ class ArchiveSettings(Settings):
     second: str | None = Field(
         default=None,
         alias="copy",
-        description="bucket that holds all of it too, e.g. s3://bucket/folder; what is not there is not acknowledged",
+        description="bucket that holds all of it too, e.g. s3://bucket/folder; what is not there "
+        "is not acknowledged",
     )
     store: dict[str, SecretStr] = Field(
         default_factory=dict,
-        description="how obstore reaches the bucket: endpoint, region, access_key_id, secret_access_key …; what is not "
+        description="how obstore reaches the bucket: endpoint, region, access_key_id, "
+        "secret_access_key …; what is not "
         "here comes from the environment (AWS_…)",
     )
 
@@ -137,7 +144,8 @@ class ServiceConfig(MonitoringSettings):
         default=["*/*/*"],
         min_length=1,
         max_length=8,
-        description="region key expressions of this service's share (quadkey chunks of 4, 3, 3 digits)",
+        description="region key expressions of this service's share (quadkey chunks of 4, 3, 3 "
+        "digits)",
     )
     archive: ArchiveSettings = Field(
         default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
@@ -160,12 +168,14 @@ class ServiceConfig(MonitoringSettings):
     )
     weather: Path | None = Field(
         default=None,
-        description="Parquet file of road weather to read at the start; reports over Zenoh are added",
+        description="Parquet file of road weather to read at the start; reports over Zenoh are "
+        "added",
     )
     public_vehicles: int = Field(
         default=1,
         ge=1,
-        description="minimum number of vehicles of a visible cell; from 2 on, within the last 12 to 24 h (privacy)",
+        description="minimum number of vehicles of a visible cell; from 2 on, within the last 12 "
+        "to 24 h (privacy)",
     )
     clock_ahead_s: Positive = Field(
         default=30.0, description="records further in the future are refused"
@@ -204,16 +214,19 @@ class ServiceConfig(MonitoringSettings):
     queue_batches: int = Field(
         default=20_000,
         ge=1,
-        description="maximum number of waiting batches; further ones stay unacknowledged with their senders",
+        description="maximum number of waiting batches; further ones stay unacknowledged with "
+        "their senders",
     )
     vehicle_kb_s: Positive = Field(
         default=40.0,
-        description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with it",
+        description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with "
+        "it",
     )
     vehicle_burst_kb: Positive = Field(
         default=2000.0,
         ge=64.0,
-        description="[kB] at once, for example after an outage of an hour; the largest batch must fit",
+        description="[kB] at once, for example after an outage of an hour; the largest batch must "
+        "fit",
     )
     fleet: Path | None = Field(
         default=None, description="enrolment file; reports of other vehicles are ignored"
@@ -229,7 +242,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """A time as people write it (ISO 8601, a day or more), in ns since 1970. Without a zone it is UTC, everywhere.
+    """A time as people write it (ISO 8601, a day or more), in ns since 1970. Without a zone it is
+    UTC, everywhere.
 
     Raises:
         InputError: it is none, or lies outside what 64 bits of nanoseconds hold.

@@ -28,7 +28,9 @@ class InputError(ValueError):
 
 
 class UnreachableError(InputError):
-    """A router or service that does not answer: the input may be right, and a later try may succeed."""
+    """A router or service that does not answer: the input may be right, and a later try may
+    succeed.
+    """
 
 
 class WireError(InputError):

@@ -1,7 +1,9 @@
-"""Places on earth: quadint cells, tiles, regions, zones, and heading sectors. All functions are vectorised.
+"""Places on earth: quadint cells, tiles, regions, zones, and heading sectors. All functions are
+vectorised.
 
-A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the even bits), so that its
-base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 - z)`.
+A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the
+even bits), so that its base-4 digits are the quadkey and a parent is a shift: `parent = cell >>
+2·(21 - z)`.
 
     cell     zoom 21   10 m (60° north) to 19 m (equator)   the canonical cell, int64
     tile     zoom 14   one map message
@@ -9,8 +11,8 @@ base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 
     zone     zoom 7    one folder of the archive
     sector   0 east, 1 north, 2 west, 3 south: quarter of the compass the vehicle heads for, so carriageways do not mix
 
-Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°. Source: the slippy-map tile scheme
-(OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
+Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°. Source: the slippy-map
+tile scheme (OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
 """
 
 from __future__ import annotations
@@ -121,11 +123,11 @@ def bounds(
 
 
 def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,), from the south-west
-    on.
+    """Return longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,),
+    from the south-west on.
 
-    With heading sectors (n,): (n, 3) of the quarter of the cell on the side of the heading, from the centre on, so that
-    the sectors of a cell do not overlap.
+    With heading sectors (n,): (n, 3) of the quarter of the cell on the side of the heading, from
+    the centre on, so that the sectors of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
     x = np.stack([west, east, east, west], axis=-1)
@@ -144,14 +146,16 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:
-    """Return True where areas and a box, each given as west, south, east, north [deg], share more than a border."""
+    """Return True where areas and a box, each given as west, south, east, north [deg], share
+    more than a border.
+    """
     west, south, east, north = (np.asarray(side) for side in area)
     return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
 
 
 def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """Return the eight cells around a cell, (…, 8), row by row from the north-west; columns wrap, -1 beyond the
-    poles."""
+    """Return the eight cells around a cell, (…, 8), row by row from the north-west; columns wrap,
+    -1 beyond the poles."""
     n = 1 << zoom
     x, y = deinterleave(cell)
     dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
@@ -178,7 +182,9 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else -1)."""
+    """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else
+    -1).
+    """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)
     left = sector_of(angle + SECTOR_MARGIN)

@@ -1,7 +1,8 @@
-"""Table of topics: key expression → message and quality of service; keys are built and parsed only here.
+"""Table of topics: key expression → message and quality of service; keys are built and parsed only
+here.
 
-A region is cut into chunks of 4, 3 and 3 quadkey digits, a tile into 4, 3, 3 and 4, so that a wildcard is a region of
-any size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
+A region is cut into chunks of 4, 3 and 3 quadkey digits, a tile into 4, 3, 3 and 4, so that a
+wildcard is a region of any size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
 SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `ServiceToken`
-CLAIMS: Final = f"{ROOT}/claims"  # likewise of who has it for itself, from before it answers until it does no more
+# likewise of who has it for itself, from before it answers until it does no more
+CLAIMS: Final = f"{ROOT}/claims"
 WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
 PRIVATE: Final = ("ahead", "vss")  # topics of one vehicle, for itself and its owner
 _ALL: Final = "all"
@@ -127,7 +129,8 @@ def shard_key(service: str) -> str:
 
 
 class ServiceToken(NamedTuple):
-    """Announcement that a service serves a region: a liveliness token that exists as long as the service.
+    """Announcement that a service serves a region: a liveliness token that exists as long as the
+    service.
 
     Attributes:
         region: key expression, chunks of 4, 3 and 3 digits or `*`.
@@ -141,8 +144,8 @@ class ServiceToken(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Return the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may
-        contain."""
+        """Return the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`,
+        which no key may contain."""
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
@@ -175,7 +178,8 @@ def parse(key: str) -> Parsed:
     """Parse a concrete key.
 
     Raises:
-        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or an invalid name.
+        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or an invalid
+            name.
     """
     head, _, rest = key.removeprefix(ROOT + "/").partition("/")
     topic = TOPICS.get(head)

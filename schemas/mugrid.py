@@ -52,12 +52,16 @@ def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
 
 
 def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArray:
-    """Return ℓ (…, 32) as bytes below its maximum; -inf becomes the floor. The caller must refuse NaN."""
+    """Return ℓ (…, 32) as bytes below its maximum; -inf becomes the floor. The caller must
+    refuse NaN.
+    """
     below = np.max(log_likelihood, axis=-1, keepdims=True) - log_likelihood
     steps: ByteArray = np.clip(np.rint(below * STEPS_PER_NAT), 0, FLOOR_STEPS).astype(np.uint8)
     return steps
 
 
 def decode_log_likelihood(steps: ByteArray) -> FloatArray:
-    """Return bytes (…, 32) as ℓ with maximum 0 (if the sender put it there) and floor -255/16 nat."""
+    """Return bytes (…, 32) as ℓ with maximum 0 (if the sender put it there) and floor -255/16
+    nat.
+    """
     return steps.astype(np.float64) / -STEPS_PER_NAT

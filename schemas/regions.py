@@ -42,8 +42,8 @@ def region_of(tile: int) -> str:
 
 
 def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
-    """Expressions of what a question is about and nobody serves; as few as there are. Of a question without a place
-    that is what lies within no service's region at all.
+    """Expressions of what a question is about and nobody serves; as few as there are. Of a question
+    without a place that is what lies within no service's region at all.
 
     Raises:
         InputError: the route is too long.
@@ -93,7 +93,8 @@ class Rank:
 
 
 def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Key (cell · 4 + sector) of everything that a route of (longitude, latitude) passes, in its order, each once.
+    """Key (cell · 4 + sector) of everything that a route of (longitude, latitude) passes, in its
+    order, each once.
 
     Raises:
         InputError: longer than ROUTE_MOST_M.

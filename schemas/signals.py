@@ -1,7 +1,8 @@
 """The signals of a vehicle: names, order in an array, units, and what may be wrong with them.
 
-A block of signals is a float array (T, N, len(CHANNELS)) for T samples of N vehicles; NaN is a missing reading.
-Axes are ISO 8855: x forward, y left, z up; yaw, steering and lateral quantities are positive to the left.
+A block of signals is a float array (T, N, len(CHANNELS)) for T samples of N vehicles; NaN is a
+missing reading. Axes are ISO 8855: x forward, y left, z up; yaw, steering and lateral quantities
+are positive to the left.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ UNITS: Final = {
 CHANNELS: Final = tuple(UNITS)
 
 
-# Context: what a car's controllers and its surroundings say, beside the channels that estimators read. A block of it is
-# a float array (T, N, len(CONTEXT)); NaN is unknown. All of it is optional: most cars have some, some have none.
+# Context: what a car's controllers and its surroundings say, beside the channels that estimators
+# read. A block of it is a float array (T, N, len(CONTEXT)); NaN is unknown. All of it is optional:
+# most cars have some, some have none.
 FLAGS: Final = (
     "abs_active",
     "esc_active",
@@ -48,7 +50,9 @@ CONTEXT: Final = tuple(CONTEXT_UNITS)
 
 
 class C(IntEnum):
-    """Index of a context signal on the last axis of a context block; the flags come first, in the order of FLAGS."""
+    """Index of a context signal on the last axis of a context block; the flags come first, in
+    the order of FLAGS.
+    """
 
     ABS = CONTEXT.index("abs_active")
     ESC = CONTEXT.index("esc_active")
@@ -58,7 +62,9 @@ class C(IntEnum):
 
 
 class S(IntEnum):
-    """Index of a channel on the last axis of a block; of a wheel channel, the index of its first wheel (fl)."""
+    """Index of a channel on the last axis of a block; of a wheel channel, the index of its first
+    wheel (fl).
+    """
 
     AX = CHANNELS.index("ax")
     AY = CHANNELS.index("ay")

@@ -9,7 +9,8 @@ from schemas.thresholds import GRAVITY, REACTION_S
 
 
 def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
-    """Speed [m/s] from which one stops within a sight [m] on a level road, after the reaction, at g·mu; 0 at no grip.
+    """Speed [m/s] from which one stops within a sight [m] on a level road, after the reaction, at
+    g·mu; 0 at no grip.
 
     v·REACTION_S + v²/(2·g·mu) = sight_m, solved for v.
     """

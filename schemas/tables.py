@@ -1,4 +1,6 @@
-"""Every table of the contract: name, type, unit and meaning of each column, and the Arrow schemas made from them."""
+"""Every table of the contract: name, type, unit and meaning of each column, and the Arrow
+schemas made from them.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,11 @@ class Field(NamedTuple):
 
     Attributes:
         name, type, unit, meaning: of the column.
-        step: the service keeps floats as multiples of it, where there is one. It is a power of two far below the
-            value's own uncertainty; finer digits are noise, and a quarter of the bytes.
-        range: least and largest value that a report may carry, where the table is reported; NaN is 'absent'.
+        step: the service keeps floats as multiples of it, where there is one. It is a power of two
+            far below the value's own uncertainty; finer digits are noise, and a quarter of the
+            bytes.
+        range: least and largest value that a report may carry, where the table is reported; NaN is
+            'absent'.
     """
 
     name: str
@@ -97,7 +101,8 @@ OBSERVATION: Final = (
         "log_likelihood",
         LIKELIHOOD,
         "1/16 nat below the maximum",
-        "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has none",
+        "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has "
+        "none",
     ),
     Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
     Field(
@@ -207,7 +212,8 @@ BOOKKEEPING: Final = (
     ),
 )
 
-# Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised` is known.
+# Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised`
+# is known.
 VALUE: Final = Field(
     "value",
     pa.bool_(),
@@ -271,7 +277,8 @@ MAP_CELL: Final = (
     ),
 )
 
-# Parts of an hour's statistics of one cell and sector; those of the same hour are merged as each column says.
+# Parts of an hour's statistics of one cell and sector; those of the same hour are merged as each
+# column says.
 CELL_HOUR: Final = (
     Field("cell", I64, "quadint z21", "the cell"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),

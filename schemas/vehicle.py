@@ -14,8 +14,8 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle_classes import PREFIX, fields_of_class
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
-# Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et al., SAE 1999-01-1336).
-# A mass in tonnes makes it thirty times that.
+# Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et
+# al., SAE 1999-01-1336). A mass in tonnes makes it thirty times that.
 LEAST_GYRATION: Final = 0.1
 MOST_GYRATION: Final = 2.0
 
@@ -26,7 +26,9 @@ Learned = tuple[Annotated[float, Field(allow_inf_nan=False)], Spread]
 
 
 class Calibration(BaseModel):
-    """Device errors learned from a car's own drives: value and standard deviation; None if not learned."""
+    """Device errors learned from a car's own drives: value and standard deviation; None if not
+    learned.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -145,9 +147,11 @@ class Vehicle(BaseModel):
         return self.wheel_radius if own is None else own
 
     def understeer_per_g(self) -> float | None:
-        """Return the steering [rad per g] beyond L r/v that the file's axles ask for; None where it does not say.
+        """Return the steering [rad per g] beyond L r/v that the file's axles ask for; None where it
+        does not say.
 
-        The axles' slip angles at 1 g differ by load over stiffness: 1/k_f - 1/k_r, k of a wheel over its static load.
+        The axles' slip angles at 1 g differ by load over stiffness: 1/k_f - 1/k_r, k of a wheel
+        over its static load.
         """
         wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
         per_axle = 0.5 * self.mass * GRAVITY / wheelbase
@@ -165,8 +169,8 @@ def load_vehicle(path: Path | str) -> Vehicle:
     """Read a vehicle file (JSON), or return that of a class: "class:compact".
 
     Raises:
-        InputError: the file cannot be read, a field is missing or out of range, or mass and yaw inertia are not of one
-            vehicle; names the field and the fix.
+        InputError: the file cannot be read, a field is missing or out of range, or mass and yaw
+            inertia are not of one vehicle; names the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))

@@ -1,9 +1,10 @@
 """Vehicle files of common classes, for a car whose own numbers nobody has.
 
-Typical values of laden production cars with one or two persons. Stiffness is per wheel, at static load, against the
-angle of its rim: steering, bushes and roll are included, so that the front axle is softer than the rear one and every
-car understeers, by 20 to 35 mrad per g. Measured front axles of six cars have 10 to 17 times their load per radian,
-rear axles 15 to 25 (Volvo S90, VW Golf, Ferrari 250LM and others). Sizes follow the makers' data sheets of each class.
+Typical values of laden production cars with one or two persons. Stiffness is per wheel, at static
+load, against the angle of its rim: steering, bushes and roll are included, so that the front axle
+is softer than the rear one and every car understeers, by 20 to 35 mrad per g. Measured front axles
+of six cars have 10 to 17 times their load per radian, rear axles 15 to 25 (Volvo S90, VW Golf,
+Ferrari 250LM and others). Sizes follow the makers' data sheets of each class.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ INERTIA_SHARE: Final = 0.97
 
 
 class Size(NamedTuple):
-    """Sizes of a class: mass [kg], arms of the axles [m], tracks [m], height of the centre of gravity [m], and so on.
+    """Sizes of a class: mass [kg], arms of the axles [m], tracks [m], height of the centre of
+    gravity [m], and so on.
 
-    `drive_front` is the share of the driving torque at the front axle, None where a class has all kinds.
+    `drive_front` is the share of the driving torque at the front axle, None where a class has all
+    kinds.
     """
 
     mass: float

@@ -1,6 +1,8 @@
-"""Road weather: its rules, and its bytes on the wire. A temperature or precipitation that is not known is NaN.
+"""Road weather: its rules, and its bytes on the wire. A temperature or precipitation that is not
+known is NaN.
 
-One report is of a z10 region from a time on. Everything in it is optional, but not all of it may be missing.
+One report is of a z10 region from a time on. Everything in it is optional, but not all of it may be
+missing.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from schemas import mugrid, wire
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
-# What a road of this earth can have; anything else is a fault of the sender (a unit, a filler like -9999).
+# What a road of this earth can have; anything else is a fault of the sender (a unit, a filler like
+# -9999).
 RANGES: Final = {
     "air_temperature": (-90.0, 60.0),
     "road_temperature": (-90.0, 90.0),
@@ -26,8 +29,8 @@ PRIOR_SUM_ERROR: Final = 0.01  # single precision and a few digits of text
 
 @dataclass(frozen=True)
 class Report:
-    """Weather of a region from `time` [ns] on: air and road temperature [°C], precipitation [mm/h as water], each NaN
-    where unknown; `prior`: probabilities (32,) of a road there, or None."""
+    """Weather of a region from `time` [ns] on: air and road temperature [°C], precipitation [mm/h
+    as water], each NaN where unknown; `prior`: probabilities (32,) of a road there, or None."""
 
     time: int
     air_temperature: float = np.nan

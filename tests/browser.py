@@ -1,7 +1,7 @@
 """Pages in a real browser: headless Chromium of the system, driven by Playwright.
 
-Debian and Ubuntu: apt install chromium; CI does. Where there is none, or no Playwright, the tests of pages are skipped
-and say so.
+Debian and Ubuntu: apt install chromium; CI does. Where there is none, or no Playwright, the tests
+of pages are skipped and say so.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""A real S3 server, a process of its own on this machine, that a test can take away, freeze and bring back."""
+"""A real S3 server, a process of its own on this machine, that a test can take away, freeze and
+bring back.
+"""
 
 from __future__ import annotations
 

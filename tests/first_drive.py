@@ -1,4 +1,6 @@
-"""The tutorial's first drive: a real minute of a dry motorway, imported, checked and published under three names."""
+"""The tutorial's first drive: a real minute of a dry motorway, imported, checked and published
+under three names.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ def commands() -> list[str]:
 
 
 def mapped(folder: Path) -> tuple[Cells, list[str]]:
-    """The map's cells and the keys of alerts once the minute was published under all names, by a router and a service
-    of its own."""
+    """The map's cells and the keys of alerts once the minute was published under all names, by a
+    router and a service of its own."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
         system = System(folder, endpoints[0])

@@ -1,8 +1,9 @@
-"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own: no container engine is needed.
+"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own: no
+container engine is needed.
 
-The Python is this machine's of the version that FROM names, in a fresh environment; folders of the image lie below
-another root. What the image then holds is started: a router, and a service that is ready without compiling anything.
-Users cannot be changed here: what USER names is only looked at.
+The Python is this machine's of the version that FROM names, in a fresh environment; folders of the
+image lie below another root. What the image then holds is started: a router, and a service that is
+ready without compiling anything. Users cannot be changed here: what USER names is only looked at.
 """
 
 from __future__ import annotations
@@ -165,7 +166,8 @@ def main() -> int:
         assert user.isdecimal(), "Kubernetes must see that it is not root"
         assert int(user) > 0 < int(group)
         print(
-            f"a service of the image is ready after {starts(image):.1f} s, with kernels that the build has compiled"
+            f"a service of the image is ready after {starts(image):.1f} s, with kernels that the "
+            "build has compiled"
         )
     return 0
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 
 def circles_of(modules: Mapping[Path, ast.Module]) -> list[str]:
-    """Return the circles among modules, given by path below the root; imports inside functions count."""
+    """Return the circles among modules, given by path below the root; imports inside functions
+    count.
+    """
     names = {_dotted(path): tree for path, tree in modules.items()}
     graph: dict[str, set[str]] = {name: set() for name in names}
     for name, tree in names.items():

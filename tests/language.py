@@ -1,10 +1,11 @@
-"""Measure the language of docstrings, names and pages; lower the ceilings of `tests/test_language.py`.
+"""Measure the language of docstrings, names and pages; lower the ceilings of
+`tests/test_language.py`.
 
     python -m tests.language          print the figures, and lower the ceilings to them
     python -m tests.language WORD     print every docstring that a rule of this name finds fault with
 
-Rules are those of CONTRIBUTING.md, section "Rules for language". Ceilings are in `language_ceilings.json`, per package.
-This program only lowers them.
+Rules are those of CONTRIBUTING.md, section "Rules for language". Ceilings are in
+`language_ceilings.json`, per package. This program only lowers them.
 """
 
 from __future__ import annotations
@@ -57,10 +58,14 @@ STOP: Final = re.compile(r"\b(?:" + "|".join(STOP_WORDS) + r")\b", re.IGNORECASE
 # Participles that are also nouns or adjectives of the field.
 NOT_PARTICIPLES: Final = {"embed", "feed", "need", "seed", "speed", "shed", "read", "spread"}
 IRREGULAR: Final = (
-    "begun born bound bought brought built caught chosen come cut dealt done drawn driven eaten fallen fed felt fit "
-    "flown forbidden forgotten found frozen given gone grown heard held hidden hit hung hurt kept known laid led left "
-    "lent let lit lost made meant met mixed moved paid put quit read rid risen run said seen sent set shown shut sold "
-    "spent split spoken spread stood stuck swept sworn taken taught thought thrown told torn understood woken won worn "
+    "begun born bound bought brought built caught chosen come cut dealt done drawn driven eaten "
+    "fallen fed felt fit "
+    "flown forbidden forgotten found frozen given gone grown heard held hidden hit hung hurt kept "
+    "known laid led left "
+    "lent let lit lost made meant met mixed moved paid put quit read rid risen run said seen sent "
+    "set shown shut sold "
+    "spent split spoken spread stood stuck swept sworn taken taught thought thrown told torn "
+    "understood woken won worn "
     "written"
 )
 PARTICIPLES: Final = set(IRREGULAR.split()) - {
@@ -103,7 +108,9 @@ def docstrings(package: str) -> Iterator[Docstring]:
 
 
 def functions(package: str) -> Iterator[Named]:
-    """Yield the functions and methods of a package, tests and properties included, dunder methods not."""
+    """Yield the functions and methods of a package, tests and properties included, dunder
+    methods not.
+    """
     for path in sources(ROOT, package):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not DUNDER.fullmatch(
@@ -132,9 +139,9 @@ def stop_words(text: str) -> list[str]:
 def measure(package: str) -> dict[str, float]:
     """Return the figures of a package; less is better for each.
 
-    Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in docstrings),
-    `free_relatives` (per 1,000 docstring words), `participles` and `one_word` (percent of function names),
-    `long_test_names` (percent of test functions).
+    Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in
+    docstrings), `free_relatives` (per 1,000 docstring words), `participles` and `one_word` (percent
+    of function names), `long_test_names` (percent of test functions).
     """
     texts = [docstring.text for docstring in docstrings(package)]
     names = [function.name for function in functions(package)]
@@ -163,7 +170,9 @@ def rounded(value: float) -> float:
 
 
 def prose(text: str) -> str:
-    """Return the prose of a Markdown page: without code, tables, generated parts, headings, links and markers."""
+    """Return the prose of a Markdown page: without code, tables, generated parts, headings,
+    links and markers.
+    """
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     kept = [
@@ -201,7 +210,9 @@ def page_stop_words(page: Path) -> list[str]:
 
 
 def markdown_words() -> int:
-    """Return the words of all pages that people wrote: tokens with a letter or digit, the results page not counted."""
+    """Return the words of all pages that people wrote: tokens with a letter or digit, the
+    results page not counted.
+    """
     written = [page for page in pages() if page.name not in NOT_OURS]
     return sum(len(re.findall(r"\S*\w\S*", page.read_text(encoding="utf-8"))) for page in written)
 

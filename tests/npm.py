@@ -1,7 +1,8 @@
-"""Files of npm packages that tests and benchmarks use in a browser: pinned, kept in `.page/tools`, never committed.
+"""Files of npm packages that tests and benchmarks use in a browser: pinned, kept in `.page/tools`,
+never committed.
 
-`python -m tests.npm axe-core` fetches one; `make browser-test` and `make page-bench` do. Where a file is not there,
-what wants it is skipped and says so.
+`python -m tests.npm axe-core` fetches one; `make browser-test` and `make page-bench` do. Where a
+file is not there, what wants it is skipped and says so.
 """
 
 from __future__ import annotations

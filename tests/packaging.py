@@ -1,8 +1,8 @@
 """`make package`: builds sdist and wheel, tries the wheel in a fresh environment, far from here.
 
-The wheel is built from the sdist, so that what is missing in the one is missed in the other. It is tried with each
-Python of VERSIONS that this machine has, on the PATH or among pyenv's; for those that it has not, a line says so.
-`--python` names others.
+The wheel is built from the sdist, so that what is missing in the one is missed in the other. It is
+tried with each Python of VERSIONS that this machine has, on the PATH or among pyenv's; for those
+that it has not, a line says so. `--python` names others.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def interpreters() -> list[str]:
 
 
 def candidates(version: str) -> list[str]:
-    """Where a Python of a version may be: this one, the command of that name, and what pyenv has installed."""
+    """Where a Python of a version may be: this one, the command of that name, and what pyenv has
+    installed.
+    """
     this = sys.executable if version == ".".join(map(str, sys.version_info[:2])) else None
     kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     return [
@@ -143,7 +145,9 @@ def use(python: str, wheel: Path, folder: Path) -> None:
 
 
 def run(command: list[str | Path], folder: Path) -> None:
-    """Run a command in a folder, with the seconds it took; SystemExit with its output where it fails."""
+    """Run a command in a folder, with the seconds it took; SystemExit with its output where it
+    fails.
+    """
     began = time.monotonic()
     done = subprocess.run(
         [str(part) for part in command],

@@ -1,7 +1,8 @@
-"""Reference pages of the documentation site, generated from the code: commands, settings, tables, metrics,
-elements of the papers.
+"""Reference pages of the documentation site, generated from the code: commands, settings, tables,
+metrics, elements of the papers.
 
-`deploy/docs/conf.py` writes them when the site is built, so they cannot lag behind the code. They are not committed.
+`deploy/docs/conf.py` writes them when the site is built, so they cannot lag behind the code. They
+are not committed.
 
     python -m tests.reference_pages FOLDER
 """
@@ -109,7 +110,10 @@ def settings_rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[st
 def settings_page() -> str:
     """Return the page of all settings."""
     parts = [
-        "# Configuration\n\nSettings are a JSON file, given with `--config`. Unknown names are refused.\n"
+        (
+            "# Configuration\n\nSettings are a JSON file, given with `--config`. Unknown names are "
+            "refused.\n"
+        )
     ]
     for program, model in SETTINGS.items():
         parts.append(f"\n## `{program}`\n\n| setting | default | |\n|---|---|---|\n")
@@ -174,7 +178,10 @@ def stored_name(metric: Metric) -> str:
 def metrics_page(found: Shown) -> str:
     """Return the page of all metrics."""
     parts = [
-        "# Metrics\n\nNames as Prometheus stores them.\n\n| metric | of | kind | |\n|---|---|---|---|\n"
+        (
+            "# Metrics\n\nNames as Prometheus stores them.\n\n| metric | of | kind | "
+            "|\n|---|---|---|---|\n"
+        )
     ]
     for half, metrics in found.items():
         for metric in metrics:

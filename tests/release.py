@@ -1,9 +1,10 @@
-"""Prepare a release: check the changelog, set the version, and build sdist, wheel and SBOM in `dist/`.
+"""Prepare a release: check the changelog, set the version, and build sdist, wheel and SBOM in
+`dist/`.
 
     python -m tests.release 0.2.0
 
-It changes `pyproject.toml` and `CITATION.cff`, and commits and tags nothing. `CHANGELOG.md` must have a section
-`## 0.2.0` with text: rename "Unreleased" first.
+It changes `pyproject.toml` and `CITATION.cff`, and commits and tags nothing. `CHANGELOG.md` must
+have a section `## 0.2.0` with text: rename "Unreleased" first.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Two routers with mutual TLS and the generated access list, and sessions under any name: all of it real."""
+"""Two routers with mutual TLS and the generated access list, and sessions under any name: all of
+it real.
+"""
 
 from __future__ import annotations
 
@@ -70,9 +72,9 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
 class Network:
     """Two routers, each a process of its own; the second is connected to the first.
 
-    `protocol` is the transport of sessions; routers reach each other over TLS. Without
-    caps, an attack that gets through is not hidden by one that was sent just before. Unguarded they check nobody: a
-    control. They are no part of the test's process because Zenoh may abort one in which
+    `protocol` is the transport of sessions; routers reach each other over TLS. Without caps, an
+    attack that gets through is not hidden by one that was sent just before. Unguarded they check
+    nobody: a control. They are no part of the test's process because Zenoh may abort one in which
     one of two connected routers is closed.
     """
 

@@ -1,4 +1,6 @@
-"""Distances of colours for four kinds of sight: simulated dichromats (Machado et al. 2009) and CIEDE2000."""
+"""Distances of colours for four kinds of sight: simulated dichromats (Machado et al. 2009) and
+CIEDE2000.
+"""
 
 from __future__ import annotations
 

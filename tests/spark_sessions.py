@@ -1,4 +1,6 @@
-"""Spark on cores of this machine that tries a task again, as clusters do; work whose process dies the first time."""
+"""Spark on cores of this machine that tries a task again, as clusters do; work whose process
+dies the first time.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ def cores(count: int) -> Iterator[Any]:
     os.environ.setdefault(
         "PYSPARK_PYTHON", sys.executable
     )  # as `spark.session` does, for what it then finds
-    # of the environment, Spark looks only at what it holds when its Java starts: the second session would be the first
+    # of the environment, Spark looks only at what it holds when its Java starts: the second session
+    # would be the first
     builder = SparkSession.builder.master(f"local[{count},{TRIES}]").config(
         "spark.ui.showConsoleProgress", "false"
     )
@@ -41,7 +44,9 @@ def cores(count: int) -> Iterator[Any]:
 def killed_at_first(
     work: Callable[[_Task], _Outcome], name_of: Callable[[_Task], str], tries: Path
 ) -> Callable[[_Task], _Outcome]:
-    """The same work, whose process is killed after the first try at each task; `tries` keeps the tasks' names."""
+    """The same work, whose process is killed after the first try at each task; `tries` keeps the
+    tasks' names.
+    """
     tries.mkdir()
 
     def done(task: _Task) -> _Outcome:

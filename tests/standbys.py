@@ -1,4 +1,6 @@
-"""Two services, or three, that follow each other: real processes, a real S3 server, and links that can be cut."""
+"""Two services, or three, that follow each other: real processes, a real S3 server, and links
+that can be cut.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from tests.faults.processes import Part
 
 
 class Link:
-    """A port that leads to another one of this machine; `cut`, it takes connections and passes nothing on."""
+    """A port that leads to another one of this machine; `cut`, it takes connections and passes
+    nothing on.
+    """
 
     def __init__(self, port: int) -> None:
         self._to = port
@@ -123,7 +127,9 @@ def hosts(
     named: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> Iterator[list[Host]]:
-    """Hosts, whose services are not started, each of its own name if `named`; they are gone after the block."""
+    """Hosts, whose services are not started, each of its own name if `named`; they are gone
+    after the block.
+    """
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]
         made = [

@@ -3,8 +3,9 @@
     python -m tests.structure [CHECKOUT]          print the table: figure, value, bar, ceiling
     python -m tests.structure --places [FIGURE]   print where a figure comes from
 
-Rooms are the entries of a package's folder. An arrow means that one of them imports another. `tests/test_structure.py`
-compares each figure with its ceiling. A ceiling above its bar is a bar not reached yet; ceilings only fall.
+Rooms are the entries of a package's folder. An arrow means that one of them imports another.
+`tests/test_structure.py` compares each figure with its ceiling. A ceiling above its bar is a bar
+not reached yet; ceilings only fall.
 """
 
 from __future__ import annotations
@@ -97,7 +98,9 @@ def ambiguous_classes(root: Path) -> dict[str, list[str]]:
 
 
 def light_import(root: Path) -> tuple[float, int, list[str]]:
-    """Milliseconds and modules of importing the contract, and what of the heavy libraries came along."""
+    """Milliseconds and modules of importing the contract, and what of the heavy libraries came
+    along.
+    """
     words = (
         f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "
         f"print(1e3 * (time.perf_counter() - begun), len(set(sys.modules) - before), "
@@ -153,7 +156,9 @@ def import_circles(root: Path) -> Places:
 
 
 def methods_of_largest_class(root: Path) -> Places:
-    """Return every class with its number of methods and properties, largest first, one entry per method."""
+    """Return every class with its number of methods and properties, largest first, one entry per
+    method.
+    """
     largest: Places = []
     for path in sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -168,7 +173,9 @@ def methods_of_largest_class(root: Path) -> Places:
 
 
 def most_parameters(root: Path) -> Places:
-    """Return the parameters of the function that has most, keywords counted, `self` and `cls` not."""
+    """Return the parameters of the function that has most, keywords counted, `self` and `cls`
+    not.
+    """
     most: Places = []
     for place, node in functions(root, *PACKAGES):
         arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
@@ -225,7 +232,9 @@ _NESTING: Final = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.AsyncFor, 
 
 
 def _depth(node: ast.AST) -> int:
-    """Return how many blocks are nested in a function; `elif` does not count, inner functions count for themselves."""
+    """Return how many blocks are nested in a function; `elif` does not count, inner functions
+    count for themselves.
+    """
     deepest = 0
     for child in ast.iter_child_nodes(node):
         if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
@@ -257,8 +266,8 @@ def many_locals(root: Path) -> Places:
 def named_constants(root: Path) -> Places:
     """Return the numbers with a name between sensor and map.
 
-    Counted are module constants (capital letters) and fields of classes called …Constants whose value is a number or an
-    expression of numbers, in `CONSTANT_ROOMS`.
+    Counted are module constants (capital letters) and fields of classes called …Constants whose
+    value is a number or an expression of numbers, in `CONSTANT_ROOMS`.
     """
     found = []
     for path in sources(root, *CONSTANT_ROOMS):
@@ -298,8 +307,9 @@ def _is_number(node: ast.AST) -> bool:
 def only_tests_use(root: Path) -> Places:
     """Return the product lines of functions and classes that only tests mention.
 
-    A name counts as used if any other line of product, deployment, Makefile, pages or examples contains it. Functions
-    with a decorator other than `property` are left out, because the decorator may register them.
+    A name counts as used if any other line of product, deployment, Makefile, pages or examples
+    contains it. Functions with a decorator other than `property` are left out, because the
+    decorator may register them.
     """
     texts = {path: path.read_text(encoding="utf-8") for path in sources(root, *PACKAGES)}
     others = [

@@ -1,7 +1,7 @@
 """Unmeasured cells have no number to colour by, in any form of output.
 
-The first promise: unknown never reads as dry. A cell of which only lower bounds are known, or a row that rolled, has a
-median that is mostly the prior, and the prior's median looks like wet asphalt.
+The first promise: unknown never reads as dry. A cell of which only lower bounds are known, or a row
+that rolled, has a median that is mostly the prior, and the prior's median looks like wet asphalt.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ END: Final = "2026-01-28"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive with values and bounds; a snapshot of its map with a bound that says mu, as files before 1.2 do."""
+    """An archive with values and bounds; a snapshot of its map with a bound that says mu, as
+    files before 1.2 do.
+    """
     root = tmp_path_factory.mktemp("bounds") / "archive"
     synthetic.write(root, WORLD, 2000)
     compact(root)
@@ -67,7 +69,9 @@ def two_cells() -> pa.Table:
 def painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
-    """Rows of which nothing is known that have a number all the same; fails where there are none of either kind."""
+    """Rows of which nothing is known that have a number all the same; fails where there are none
+    of either kind.
+    """
     bounds = [row for row in rows if not known(row)]
     assert bounds
     assert any(known(row) and row[names[0]] is not None for row in rows)

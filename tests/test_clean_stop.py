@@ -1,4 +1,6 @@
-"""SIGTERM and Ctrl-C: agent and service flush, settle what they can, and are gone, whatever the router does."""
+"""SIGTERM and Ctrl-C: agent and service flush, settle what they can, and are gone, whatever the
+router does.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Both command lines as a person meets them: versions, examples, completion, Ctrl-C, minus signs, brakes, endings."""
+"""Both command lines as a person meets them: versions, examples, completion, Ctrl-C, minus
+signs, brakes, endings.
+"""
 
 from __future__ import annotations
 

@@ -54,7 +54,9 @@ def test_a_mistake_is_made_with_every_command() -> None:
 
 
 def typed(text: str) -> list[str]:
-    """Return the commands in the code blocks of a page, without comments; a synopsis with brackets is none."""
+    """Return the commands in the code blocks of a page, without comments; a synopsis with
+    brackets is none.
+    """
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     lines = [line.strip() for block in blocks for line in block.splitlines() if "[" not in line]
     lines += [

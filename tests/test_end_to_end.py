@@ -1,4 +1,6 @@
-"""From wheels to map: recorded drives, the agent, a router, the service, and a client that knows only Zenoh."""
+"""From wheels to map: recorded drives, the agent, a router, the service, and a client that knows
+only Zenoh.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ ICE = 0.25
 
 
 class System:
-    """A router and a service in this process, and the folder with what they and the agents leave."""
+    """A router and a service in this process, and the folder with what they and the agents
+    leave.
+    """
 
     def __init__(self, folder: Path, endpoint: str) -> None:
         self.folder = folder

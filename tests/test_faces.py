@@ -1,4 +1,6 @@
-"""The public faces: every name is there, documented and reachable; plug-ins of another distribution are found."""
+"""The public faces: every name is there, documented and reachable; plug-ins of another
+distribution are found.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,10 @@ def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
 
 def test_importing_a_face_loads_nothing_heavy() -> None:
     heavy = ("numba", "numpy", "pyarrow", "zenoh")
-    words = f"import sys, edge_agent, fleet_service; print([name for name in {heavy} if name in sys.modules])"
+    words = (
+        f"import sys, edge_agent, fleet_service; print([name for name in {heavy} if name in "
+        "sys.modules])"
+    )
     assert (
         subprocess.run(
             [sys.executable, "-c", words], capture_output=True, text=True, check=True

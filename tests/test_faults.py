@@ -1,4 +1,6 @@
-"""The frame of the fault campaigns: it reports what is missing, and its census sees what is lost or doubled."""
+"""The frame of the fault campaigns: it reports what is missing, and its census sees what is lost
+or doubled.
+"""
 
 from __future__ import annotations
 

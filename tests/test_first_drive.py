@@ -1,4 +1,6 @@
-"""The tutorial's first drive has few commands, raises no alert, and is slippery nowhere on the map."""
+"""The tutorial's first drive has few commands, raises no alert, and is slippery nowhere on the
+map.
+"""
 
 from __future__ import annotations
 

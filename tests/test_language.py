@@ -1,6 +1,7 @@
 """Docstrings, names and pages keep the rules of language; ceilings per package and page only fall.
 
-`python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the faults of a rule.
+`python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the faults of
+a rule.
 """
 
 from __future__ import annotations
@@ -74,7 +75,10 @@ def test_stop_words_are_found(text: str) -> None:
 
 
 def test_prose_leaves_out_code_tables_and_links() -> None:
-    text = "# Title\n\nOne [word](a/b.md) and `code`.\n\n| a |\n|---|\n\n```\nanew\n```\n- item one.\n- item two.\n"
+    text = (
+        "# Title\n\nOne [word](a/b.md) and `code`.\n\n| a |\n|---|\n\n```\nanew\n```\n- item "
+        "one.\n- item two.\n"
+    )
     assert [one.strip() for one in language.sentences(text)] == [
         "One word and Code.",
         "item one.",

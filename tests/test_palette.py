@@ -1,7 +1,7 @@
 """Colours that are told apart by every kind of sight and on grey paper, computed and not believed.
 
-Sight is simulated as Machado, Oliveira and Fernandes (2009) do at full severity, distances are CIEDE2000 (Sharma, Wu
-and Dalal 2005).
+Sight is simulated as Machado, Oliveira and Fernandes (2009) do at full severity, distances are
+CIEDE2000 (Sharma, Wu and Dalal 2005).
 """
 
 from __future__ import annotations

@@ -116,7 +116,8 @@ PURE = (
         for name in ("alerts", "idle_roads", "map_state", "neighbour_fill", "view", "visitors")
     ),
 )
-# Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
+# Beside it, what turns one thing in memory into another: tables and messages too, but no input or
+# output either.
 SANS_IO = (
     "edge_agent/publish/batching.py",
     "edge_agent/ahead/hearing.py",
@@ -149,7 +150,8 @@ IMPURE = {
     "zenoh",
 }
 IMPURE_CALLS = {"open", "print", "input"}
-# What the pure core may use of the contract: numbers, names and errors, no messages, tables or transport.
+# What the pure core may use of the contract: numbers, names and errors, no messages, tables or
+# transport.
 PURE_SCHEMAS = {
     "config",
     "errors",
@@ -227,7 +229,9 @@ def impurities(tree: ast.AST) -> list[tuple[int, str]]:
 
 
 def undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Public modules, classes and functions without a docstring; what is inside a function is private."""
+    """Public modules, classes and functions without a docstring; what is inside a function is
+    private.
+    """
     if ast.get_docstring(tree) is None:
         yield 1, "module"
     stack: list[ast.AST] = [tree]

@@ -1,7 +1,8 @@
 """Figures of the demo: the map compared with the truth.
 
-The truth is the simulator's record of each visit of a vehicle to a cell: mean friction under its wheels, and the
-largest share of the grip that it used. A visit with a share of at least 0.6 is *excited*: it shows the friction.
+The truth is the simulator's record of each visit of a vehicle to a cell: mean friction under its
+wheels, and the largest share of the grip that it used. A visit with a share of at least 0.6 is
+*excited*: it shows the friction.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ def works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Cells of the map that have a truth, one per row; `truth` is the friction at the end of the demo."""
+    """Cells of the map that have a truth, one per row; `truth` is the friction at the end of the
+    demo.
+    """
 
     cells: pa.Table
     truth: FloatArray
@@ -82,8 +85,8 @@ class MapComparison:
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
-    """Return the friction of each visited (cell, sector) at the end: mean over visits since the change, else over
-    all."""
+    """Return the friction of each visited (cell, sector) at the end: mean over visits since the
+    change, else over all."""
     keys = _keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
     mu = visits["mu"].to_numpy()
@@ -125,7 +128,8 @@ def delay_passes(
 ) -> float:
     """Return the excited passes over a new patch until its first alert, the median of all patches.
 
-    A patch without an alert counts as infinite; cells within LINK_CELLS of each other are one patch.
+    A patch without an alert counts as infinite; cells within LINK_CELLS of each other are one
+    patch.
 
     Args:
         visits: the truth.
@@ -159,7 +163,9 @@ def known_patches(
 
 
 def passes(rows: pa.Table) -> int:
-    """Return the number of passes: successive visits of one vehicle to neighbouring cells are one pass."""
+    """Return the number of passes: successive visits of one vehicle to neighbouring cells are
+    one pass.
+    """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
     enter, left = (order[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
@@ -212,8 +218,8 @@ def figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Passes over the new ice since the first alert of its patch, one per row: whether the driver was warned and a
-    wheel lost its grip.
+    """Passes over the new ice since the first alert of its patch, one per row: whether the driver
+    was warned and a wheel lost its grip.
 
     `cell` is where it was lost, or the first of the pass.
     """
@@ -249,7 +255,9 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return the passes over the new ice since the first alert of its patch; `share` of the drivers is warned."""
+    """Return the passes over the new ice since the first alert of its patch; `share` of the
+    drivers is warned.
+    """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)
     for cells, known in known_patches(visits, on, alerts, changed_ns):
@@ -283,7 +291,8 @@ def _number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return True for visits (visits,) after the change that found clearly less grip than all before in the cell.
+    """Return True for visits (visits,) after the change that found clearly less grip than all
+    before in the cell.
 
     Old snow that is reached late, or its border, does not count as new ice.
     """

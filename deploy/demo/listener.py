@@ -21,7 +21,9 @@ def read_tile(payload: bytes) -> pa.Table:
 
 @dataclass
 class Listener:
-    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with its time of receipt."""
+    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with its time
+    of receipt.
+    """
 
     session: zenoh.Session
     tiles: dict[str, pa.Table] = field(default_factory=dict)
@@ -59,7 +61,8 @@ class Listener:
         several = int((cells["vehicles"].to_numpy() >= 2).sum())
         standing = {(alert.cell, alert.sector): alert.raised for _, alert in alerts}
         return (
-            f"{len(basis):5d} cells, {basis.count('measured'):4d} measured, {several:4d} by two or more vehicles, "
+            f"{len(basis):5d} cells, {basis.count('measured'):4d} measured, {several:4d} by two or "
+            "more vehicles, "
             f"{sum(standing.values()):3d} alerts stand"
         )
 

@@ -1,4 +1,6 @@
-"""The map next to the truth as one HTML file that opens offline and shows the interval of a cell."""
+"""The map next to the truth as one HTML file that opens offline and shows the interval of a
+cell.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
     several = int(comparison.has_several_vehicles.sum())
     about = (
-        f"{cells.num_rows} cells and directions that have a truth; {several} of them seen by two or more vehicles, "
+        f"{cells.num_rows} cells and directions that have a truth; {several} of them seen by two "
+        "or more vehicles, "
         "and the figures below judge these."
     )
     table = [["figure", "value", "bar", ""], *(row(figure) for figure in figures)]

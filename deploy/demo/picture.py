@@ -1,4 +1,6 @@
-"""The map next to the truth as an image (PNG): each heading sector of a cell is a quarter of its square."""
+"""The map next to the truth as an image (PNG): each heading sector of a cell is a quarter of its
+square.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from schemas.runtime.palette import SURFACES, UNKNOWN
 def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
     """Draw three panels: the truth, the map (median), and the width of the map's interval.
 
-    The truth also shows where drivers lost their grip on the new ice and where they kept it, warned and not.
+    The truth also shows where drivers lost their grip on the new ice and where they kept it, warned
+    and not.
     """
     cells = comparison.cells
     shapes = cell_shapes(cells["cell"].to_numpy(), cells["sector"].to_numpy().astype(np.int64))
@@ -40,15 +43,16 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
     )
     figure.colorbar(wide, ax=width, label="width [1]", shrink=0.8)
     figure.suptitle(
-        f"{cells.num_rows} cells and directions; truth inside the interval in {comparison.is_covered.mean():.0%}, "
+        f"{cells.num_rows} cells and directions; truth inside the interval in "
+        f"{comparison.is_covered.mean():.0%}, "
         f"{comparison.has_several_vehicles.sum()} of them seen by two or more vehicles"
     )
     figure.savefig(path, dpi=130)
 
 
 def _mark(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
-    """Mark passes over the new ice: circles of warned drivers, squares of others; black if grip was lost, else
-    white."""
+    """Mark passes over the new ice: circles of warned drivers, squares of others; black if grip was
+    lost, else white."""
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[
         len(drawn) :
     ]  # in the axes of what is drawn

@@ -123,7 +123,9 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 @contextmanager
 def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
-    """Run the live page on the town's streets; yield its address. The truth can be drawn over the map."""
+    """Run the live page on the town's streets; yield its address. The truth can be drawn over
+    the map.
+    """
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write(scenario_named(SCENARIO), folder)
     options = {
@@ -148,14 +150,15 @@ def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Ite
 def fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Return the process of the simulated vehicles, with one session and identity each; a share of the drivers is
-    warned."""
+    """Return the process of the simulated vehicles, with one session and identity each; a share of
+    the drivers is warned."""
     scripts = Path(sys.executable).parent
     options = {
         "--vehicles": vehicles,
         "--scenario": SCENARIO,
         "--rough": 0.5,  # half of them as real cars are
-        "--winter": 0.5,  # half of them, half of the rough ones too, with controllers and tyres that matter in winter
+        # half of them, half of the rough ones too, with controllers and tyres that matter in winter
+        "--winter": 0.5,
         "--warned": warned,
         "--duration": duration_s,
         "--seed": seed,

@@ -1,4 +1,6 @@
-"""Course of the demo: start the parts, let the fleet drive, compare the map with the truth, report."""
+"""Course of the demo: start the parts, let the fleet drive, compare the map with the truth,
+report.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def report(
     grip: compare.LostGrip,
     seed: int,
 ) -> list[figures.Figure]:
-    """Write and print all figures, draw the map next to the truth and the passes that lost grip; return the figures."""
+    """Write and print all figures, draw the map next to the truth and the passes that lost grip;
+    return the figures.
+    """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
     picture.draw(comparison, folder / "map.png", grip)
@@ -84,15 +88,16 @@ def report(
 def run(args: argparse.Namespace) -> int:
     """Run the demo; exit code 1 if a bar of a promise does not hold.
 
-    The delay of the first alert, the number of passes and the duration are goals: a miss is reported in figures and
-    README, but does not fail the demo.
+    The delay of the first alert, the number of passes and the duration are goals: a miss is
+    reported in figures and README, but does not fail the demo.
     """
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     appears_s = scenario_named(processes.SCENARIO).events[0].start
     print(
-        f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black ice appears."
+        f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black "
+        "ice appears."
     )
     with (
         processes.system(FOLDER) as (endpoint, service),

@@ -1,7 +1,9 @@
-"""Base map and named roads of the demo's simulated town, so that its page looks like a town and needs no network.
+"""Base map and named roads of the demo's simulated town, so that its page looks like a town and
+needs no network.
 
-`write` makes an MBTiles file of vector tiles (streets, buildings, parks, water, names) and a GeoJSON file of the roads.
-The geometry of the streets is the simulation's; houses, parks and the lake are drawn around them by a seeded generator.
+`write` makes an MBTiles file of vector tiles (streets, buildings, parks, water, names) and a
+GeoJSON file of the roads. The geometry of the streets is the simulation's; houses, parks and the
+lake are drawn around them by a seeded generator.
 """
 
 from __future__ import annotations
@@ -86,7 +88,9 @@ def _blob(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
 
 
 def _houses(centres: FloatArray) -> Iterable[FloatArray]:
-    """Yield houses along the streets, turned like them and clear of streets, parks and each other."""
+    """Yield houses along the streets, turned like them and clear of streets, parks and each
+    other.
+    """
     rng = np.random.default_rng(5)
     placed: list[tuple[float, float, float]] = []
     for _ in range(HOUSES * 6):

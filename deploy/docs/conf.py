@@ -1,7 +1,7 @@
 """Configuration of the documentation site; `make docs` builds it.
 
-The source is the whole repository, because room READMEs are part of the site. Reference pages of commands, settings,
-tables and metrics are generated here, before Sphinx reads the pages.
+The source is the whole repository, because room READMEs are part of the site. Reference pages of
+commands, settings, tables and metrics are generated here, before Sphinx reads the pages.
 """
 
 from __future__ import annotations

@@ -35,7 +35,8 @@ def main(archive: Path, folder: Path) -> None:
         fleet_service.write_answer(worst, "worst", folder / f"worst.{ending}")
     stretches = geopandas.read_parquet(folder / "worst.geo.parquet")
     print(
-        f"{len(stretches)} stretches, {stretches.geometry.to_crs(3006).area.sum():.0f} square metres of cells"
+        f"{len(stretches)} stretches, {stretches.geometry.to_crs(3006).area.sum():.0f} square "
+        "metres of cells"
     )
 
 

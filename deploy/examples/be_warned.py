@@ -1,4 +1,5 @@
-"""Warnings in the car: it receives the map in front of it over its own session, and a callback gets each warning.
+"""Warnings in the car: it receives the map in front of it over its own session, and a callback gets
+each warning.
 
 python deploy/examples/be_warned.py tcp/127.0.0.1:7447 57.7 11.97
 """
@@ -19,7 +20,9 @@ SPEED = 14.0  # [m/s]
 def main(
     endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
 ) -> str:
-    """Look ahead from a place (yaw: radians from east) and print warnings; return the first one, or ""."""
+    """Look ahead from a place (yaw: radians from east) and print warnings; return the first one,
+    or "".
+    """
     warnings: queue.Queue[str] = queue.Queue()
     lookout = edge_agent.Lookout(
         ["my-car"], lambda name, warning: warnings.put(f"{name}: {warning.line()}")

@@ -1,4 +1,5 @@
-"""First estimate: a simulated drive, two estimators compared with the truth, a data frame and a plot.
+"""First estimate: a simulated drive, two estimators compared with the truth, a data frame and a
+plot.
 
 python deploy/examples/first_estimate.py FOLDER
 """

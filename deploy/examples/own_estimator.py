@@ -5,7 +5,8 @@ As a plug-in, your package states in its pyproject.toml
     [project.entry-points."gripmap.estimators"]
     at-least = "my_package:AtLeast"
 
-Then `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used directly:
+Then `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used
+directly:
 
 python deploy/examples/own_estimator.py
 """
@@ -44,8 +45,8 @@ class AtLeast:
         *,
         threads: int = 1,
     ) -> edge_agent.Estimates:
-        """Estimate samples: t (T, N) [s], signals (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is
-        missing."""
+        """Estimate samples: t (T, N) [s], signals (T, N, 18) in the order of
+        schemas.signals.CHANNELS; NaN is missing."""
         del closes, threads  # no visits, one thread
         values = np.zeros((*t.shape, ONE_FRICTION))
         pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY

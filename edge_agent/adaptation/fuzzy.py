@@ -6,8 +6,8 @@ Legend
     mismatch    nu2/s - 1 [1]
     factor      R over its nominal value [1], within [LEAST_FACTOR, LARGEST_FACTOR]
 
-Where the actual variance exceeds the theoretical one, R grows: paper 004, equations 29 to 31, with the direction of the
-errata, and with bounds that the paper lacks.
+Where the actual variance exceeds the theoretical one, R grows: paper 004, equations 29 to 31, with
+the direction of the errata, and with bounds that the paper lacks.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ LARGEST_FACTOR = 10.0
 
 @compiled
 def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
-    """Log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the mismatch at peaks inputs (5,).
+    """Log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the mismatch at
+    peaks inputs (5,).
 
-    Triangles that meet at each other's peaks make the weighted mean a straight line between neighbours.
+    Triangles that meet at each other's peaks make the weighted mean a straight line between
+    neighbours.
     """
     last = inputs.shape[0] - 1
     if mismatch <= inputs[0]:

@@ -6,7 +6,8 @@ Legend
     outputs     log of the multiplier on R that each set asks for [nat] (5,)
     ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows [nat] (2,)
 
-Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, and what two rules ask for:
+Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, and what two rules ask
+for:
     far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
     consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and bank return to their
                 prior where the wheels are FAR [1/s]
@@ -14,7 +15,8 @@ Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, an
                 then demand (low, middle, high), then forces (as before, new) [nat] (12,)
     strained    what is added to it where beliefs about the car are strained, by whether a wheel slides [nat] (2,)
 
-Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the range is covered.
+Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the
+range is covered.
 """
 
 from __future__ import annotations
@@ -103,7 +105,8 @@ class Memberships:
         if np.any(np.diff(self.outputs) < 0.0) or max(map(abs, self.outputs)) > LARGEST_STEP:
             raise InputError(
                 "memberships.outputs",
-                "not rising within a step: R must grow where the actual innovation exceeds the theoretical",
+                "not rising within a step: R must grow where the actual innovation exceeds the "
+                "theoretical",
                 f"order them in [-{LARGEST_STEP:g}, {LARGEST_STEP:g}]",
             )
         if self.outputs[0] > 0.0 or self.outputs[-1] < 0.0:
@@ -140,7 +143,8 @@ class Memberships:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """The memberships of a vector (30,) within `bounds`; inputs and outputs are sorted first, so all are valid.
+        """The memberships of a vector (30,) within `bounds`; inputs and outputs are sorted first,
+        so all are valid.
 
         Of a vector (12,), which ends at ln_scales, the rest is as untuned.
         """

@@ -1,4 +1,5 @@
-"""The rules by which the default estimator steers what varies: what to believe, and how fast to forget.
+"""The rules by which the default estimator steers what varies: what to believe, and how fast to
+forget.
 
 | if | then | kind |
 |---|---|---|
@@ -7,9 +8,9 @@
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
 | slide, demand, new forces and strain are in one set each | ln of the share of evidence taken | Takagi–Sugeno |
 
-Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`.
-Sets are ramps from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`. Inputs are
-of the block that has just ended, so that a rule never sees what it steers.
+Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`. Sets are ramps
+from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`.
+Inputs are of the block that has just ended, so that a rule never sees what it steers.
 """
 
 from __future__ import annotations

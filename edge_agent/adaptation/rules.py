@@ -1,4 +1,5 @@
-"""Fuzzy inference with two inputs: a table of rules over the mismatch of the innovations and its rate (paper 001).
+"""Fuzzy inference with two inputs: a table of rules over the mismatch of the innovations and its
+rate (paper 001).
 
 Legend
     alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the paper's (18) is a
@@ -6,11 +7,13 @@ Legend
     rate        its rate [1/s]
     level       what a rule asks for: ln of the factor on R [nat]                         (5, 7)
 
-Sets are triangles that meet at each other's peaks, so memberships sum to one and the inference is bilinear.
+Sets are triangles that meet at each other's peaks, so memberships sum to one and the inference is
+bilinear.
 
-Table 1 of paper 001, rows NB NM Z PM PB of the rate, columns NB NM NS Z PS PM PB of alpha. Where alpha is negative the
-printed table grows R, although the text asks for less: there the level counts as its reciprocal. PMB and PSM, which the
-declared sets do not have, are taken as the steps beside PM.
+Table 1 of paper 001, rows NB NM Z PM PB of the rate, columns NB NM NS Z PS PM PB of alpha. Where
+alpha is negative the printed table grows R, although the text asks for less: there the level counts
+as its reciprocal. PMB and PSM, which the declared sets do not have, are taken as the steps beside
+PM.
 """
 
 from __future__ import annotations
@@ -58,7 +61,9 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
-    """ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)), level beyond the ends."""
+    """ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)),
+    level beyond the ends.
+    """
     i, u = bracket(alpha, at)
     j, v = bracket(rate, of)
     lower = (1.0 - u) * levels[j, i] + u * levels[j, i + 1]

@@ -1,8 +1,9 @@
-"""Measurement noise from a moving window of innovations, larger ones weighing more (paper 002, equations 24 and 25).
+"""Measurement noise from a moving window of innovations, larger ones weighing more (paper 002,
+equations 24 and 25).
 
-Legend: e_j innovations of the last N samples of one row; c_j = |e_j| their weights, normalised (the paper's are not);
-P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P.
-The half is the departure that makes it right: of a normal variable E|e|^3 / E|e| = 2 var(e).
+Legend: e_j innovations of the last N samples of one row; c_j = |e_j| their weights, normalised (the
+paper's are not); P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P. The
+half is the departure that makes it right: of a normal variable E|e|^3 / E|e| = 2 var(e).
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ def push(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """R of a row from its window (N,), NaN where not yet filled: then nominal; within [least, largest]*nominal."""
+    """R of a row from its window (N,), NaN where not yet filled: then nominal; within [least,
+    largest]*nominal.
+    """
     weight = total = 0.0
     for error in window:
         size = abs(error)

@@ -1,8 +1,9 @@
-"""Choice of map requests: boxes along the way ahead, so that a day costs megabytes and not gigabytes. Pure.
+"""Choice of map requests: boxes along the way ahead, so that a day costs megabytes and not
+gigabytes. Pure.
 
-A changed tile is published whole, each second: about 50 kB in a busy town. A car needs only what lies along its way,
-and not every second, while it must learn of ice at once. It therefore requests narrow boxes along its way and
-subscribes to the alerts of the tiles there.
+A changed tile is published whole, each second: about 50 kB in a busy town. A car needs only what
+lies along its way, and not every second, while it must learn of ice at once. It therefore requests
+narrow boxes along its way and subscribes to the alerts of the tiles there.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ REFRESH_S: Final = 300.0
 STEP: Final = 4  # metres between the points that are looked at
 MOST_BOXES: Final = 128
 MOST_TILES: Final = 6  # whose alerts are heard at a time
-LEAVE_S: Final = 20.0  # a tile that is not ahead any more is heard for so long: a car at a border goes to and fro
+# a tile that is not ahead any more is heard for so long: a car at a border goes to and fro
+LEAVE_S: Final = 20.0
 
 
 class Box(NamedTuple):
@@ -53,7 +55,8 @@ class RequestLog:
     def wanting(self, path: Path, pose: Pose, within: float) -> list[Box]:
         """Return the boxes to request now, along a path; they count as requested.
 
-        Nothing is requested until something nearer than `within` [m] is missing; then all of the path is.
+        Nothing is requested until something nearer than `within` [m] is missing; then all of the
+        path is.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
@@ -117,7 +120,9 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return runs of the path, first and last metre, that have small boxes and contain every wanted point."""
+    """Return runs of the path, first and last metre, that have small boxes and contain every
+    wanted point.
+    """
     found: list[tuple[int, int]] = []
     first = last = -1
     for k in (np.flatnonzero(wanted) * STEP).tolist():

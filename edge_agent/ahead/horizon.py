@@ -27,7 +27,8 @@ UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (
 )  # lower end of a road that no vehicle has measured
 SHORTEST_M: Final = 150.0
 LONGEST_M: Final = 1000.0
-# Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an hour without a link.
+# Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an
+# hour without a link.
 WARN_ABOVE: Final = 0.8
 LEAST_VEHICLES: Final = 2  # as for an alert: one bad sensor warns nobody
 
@@ -72,7 +73,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
     there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
-    # the first place that is measured, else the first of which anything is known; an alert goes before both
+    # the first place that is measured, else the first of which anything is known; an alert goes
+    # before both
     rank = np.where(
         there,
         np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)),
@@ -117,12 +119,12 @@ def justifies_warning(found: PlaceBelief) -> BoolArray:
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the speed [m/s] at each metre (M,) that allows bends and stopping within SIGHT_M with the lower end of
-    grip.
+    """Return the speed [m/s] at each metre (M,) that allows bends and stopping within SIGHT_M with
+    the lower end of grip.
 
-    Before a slower place it falls with a comfortable deceleration, or with the grip that cornering leaves. Where
-    nothing is measured (NaN) there is no advice (NaN), except before a slower place, with no more braking than an
-    unknown road allows.
+    Before a slower place it falls with a comfortable deceleration, or with the grip that cornering
+    leaves. Where nothing is measured (NaN) there is no advice (NaN), except before a slower place,
+    with no more braking than an unknown road allows.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))
@@ -145,9 +147,11 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Return half the square of the speed that can be braked away from the car to each metre, (M,) [m^2/s^2].
+    """Return half the square of the speed that can be braked away from the car to each metre, (M,)
+    [m^2/s^2].
 
-    It uses the lower end of grip, at most comfortably; an unknown road allows what must be expected of any road.
+    It uses the lower end of grip, at most comfortably; an unknown road allows what must be expected
+    of any road.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

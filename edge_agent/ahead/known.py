@@ -1,7 +1,9 @@
-"""Local copy of the map around one car, with ages: bounded, and fading to unknown. Pure; time is an argument.
+"""Local copy of the map around one car, with ages: bounded, and fading to unknown. Pure; time is an
+argument.
 
-A cell's belief is built from the values of a tile: the share of μ below lower, median and upper end, and P(slippery).
-It then fades as in the map: the road may have changed since, and is unknown in that case.
+A cell's belief is built from the values of a tile: the share of μ below lower, median and upper
+end, and P(slippery). It then fades as in the map: the road may have changed since, and is unknown
+in that case.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ class ReceivedCells(NamedTuple):
     basis: IntArray
     vehicles: IntArray
     last_time: IntArray  # [ns] of the last observation
-    heard: IntArray  # [ns] when the map said so: when the car heard of it, or before, where an older tile came
+    # [ns] when the map said so: when the car heard of it, or before, where an older tile came
+    heard: IntArray
 
 
 class PlaceBelief(NamedTuple):
@@ -60,7 +63,8 @@ class PlaceBelief(NamedTuple):
 def belief_of(
     lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
 ) -> FloatArray:
-    """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be NaN.
+    """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be
+    NaN.
 
     The distribution function is linear between the known values.
     """
@@ -90,7 +94,9 @@ NOTHING: Final = ReceivedCells(
 
 
 class LocalMap:
-    """Cache of one car: received tiles, the latest with up to MOST_CELLS cells, and standing alerts."""
+    """Cache of one car: received tiles, the latest with up to MOST_CELLS cells, and standing
+    alerts.
+    """
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
         self._most = most_cells
@@ -160,8 +166,8 @@ class LocalMap:
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
         """Return the current knowledge of places (n,).
 
-        An alert for the opposite direction counts for this side too, as long as no better grip was found here since:
-        ice and water are not limited to a lane.
+        An alert for the opposite direction counts for this side too, as long as no better grip was
+        found here since: ice and water are not limited to a lane.
         """
         belief, basis, last, at, vehicles = self._rows(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -214,7 +220,9 @@ class LocalMap:
         )
 
     def belief(self, key: int, now: int) -> FloatArray | None:
-        """Return the current belief about one place, (32,); None if nothing or only a bound is known."""
+        """Return the current belief about one place, (32,); None if nothing or only a bound is
+        known.
+        """
         belief, basis, last, at, _ = self._rows(np.array([key]))
         if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
             return None

@@ -1,4 +1,5 @@
-"""Lookout: updates what vehicles see ahead once a second in a thread of its own, and at once when alerts change.
+"""Lookout: updates what vehicles see ahead once a second in a thread of its own, and at once when
+alerts change.
 
 The estimation loop only reports its position (`see`), which never blocks.
 """
@@ -245,8 +246,8 @@ class Lookout:
 def paths_ahead(
     pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float
 ) -> list[Path]:
-    """Return the ways on: the given route, else the roads visible in the map, else straight on; hold the subscriber's
-    lock."""
+    """Return the ways on: the given route, else the roads visible in the map, else straight on;
+    hold the subscriber's lock."""
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]

@@ -1,6 +1,8 @@
-"""Subscriptions and queries of one vehicle over its own session: alerts of the tiles ahead, the map along the way.
+"""Subscriptions and queries of one vehicle over its own session: alerts of the tiles ahead, the map
+along the way.
 
-Zenoh's threads call back; one lock protects the received data. Invalid messages are refused and counted.
+Zenoh's threads call back; one lock protects the received data. Invalid messages are refused and
+counted.
 """
 
 from __future__ import annotations
@@ -26,8 +28,8 @@ from schemas.wire.ahead import AHEAD_ENCODING
 
 log = logging.getLogger(__name__)
 ANSWER_S: Final = 5.0  # for an answer; the next look asks again
-# After a session came back a car asks once more if nobody answered yet: the service may come back later: Zenoh looks
-# for a router every 4 s at the latest.
+# After a session came back a car asks once more if nobody answered yet: the service may come back
+# later: Zenoh looks for a router every 4 s at the latest.
 AGAIN_S: Final = (1.0, 3.0, 9.0)
 _TOPIC: Final = keys.TOPICS["ahead"]
 
@@ -88,7 +90,8 @@ class MapSubscriber:
     def follow(self, paths: list[Path], pose: Pose, within: float) -> None:
         """Subscribe and query along the ways on, the likeliest first; never waits for an answer.
 
-        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see `RequestLog.wanting`.
+        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see
+        `RequestLog.wanting`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

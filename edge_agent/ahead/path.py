@@ -5,8 +5,8 @@ Legend
     key      cell·4 + sector: a place of the map                                   int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE where there is none
 
-A car of the fleet may have driven one lane aside, with a position error of 1.5 m. So each metre also covers places a
-little to the left and right, and both sectors near the border of a sector.
+A car of the fleet may have driven one lane aside, with a position error of 1.5 m. So each metre
+also covers places a little to the left and right, and both sectors near the border of a sector.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from schemas.thresholds import METRES_PER_DEGREE
 from schemas.wire.ahead import Way
 
 NONE: Final = -1
-BESIDE_M: Final = 4.0  # a lane's width and a receiver's error; no other carriageway of the same direction is as near
+# a lane's width and a receiver's error; no other carriageway of the same direction is as near
+BESIDE_M: Final = 4.0
 # in which a corner of a given route is driven: 9.5 m of radius at a right angle
 SMOOTH_M: Final = 15
 # from the line of a route: a receiver's error, a wide road, a coarse route
 OFF_ROUTE_M: Final = 20.0
 BACK_M: Final = 20.0  # a fix may jump back by so much
 ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
-# Unless the route heads like that so near, for corners are cut and turned into late; or begins so near: a navigation
-# system leaves out what has been driven, and how a route came to its beginning nobody knows.
+# Unless the route heads like that so near, for corners are cut and turned into late; or begins so
+# near: a navigation system leaves out what has been driven, and how a route came to its beginning
+# nobody knows.
 CORNER_M: Final = 20.0
 # a road without bends in sight; beyond, where it leads is anybody's guess
 CORRIDOR_M: Final = 150.0
@@ -98,7 +100,8 @@ def path_along(
 ) -> Path:
     """Return the way along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
-    `first` (n,) are known keys at the line's points; they precede those that follow from the position.
+    `first` (n,) are known keys at the line's points; they precede those that follow from the
+    position.
     """
     run = _run(line)
     count = max(int(min(run[-1], length)), 1)
@@ -153,7 +156,9 @@ class GivenRoute:
         return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
-        """Return the metre of the route at which the car is: the next one after the last, with the same heading."""
+        """Return the metre of the route at which the car is: the next one after the last, with
+        the same heading.
+        """
         step = np.diff(line, axis=0)
         start = line[:-1]
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
@@ -171,7 +176,8 @@ class GivenRoute:
             return None
         onward = fits & (at >= self._metre - BACK_M)
         among = np.flatnonzero(onward if onward.any() else fits)
-        # the nearest of those a little further on; a loop that is driven twice is not jumped ahead in
+        # the nearest of those a little further on; a loop that is driven twice is not jumped ahead
+        # in
         cost = off[among] + 0.1 * np.maximum(at[among] - self._metre, 0.0)
         return float(at[among[int(cost.argmin())]])
 

@@ -1,11 +1,13 @@
-"""Speed limit for a motion planner from the lower bound of grip ahead, as Autoware's message VelocityLimit.
+"""Speed limit for a motion planner from the lower bound of grip ahead, as Autoware's message
+VelocityLimit.
 
-The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place ahead. It falls at
-once and rises only after it was higher for HOLD_S, so that a planner does not see it flutter. A road that nobody
-measured gives no limit.
+The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place
+ahead. It falls at once and rises only after it was higher for HOLD_S, so that a planner does not
+see it flutter. A road that nobody measured gives no limit.
 
-Autoware listens on `/planning/scenario_planning/max_velocity_candidates` (tier4_planning_msgs/msg/VelocityLimit). The
-message is put as rmw_zenoh puts it: CDR, with an attachment of number, time and identity of the sender.
+Autoware listens on `/planning/scenario_planning/max_velocity_candidates`
+(tier4_planning_msgs/msg/VelocityLimit). The message is put as rmw_zenoh puts it: CDR, with an
+attachment of number, time and identity of the sender.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ _GID_BYTES: Final = 16
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
-    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT; inf without any.
+    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT;
+    inf without any.
 
     Args:
         distance: (M,) [m] from the vehicle.
@@ -98,7 +101,8 @@ class PlannerKey:
 
     Args:
         domain: of ROS.
-        type_hash: of the message in the planner's version, e.g. RIHS01_…; rmw_zenoh subscribes to it literally.
+        type_hash: of the message in the planner's version, e.g. RIHS01_…; rmw_zenoh subscribes to
+            it literally.
     """
 
     def __init__(self, domain: int = 0, type_hash: str = ANY_HASH) -> None:

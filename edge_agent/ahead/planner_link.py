@@ -1,4 +1,6 @@
-"""Zenoh session at the planner of the vehicle: its speed limit whenever it changes, and again every REPEAT_S."""
+"""Zenoh session at the planner of the vehicle: its speed limit whenever it changes, and again
+every REPEAT_S.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""The map as prior knowledge about the vehicle's current cell; it never enters what the vehicle publishes. Pure.
+"""The map as prior knowledge about the vehicle's current cell; it never enters what the vehicle
+publishes. Pure.
 
-The estimator runs as if there were no map: its recursion, and the evidence of a visit that is published, are the same
-bit for bit. Beside it stands what it would believe had it begun the visit with the map's belief:
+The estimator runs as if there were no map: its recursion, and the evidence of a visit that is
+published, are the same bit for bit. Beside it stands what it would believe had it begun the visit
+with the map's belief:
 
     q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at a cell's border
     p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            in the cell
@@ -14,11 +16,12 @@ Legend
             variation), BLIND where it knows only this one
     L       likelihood of the visit's measurements so far               (32,)
     β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 - β)·Z_M) with
-            Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take away, and what a visit found
-            holds for the next ones, KEPT of it from border to border
+            Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take away, and what a
+            visit found holds for the next ones, KEPT of it from border to border
 
-The filter's own belief is carried over a border, never the mixture, so that no cell of the map is counted twice.
-Hypotheses that are averaged by what they predicted: Hoeting et al., Bayesian model averaging, Stat. Sci. 14 (1999).
+The filter's own belief is carried over a border, never the mixture, so that no cell of the map is
+counted twice. Hypotheses that are averaged by what they predicted: Hoeting et al., Bayesian model
+averaging, Stat. Sci. 14 (1999).
 """
 
 from __future__ import annotations
@@ -30,9 +33,11 @@ import numpy as np
 from schemas import mugrid
 from schemas.numeric import FloatArray, IntArray
 
-SHARE: Final = 0.2  # of cells in which a map that says something sure is wrong: tyres, patches, fixes in the wrong cell
+# of cells in which a map that says something sure is wrong: tyres, patches, fixes in the wrong cell
+SHARE: Final = 0.2
 MOST: Final = 0.98
-KEPT: Final = 0.9  # per cell: ten cells, a hundred metres, after which a map that was wrong may be right again
+# per cell: ten cells, a hundred metres, after which a map that was wrong may be right again
+KEPT: Final = 0.9
 BLIND: Final = 0.5
 LEAST_CHANGE: Final = 0.05  # in a cell of ten metres, as the estimator's own road change of 190 m
 NOWHERE: Final = -1
@@ -51,7 +56,9 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # now
 
     def enters(self, keys: IntArray) -> list[int]:
-        """Return the vehicles that entered another place since the last step: their map beliefs are needed."""
+        """Return the vehicles that entered another place since the last step: their map beliefs
+        are needed.
+        """
         return np.flatnonzero(keys != self._key).tolist()
 
     def step(

@@ -1,9 +1,10 @@
-"""Roads visible in the map: sequences of cells and sectors that vehicles visited one after the other.
+"""Roads visible in the map: sequences of cells and sectors that vehicles visited one after the
+other.
 
-Two places of the map follow each other if the second lies within two cells, in front, and vehicles head there as they
-must when they come from the first. All ways at a fork are followed, the straightest first. After its last known place
-that way continues straight on, as far as a corridor: the car requests the map along its way, so a shorter way would
-never grow.
+Two places of the map follow each other if the second lies within two cells, in front, and vehicles
+head there as they must when they come from the first. All ways at a fork are followed, the
+straightest first. After its last known place that way continues straight on, as far as a corridor:
+the car requests the map along its way, so a shorter way would never grow.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map shows no road
-    here."""
+    """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map
+    shows no road here."""
     latitude, longitude = grid.centre(keys // grid.SECTORS)
     x, y = to_plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
@@ -122,7 +123,9 @@ def _follow_way(
 
 
 def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Return the heading of the last three links, because the cell centres of a slanting road zigzag."""
+    """Return the heading of the last three links, because the cell centres of a slanting road
+    zigzag.
+    """
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx = last[-1][0] - last[0][0]
     dy = last[-1][1] - last[0][1]

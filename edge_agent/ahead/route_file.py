@@ -1,4 +1,5 @@
-"""Route files: GPX (track, route or way points) and GeoJSON (a LineString, or an object that contains one).
+"""Route files: GPX (track, route or way points) and GeoJSON (a LineString, or an object that
+contains one).
 
 XML is read by events; a document that declares a type is refused before anything in it is expanded.
 """

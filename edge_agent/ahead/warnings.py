@@ -1,7 +1,8 @@
-"""Warnings: issued when a slippery stretch comes within reach, updated when it changes, ended when it is over. Pure.
+"""Warnings: issued when a slippery stretch comes within reach, updated when it changes, ended when
+it is over. Pure.
 
-Reach is the stopping distance before the stretch at the present speed: reaction, a margin, and braking at the lower end
-of grip on the road up to it.
+Reach is the stopping distance before the stretch at the present speed: reaction, a margin, and
+braking at the lower end of grip on the road up to it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Replay of many recorded drives to estimates, several at a time: here, or on Spark.
 
-It uses threads, because the kernels and Parquet release the interpreter lock, and the compiled code is loaded once.
-Both engines run the same function for each drive and write the same bytes.
+It uses threads, because the kernels and Parquet release the interpreter lock, and the compiled code
+is loaded once. Both engines run the same function for each drive and write the same bytes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Outcome(NamedTuple):
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
-    """Return one task per log, with its estimates under the log's name in `folder`; the vehicle file is next to the log
-    unless one is given.
+    """Return one task per log, with its estimates under the log's name in `folder`; the vehicle
+    file is next to the log unless one is given.
 
     Raises:
         InputError: two logs have one name, or estimates would replace a log.
@@ -70,7 +70,8 @@ def vehicle_file_of(log: Path) -> Path:
 def backfill(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all drives, `jobs` at a time; yield outcomes as they arrive. A bad drive stops no other.
+    """Estimate all drives, `jobs` at a time; yield outcomes as they arrive. A bad drive stops no
+    other.
 
     Raises:
         InputError: jobs is below 1.
@@ -87,11 +88,12 @@ def backfill(
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate like `backfill`, on the machines of Spark, all of which see the same files; outcomes in the tasks'
-    order.
+    """Estimate like `backfill`, on the machines of Spark, all of which see the same files; outcomes
+    in the tasks' order.
 
     Raises:
-        InputError: Spark is not available or gave up, or the folder of the estimates cannot be created.
+        InputError: Spark is not available or gave up, or the folder of the estimates cannot be
+            created.
     """
     folders = {writable("out", task.out).parent for task in tasks}
     yield from spark.spread(
@@ -104,7 +106,9 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write its file atomically, also if another process estimates the same drive."""
+    """Estimate one drive and write its file atomically, also if another process estimates the
+    same drive.
+    """
     folder = task.out.parent
     with own_drafts(folder) as drafts:
         outcome = estimate(task._replace(out=drafts / task.out.name), estimator, memberships)

@@ -1,7 +1,7 @@
 """Report of a drive: the estimates of one or more estimators as an HTML page or an image.
 
-Speed, sideslip, friction with its 90 % band, grip in use, health and the track share one time axis. The HTML page is
-one file that needs no network; pointing at a plot reads all values of that moment.
+Speed, sideslip, friction with its 90 % band, grip in use, health and the track share one time axis.
+The HTML page is one file that needs no network; pointing at a plot reads all values of that moment.
 """
 
 from __future__ import annotations
@@ -95,7 +95,9 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time, value, and both ends of the band of a quantity, (n,) each; NaN where there is none."""
+    """Return time, value, and both ends of the band of a quantity, (n,) each; NaN where there is
+    none.
+    """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
         low, high = (table[name].to_numpy().astype(np.float64) for name in panel.band)
@@ -177,7 +179,9 @@ def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
 
 
 def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
-    """Return the places of the drive [m from its middle] with time and the colour of the first estimator's mu."""
+    """Return the places of the drive [m from its middle] with time and the colour of the first
+    estimator's mu.
+    """
     position = drive.log.signals[:, [S.LATITUDE, S.LONGITUDE]].reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(position).all(axis=1))
     if len(known) < 2:

@@ -110,7 +110,9 @@ class EstimatesFile:
 
 
 def table(t: FloatArray, estimates: Estimates) -> pa.Table:
-    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null if the bank has one mu."""
+    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null if
+    the bank has one mu.
+    """
     wheels = estimates.mu_wheel
     columns: list[Any] = []
     for field in ESTIMATES_SCHEMA:

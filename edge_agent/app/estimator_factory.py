@@ -32,9 +32,8 @@ def bank_of(
         memberships: fuzzy sets instead of the shipped ones.
 
     Raises:
-        InputError: there is no such estimator, no vehicle, memberships for an estimator that has none, or its tuned
-            ones
-            cannot be read.
+        InputError: there is no such estimator, no vehicle, memberships for an estimator that has
+            none, or its tuned ones cannot be read.
     """
     estimator, _, own = estimator.partition("@")
     if own and own not in plugins.entry_points_of(plugins.TYRE_CURVES):

@@ -32,7 +32,8 @@ DEFAULT = "aco-fckf"
 
 
 def read_log(path: Path | str) -> SignalLog:
-    """Return a signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of schemas.signals.CHANNELS, SI units.
+    """Return a signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of
+    schemas.signals.CHANNELS, SI units.
 
     Raises:
         InputError: it cannot be read, or lacks a required column; names column, row and fix.
@@ -53,10 +54,12 @@ def load_memberships(path: Path | str) -> Memberships:
 def make_bank(
     estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None
 ) -> EstimatorBank:
-    """Return N estimators, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals (T, N, 18).
+    """Return N estimators, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals
+    (T, N, 18).
 
     Raises:
-        InputError: there is no such estimator, no vehicle, or memberships for an estimator that has none.
+        InputError: there is no such estimator, no vehicle, or memberships for an estimator that has
+            none.
     """
     return bank_of(estimator, vehicles, memberships)
 
@@ -68,10 +71,11 @@ def estimate(
     *,
     memberships: Memberships | None = None,
 ) -> pa.Table:
-    """Return the estimates of a log, one row per sample, with the columns of schemas.tables.ESTIMATES.
+    """Return the estimates of a log, one row per sample, with the columns of
+    schemas.tables.ESTIMATES.
 
-    Known device errors of a calibrated vehicle file and the lags that the signal doctor measures are corrected in the
-    signals first, as in `edge-agent replay`.
+    Known device errors of a calibrated vehicle file and the lags that the signal doctor measures
+    are corrected in the signals first, as in `edge-agent replay`.
     """
     log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)
@@ -95,7 +99,8 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
 def plot(
     estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = ""
 ) -> Figure:
-    """Plot speed and friction with its 90 % band over time, for several estimators by name; `truth` is a simulated log.
+    """Plot speed and friction with its 90 % band over time, for several estimators by name; `truth`
+    is a simulated log.
 
     Raises:
         InputError: matplotlib is not installed.

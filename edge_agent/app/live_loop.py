@@ -1,7 +1,8 @@
-"""Live loop: blocks of samples in real time through the pipeline to the publisher, until it is stopped.
+"""Live loop: blocks of samples in real time through the pipeline to the publisher, until it is
+stopped.
 
-The clock paces the loop. A block that is finished more than its own length too late counts as behind. Nothing is
-skipped: a loop that fell behind catches up as fast as it can.
+The clock paces the loop. A block that is finished more than its own length too late counts as
+behind. Nothing is skipped: a loop that fell behind catches up as fast as it can.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the loop: seconds of signals, blocks, late blocks, the longest and the last lag [s].
+    """Progress of the loop: seconds of signals, blocks, late blocks, the longest and the last lag
+    [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -54,10 +56,11 @@ def drive(
     admitted: Callable[[], bool] = lambda: True,
     after: Callable[[], None] = lambda: None,
 ) -> Progress:
-    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
+    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open
+    visits.
 
-    `progress` is updated while it runs, and returned. Records of blocks that are not `admitted` are held back and
-    counted. `after` is called after each block.
+    `progress` is updated while it runs, and returned. Records of blocks that are not `admitted` are
+    held back and counted. `after` is called after each block.
     """
     progress = progress or Progress()
     status_at = STATUS_EVERY_S
@@ -112,8 +115,8 @@ def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: R
 
 
 def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the final counts of records, all kinds together and observations alone, and lags and blocks of the
-    loop."""
+    """Return the final counts of records, all kinds together and observations alone, and lags and
+    blocks of the loop."""
     counts = publisher.counts
     seen = Kind.OBSERVATION
     return {

@@ -1,4 +1,6 @@
-"""Estimates as MCAP for Foxglove and other viewers: JSON messages with a schema, one per sample on one topic."""
+"""Estimates as MCAP for Foxglove and other viewers: JSON messages with a schema, one per sample
+on one topic.
+"""
 
 from __future__ import annotations
 

@@ -103,11 +103,13 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
         found.append("the outbox is full: the oldest states are dropped first")
     if abs(publisher.clock_behind_s) > CLOCK_OFF_S:
         found.append(
-            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive late or are refused"
+            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive "
+            "late or are refused"
         )
     if publisher.stranded:
         found.append(
-            f"{publisher.stranded} records are stored under a former name; run once with the former --name"
+            f"{publisher.stranded} records are stored under a former name; run once with the "
+            "former --name"
         )
     if publisher.broken:
         found.append("the sending thread has died; restart the agent")

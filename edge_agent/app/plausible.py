@@ -25,10 +25,11 @@ MOST_RESETS_PER_S: Final = 0.2
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
-    """Return the grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where they are missing.
+    """Return the grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where
+    they are missing.
 
-    `mu_utilised` would not do, because it looks back a second: on a road that has just become slippery more was used
-    than is available.
+    `mu_utilised` would not do, because it looks back a second: on a road that has just become
+    slippery more was used than is available.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -95,7 +96,8 @@ class Plausibility:
         """Return the summary line."""
         n = max(self.samples, 1)
         summary = (
-            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} off the wheels, "
+            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "
+            "off the wheels, "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"violations {self.violations / n:.1%}, resets {self.resets}"
         )

@@ -87,7 +87,8 @@ class SignalWatch:
 def reasons(
     watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
 ) -> list[str]:
-    """Return the reasons why nothing is published, the first cause first; empty if records can be published.
+    """Return the reasons why nothing is published, the first cause first; empty if records can be
+    published.
 
     Args:
         watch: has seen the blocks.
@@ -102,12 +103,14 @@ def reasons(
         found.append("the vehicle stands: only a moving vehicle visits cells")
     if watch.missing("position"):
         found.append(
-            "no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and longitude"
+            "no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and "
+            "longitude"
         )
     where = ", ".join(endpoints)
     if not publisher.links:
         found.append(
-            f"no router answers at {where}: start one with `gripmap router`, or correct zenoh.connect"
+            f"no router answers at {where}: start one with `gripmap router`, or correct "
+            "zenoh.connect"
         )
     elif publisher.cut_off:
         found.append(

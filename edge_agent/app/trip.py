@@ -1,9 +1,10 @@
-"""Live trip: verified by the signal doctor, and learned from; the knowledge of the car is stored next to the outbox.
+"""Live trip: verified by the signal doctor, and learned from; the knowledge of the car is stored
+next to the outbox.
 
-Nothing is published before the doctor has passed the signals, in this trip or in an earlier one with the same vehicle
-file and profile. A trip is examined in parts of PART_S. Each part that passes is learned from; one that shows a fault
-revokes the approval. Learned values are used from the next trip on, because an estimator's vehicle does not change
-during a trip.
+Nothing is published before the doctor has passed the signals, in this trip or in an earlier one
+with the same vehicle file and profile. A trip is examined in parts of PART_S. Each part that passes
+is learned from; one that shows a fault revokes the approval. Learned values are used from the next
+trip on, because an estimator's vehicle does not change during a trip.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge of a car: whether its signals passed, and the estimates of each part of a trip."""
+    """Stored knowledge of a car: whether its signals passed, and the estimates of each part of a
+    trip.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -93,13 +96,15 @@ class Trip:
     def blocks(
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
-        """Yield the blocks of a source with known device errors corrected; the raw ones are kept for the doctor.
+        """Yield the blocks of a source with known device errors corrected; the raw ones are kept
+        for the doctor.
 
         `ground` returns the speed over ground (T,) of the last block.
         """
         if not self.admitted():
             log.info(
-                "nothing is published until the signal doctor has passed half a minute of turns and braking"
+                "nothing is published until the signal doctor has passed half a minute of turns "
+                "and braking"
             )
         corrector = Corrector(self.vehicle)
         with closing(source):
@@ -158,7 +163,8 @@ class Trip:
             return
         if diagnosis.passed and not self._known.passed:
             log.info(
-                "the signal doctor has passed: units, signs, clocks and offsets agree with each other"
+                "the signal doctor has passed: units, signs, clocks and offsets agree with each "
+                "other"
             )
         passed = diagnosis.passed or (self._known.passed and not self._faults)
         if estimates or passed != self._known.passed:
@@ -180,7 +186,9 @@ def _identity(vehicle: Vehicle, profile: Profile) -> str:
 
 
 def _read(path: Path, identity: str) -> Known:
-    """Return the stored knowledge of the car; empty if the file is missing, broken, or of another car."""
+    """Return the stored knowledge of the car; empty if the file is missing, broken, or of
+    another car.
+    """
     try:
         known = Known.model_validate_json(path.read_bytes())
     except FileNotFoundError:

@@ -27,7 +27,9 @@ class Record(BaseModel):
 
 
 class Score(Record):
-    """Scores of one set of memberships on one set of drives; null if the true friction is unknown."""
+    """Scores of one set of memberships on one set of drives; null if the true friction is
+    unknown.
+    """
 
     interval_score: Annotated[
         Finite | None, Field(description="of the 90 % friction interval, less is better [1]")
@@ -104,7 +106,8 @@ def parse(text: str | bytes, where: str) -> Tuned:
     """Return the tuned memberships in a document.
 
     Raises:
-        InputError: a field is missing, unknown, not a finite number, or a vertex is out of order or out of range.
+        InputError: a field is missing, unknown, not a finite number, or a vertex is out of order or
+            out of range.
     """
     try:
         document = Document.model_validate_json(text)
@@ -144,7 +147,9 @@ def shipped(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the results of every search behind the shipped file, by search; empty if the file does not have them."""
+    """Return the results of every search behind the shipped file, by search; empty if the file
+    does not have them.
+    """
     document = load(FOLDER / f"{estimator}.json").document
     return {
         way: [Memberships.from_json(one) for one in found]

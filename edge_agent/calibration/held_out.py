@@ -1,8 +1,9 @@
 """Judgement of a calibration on drives that it was not learned from.
 
-A calibration is a set of groups (radii, steering, inertial unit, clocks, torque). Each group is kept only if a car with
-it predicts held-out drives at least as well as one without: the predictive log-likelihood of the estimator's own
-innovations does not fall, and the model is not contradicted for longer.
+A calibration is a set of groups (radii, steering, inertial unit, clocks, torque). Each group is
+kept only if a car with it predicts held-out drives at least as well as one without: the predictive
+log-likelihood of the estimator's own innovations does not fall, and the model is not contradicted
+for longer.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ class Prediction(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """The calibration to write, the groups that were left out, and predictions without and with it."""
+    """The calibration to write, the groups that were left out, and predictions without and with
+    it.
+    """
 
     calibration: Calibration
     refused: list[str]
@@ -99,7 +102,9 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
 
 
 def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
-    """Return pairs of drives to learn from and the drive to judge by; a single drive is cut in two."""
+    """Return pairs of drives to learn from and the drive to judge by; a single drive is cut in
+    two.
+    """
     if len(drives) == 1:
         t, signals = drives[0]
         if t[-1] - t[0] < 2.0 * LEAST_PART_S:
@@ -124,7 +129,9 @@ def restrict(calibration: Calibration, groups: Sequence[str]) -> Calibration:
 
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
-    """Return True if predictions are worse on the mean of the drives, or one drive is contradicted for longer."""
+    """Return True if predictions are worse on the mean of the drives, or one drive is
+    contradicted for longer.
+    """
     lost = _mean(best).log_likelihood - _mean(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))
     return lost > WORSE or longer > LONGER

@@ -1,4 +1,5 @@
-"""Errors of one car's devices from its own drives, each a mean over the drives with its standard deviation.
+"""Errors of one car's devices from its own drives, each a mean over the drives with its standard
+deviation.
 
     quantity          from
     radius_fl … rr    turning of each wheel against the mean of the four on calm moments, less what yaw and slip explain
@@ -8,17 +9,20 @@
     force_gain        torque over radius, over mass times acceleration: torque gain and mass, where torque is recorded
     wheel_lag, steer_lag    by which they speak later than the inertial unit: lags.py
 
-At one speed gain and understeer are the same; only a prior that the whole fleet shares tells them apart there. So the
-regression of a drive begins from USUAL around SOUND, and its standard deviations say how much of that is left.
+At one speed gain and understeer are the same; only a prior that the whole fleet shares tells them
+apart there. So the regression of a drive begins from USUAL around SOUND, and its standard
+deviations say how much of that is left.
 
-Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is taken off a radius by
-the file's stiffness, its driven axle, and what usual cars lose to air and to the tyres' rolling.
+Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is
+taken off a radius by the file's stiffness, its driven axle, and what usual cars lose to air and to
+the tyres' rolling.
 
-A drive that was not excited enough for a quantity leaves it out. The median deviation among drives (not less than
-FLOOR, as few drives may agree by chance) over the root of their number, and BIAS, what all drives have in common
-(crossfall of 2.5 %, a steering map that is bent, load), make the standard deviation. Both were set on 40 simulated
-rough cars with other seeds than those of the figures. A quantity that was hardly seen is drawn to what cars usually
-have (USUAL): value and standard deviation are those of the posterior.
+A drive that was not excited enough for a quantity leaves it out. The median deviation among drives
+(not less than FLOOR, as few drives may agree by chance) over the root of their number, and BIAS,
+what all drives have in common (crossfall of 2.5 %, a steering map that is bent, load), make the
+standard deviation. Both were set on 40 simulated rough cars with other seeds than those of the
+figures. A quantity that was hardly seen is drawn to what cars usually have (USUAL): value and
+standard deviation are those of the posterior.
 """
 
 from __future__ import annotations
@@ -95,7 +99,9 @@ ROLLING: Final = 0.008  # [1] rolling resistance over load
 BRAKED_FRONT: Final = 0.7  # [1] share of the front axle in braking
 
 DriveEstimates: TypeAlias = dict[str, float]
-"""Estimates of one drive, by quantity; QUANTITY_std is what its own regression leaves unknown of it."""
+"""Estimates of one drive, by quantity; QUANTITY_std is what its own regression leaves unknown of
+it.
+"""
 
 
 def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
@@ -135,7 +141,9 @@ def weighed(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration |
 
 
 def surer(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Return, of each quantity, the value with the smaller standard deviation of two calibrations of a car."""
+    """Return, of each quantity, the value with the smaller standard deviation of two
+    calibrations of a car.
+    """
     if one is None or other is None:
         return one or other
     better = {
@@ -150,7 +158,8 @@ def surer(one: Calibration | None, other: Calibration | None) -> Calibration | N
 def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tuple[float, float]:
     """Value and standard deviation by the estimates of drives (n,).
 
-    `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what is usual already.
+    `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what
+    is usual already.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
@@ -166,7 +175,9 @@ def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tu
 
 
 def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
-    """Estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; what it was not excited for is left out."""
+    """Estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; what it was not
+    excited for is left out.
+    """
     return _quantities(prepare(t, signals, vehicle), vehicle) | lags(t, signals, vehicle)
 
 
@@ -190,7 +201,9 @@ def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def trace_steering(drive: EvenDrive) -> DriveEstimates:
-    """Return offset, gain and understeer of the steering with their standard deviations, from the way that it makes."""
+    """Return offset, gain and understeer of the steering with their standard deviations, from
+    the way that it makes.
+    """
     fast = np.maximum(drive.v, STEERED_M_S)
     across = drive.v * drive.r
     rows = (drive.moving > 0) & np.isfinite(drive.delta) & np.isfinite(across)
@@ -237,7 +250,8 @@ def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
 
 
 def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    """Torque against what moves the file's mass, by the wheels: an accelerometer pitches with the body.
+    """Torque against what moves the file's mass, by the wheels: an accelerometer pitches with the
+    body.
 
     Slope, air and rolling are beside it: they do not go with acceleration.
     """
@@ -250,9 +264,11 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def _slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
-    """Slip of the wheels against the mean of the four, (n, 4): what drives, less what it takes to turn the others.
+    """Slip of the wheels against the mean of the four, (n, 4): what drives, less what it takes to
+    turn the others.
 
-    The accelerometer feels the tyres' force less the air's, on slopes too; its offset is what it reads beside dv/dt.
+    The accelerometer feels the tyres' force less the air's, on slopes too; its offset is what it
+    reads beside dv/dt.
     """
     if vehicle.drive_split_front is None:
         return np.zeros((int(rows.sum()), 4))

@@ -1,7 +1,7 @@
 """`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
-needs them, so that help is fast.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported
+when a command needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ COMMANDS: Final = (
         "simulate",
         "edge_agent.cli.simulate",
         "write the signal log of a manoeuvre, with truth",
-        "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet --vehicle-out drive.json",
+        "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet "
+        "--vehicle-out drive.json",
     ),
     Command(
         "import",
         "edge_agent.cli.import_",
         "convert a car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
-        "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out drive.parquet",
+        "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out "
+        "drive.parquet",
     ),
     Command(
         "check",

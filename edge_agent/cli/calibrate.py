@@ -1,4 +1,6 @@
-"""`edge-agent calibrate`: learn the device errors of a car from its drives; writes a vehicle file."""
+"""`edge-agent calibrate`: learn the device errors of a car from its drives; writes a vehicle
+file.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 
 def report_lines(found: HeldOut) -> list[str]:
-    """Return the learned values with units, the groups that were left out, and the judgement on held-out drives."""
+    """Return the learned values with units, the groups that were left out, and the judgement on
+    held-out drives.
+    """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():
         if isinstance(estimate, tuple):
@@ -100,7 +104,9 @@ def report_lines(found: HeldOut) -> list[str]:
     before = found.before
     after = found.after
     lines.append(
-        f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} -> "
-        f"{after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> {after.contradicted:.3f}"
+        f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} "
+        "-> "
+        f"{after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> "
+        f"{after.contradicted:.3f}"
     )
     return lines

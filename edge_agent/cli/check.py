@@ -1,4 +1,6 @@
-"""`edge-agent check`: run the signal doctor on a log; lists sound and faulty signals with their corrections."""
+"""`edge-agent check`: run the signal doctor on a log; lists sound and faulty signals with their
+corrections.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
             )
         for finding in left:
             _tell(
-                f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise"
+                f"not mended: {finding.channel} {finding.kind}: its recording must be decoded "
+                "otherwise"
             )
         _tell(f"{args.fix}: the corrected profile; import the recording again with it")
     return 0 if diagnosis.passed else NOT_PASSED

@@ -1,4 +1,6 @@
-"""Shared parts of the commands: estimators by name, closing of a publisher, signals, vehicle names."""
+"""Shared parts of the commands: estimators by name, closing of a publisher, signals, vehicle
+names.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,8 @@ def publisher_of(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's session.
+    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's
+    session.
 
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
@@ -93,7 +96,9 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
 
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
-    """Print on stderr the faults that the signal doctor finds in a log; return notes to print after the estimates."""
+    """Print on stderr the faults that the signal doctor finds in a log; return notes to print
+    after the estimates.
+    """
     found = diagnosis.findings
     for fault in found:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
@@ -132,15 +137,17 @@ def stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-# Set when a session or a source hangs, on a frozen router, say: what its library does at the exit may wait for it. So
-# the command line ends the process itself, once the command has closed its files and its exit code is known.
+# Set when a session or a source hangs, on a frozen router, say: what its library does at the exit
+# may wait for it. So the command line ends the process itself, once the command has closed its
+# files and its exit code is known.
 left_behind = threading.Event()
 
 
 def close_publisher(
     publisher: Publisher, progress: Progress, drain_s: float, **more: float
 ) -> None:
-    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on stdout.
+    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on
+    stdout.
 
     Unsettled records stay in the outbox for the next start.
     """
@@ -160,7 +167,8 @@ def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[s
     counts = publisher.counts
     late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""
     text = (
-        f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
+        f"{progress.signals_s:7.1f} s  {publisher.links} sessions, "
+        f"{sum(counts.published.values())} records published, "
         f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
     )
     log_line(LogLine(text, event="status", **summary(progress, publisher)))

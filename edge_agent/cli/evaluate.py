@@ -54,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper",
         choices=PAPERS,
-        help="one paper under its own conditions: its figures and tables next to ours, as index.html and report.md; "
+        help="one paper under its own conditions: its figures and tables next to ours, as "
+        "index.html and report.md; "
         "ends with 1 if a matched number misses the printed one",
     )
     parser.add_argument(

@@ -1,4 +1,6 @@
-"""`edge-agent fleet`: simulated vehicles in real time, each with its own session and name, one estimator bank."""
+"""`edge-agent fleet`: simulated vehicles in real time, each with its own session and name, one
+estimator bank.
+"""
 
 from __future__ import annotations
 

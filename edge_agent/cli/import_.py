@@ -1,4 +1,6 @@
-"""`edge-agent import`: convert a car's recording to a signal log by a profile; without one, a profile is drafted."""
+"""`edge-agent import`: convert a car's recording to a signal log by a profile; without one, a
+profile is drafted.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,8 @@ def run(args: argparse.Namespace) -> int:
     ]
     if lacking:
         print(
-            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the profile"
+            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
+            "profile"
         )
     print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
     return 0

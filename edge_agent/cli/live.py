@@ -69,9 +69,9 @@ def drive_live(
 ) -> int:
     """Drive in real time, call `at_end`, and shut down; print a line of counts and return 0.
 
-    Records made while not `admitted` are not published; `troubled` returns the problems of the sources. A `lookout`
-    receives the map over the vehicles' sessions. `vss` reports the friction at the vehicles if their signals are
-    admitted. `memberships` replace the estimator's own.
+    Records made while not `admitted` are not published; `troubled` returns the problems of the
+    sources. A `lookout` receives the map over the vehicles' sessions. `vss` reports the friction at
+    the vehicles if their signals are admitted. `memberships` replace the estimator's own.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
@@ -157,8 +157,8 @@ def _show(lookout: Lookout, pipeline: Pipeline) -> None:
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
-    """Return a function that prints warnings on stdout: text, or JSON if the log is JSON; an infinite time is null
-    there."""
+    """Return a function that prints warnings on stdout: text, or JSON if the log is JSON; an
+    infinite time is null there."""
     say = line_logger(config.log, sys.stdout)
 
     def tell(vehicle: str, warning: GripWarning) -> None:

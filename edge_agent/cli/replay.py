@@ -1,4 +1,6 @@
-"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one to the map."""
+"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one to
+the map.
+"""
 
 from __future__ import annotations
 
@@ -70,12 +72,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
     parser.add_argument(
         "--start",
-        help="time of t = 0, UTC without a zone, or 'now', such that it ends now (default: the log's, else now)",
+        help="time of t = 0, UTC without a zone, or 'now', such that it ends now (default: the "
+        "log's, else now)",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused, 3 if not plausible."""
+    """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused,
+    3 if not plausible.
+    """
     from edge_agent.app.backfill import backfill, backfill_on_spark, tasks_of, vehicle_file_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of

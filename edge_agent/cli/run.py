@@ -1,4 +1,6 @@
-"""`edge-agent run`: drive one vehicle live; signals come from its buses, a simulation, or a log paced in real time."""
+"""`edge-agent run`: drive one vehicle live; signals come from its buses, a simulation, or a log
+paced in real time.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         action="append",
-        help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
-        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
+        help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are "
+        "sources: "
+        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a "
+        "package of yours",
     )
     parser.add_argument(
         "--profile", help="profile that maps live signals to channels: a file, or a shipped one"

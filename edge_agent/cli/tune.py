@@ -1,7 +1,8 @@
-"""`edge-agent tune`: search the memberships by ant colony and by a random search of equal budget; write the best
-result.
+"""`edge-agent tune`: search the memberships by ant colony and by a random search of equal budget;
+write the best result.
 
-With --study: run paper 004's own filter under right and wrong R, several searches each, with figures, table and plot.
+With --study: run paper 004's own filter under right and wrong R, several searches each, with
+figures, table and plot.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--objective",
         choices=tuple(OBJECTIVES),
-        help="interval score of friction (needs the truth: simulated drives' default), log-likelihood of the"
+        help="interval score of friction (needs the truth: simulated drives' default), "
+        "log-likelihood of the"
         " innovations, or that with a price on wrong calibration (default with logs: predictive)",
     )
     parser.add_argument(
@@ -95,7 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--study",
         type=Path,
         metavar="DIR",
-        help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
+        help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, "
+        "paper-aco-fckf.json",
     )
     parser.add_argument(
         "--quick", action="store_true", help="a few ants on short drives, to check that it runs"
@@ -127,7 +130,8 @@ def run(args: argparse.Namespace) -> int:
     chosen = args.objective or ("predictive" if args.log else "interval")
     train, held_out = _drives(args, chosen, duration)
     print_line(
-        f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, {duration:g} s each"
+        f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, "
+        f"{duration:g} s each"
     )
     objective = objective_on(train, ESTIMATOR, chosen)
     objective(
@@ -152,8 +156,10 @@ def run(args: argparse.Namespace) -> int:
     winner = max(WAYS, key=lambda way: _worth(scores[way].held_out, chosen))
     evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
     command = (
-        f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats {args.repeats}"
-        f" --objective {chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
+        f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats "
+        f"{args.repeats}"
+        " --objective "
+        f"{chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
     )
     document = _document(
         found[winner],
@@ -172,7 +178,9 @@ def run(args: argparse.Namespace) -> int:
 def _drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return the drives to search on and to judge by: simulated ones, or parts of the given logs."""
+    """Return the drives to search on and to judge by: simulated ones, or parts of the given
+    logs.
+    """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
     if objective == "interval":
@@ -190,7 +198,9 @@ def _drives(
 
 
 def _worth(score: Score, objective: str) -> float:
-    """Return the worth of a search: minus the cost of false and missed ice if truth is known, else the objective."""
+    """Return the worth of a search: minus the cost of false and missed ice if truth is known,
+    else the objective.
+    """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}
     scores = TuningScores(**(unknown | known))
@@ -275,15 +285,16 @@ def print_line(line: str) -> None:
 def reporter(
     way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]
 ) -> Progress:
-    """Return a function that prints one line per iteration: best, mean, elapsed and expected remaining time by `clock`
-    [s]."""
+    """Return a function that prints one line per iteration: best, mean, elapsed and expected
+    remaining time by `clock` [s]."""
     began = clock()
 
     def log_line(line: Iteration) -> None:
         elapsed = clock() - began
         left = elapsed / line.iteration * (iterations - line.iteration)
         write(
-            f"{way:<7} {line.iteration:>3}/{iterations}   best {line.best:.4f}   mean {line.mean:.4f}   "
+            f"{way:<7} {line.iteration:>3}/{iterations}   best {line.best:.4f}   mean "
+            f"{line.mean:.4f}   "
             f"evaluations {line.evaluations:>4}   elapsed {elapsed:4.0f} s   left {left:4.0f} s"
         )
 
@@ -327,12 +338,16 @@ def _number(value: float | None, digits: int) -> str:
 def table(scores: dict[str, SplitScores]) -> str:
     """Return the comparison as plain text, one row per search and set of drives."""
     lines = [
-        f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"
+        (
+            f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} "
+            f"{'NIS':>6}"
+        )
     ]
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):
             lines.append(
-                f"{way:<8} {drives:<9} {_number(score.interval_score, 4):>15} {_number(score.coverage, 3):>9}"
+                f"{way:<8} {drives:<9} {_number(score.interval_score, 4):>15} "
+                f"{_number(score.coverage, 3):>9}"
                 f" {score.log_likelihood:>20.2f} {score.nis_ratio:>6.2f}"
             )
     return "\n".join(lines)

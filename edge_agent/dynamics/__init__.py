@@ -1,1 +1,3 @@
-"""Vehicle and tyre equations as compiled scalar functions, independent of filters, files and clocks."""
+"""Vehicle and tyre equations as compiled scalar functions, independent of filters, files and
+clocks.
+"""

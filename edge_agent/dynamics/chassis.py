@@ -1,4 +1,6 @@
-"""Body and four tyres together: the accelerations of a vehicle for given state, steering, wheel speeds and friction."""
+"""Body and four tyres together: the accelerations of a vehicle for given state, steering, wheel
+speeds and friction.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
 @compiled
 def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
-    """(4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel speed (4,) [rad/s]."""
+    """(4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel
+    speed (4,) [rad/s].
+    """
     out = np.empty((4, 3))
     for wheel in range(4):
         out[wheel, 0], out[wheel, 1], out[wheel, 2] = (
@@ -35,7 +39,9 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
 def _slips(
     radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
 ) -> tuple[float, float]:
-    """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta), sin(delta)."""
+    """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta),
+    sin(delta).
+    """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
     slip_x, slip_y = slips(radius, omega, along, across)
@@ -44,9 +50,11 @@ def _slips(
 
 @inlined
 def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, float]:
-    """Return the slip stiffness (along [N], across [N/rad]) of a tyre under `load` [N] on friction `mu`.
+    """Return the slip stiffness (along [N], across [N/rad]) of a tyre under `load` [N] on friction
+    `mu`.
 
-    It is in proportion to load alone, unless the row says otherwise: PROPORTIONAL, QUADRATIC, REAR_SLOPE.
+    It is in proportion to load alone, unless the row says otherwise: PROPORTIONAL, QUADRATIC,
+    REAR_SLOPE.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
     share = (1.0 + body.proportional * (mu - 1.0)) * by_load
@@ -64,10 +72,11 @@ def tyre_forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Fill force_x, force_y (4,) [N] at motion (5,) = v_x, v_y, r, a_x, a_y; the accelerations give the loads.
+    """Fill force_x, force_y (4,) [N] at motion (5,) = v_x, v_y, r, a_x, a_y; the accelerations give
+    the loads.
 
-    wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of the Magic Formula
-    (e = 0), or DUGOFF.
+    wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of
+    the Magic Formula (e = 0), or DUGOFF.
     """
     parameters = body(row)
     loads = wheel_loads(parameters, motion[3], motion[4])
@@ -115,7 +124,8 @@ class WheelInputs(NamedTuple):
 def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[float, float, float]:
     """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces.
 
-    Written out per wheel, with numbers and no arrays between: this is where the papers' filters spend their time.
+    Written out per wheel, with numbers and no arrays between: this is where the papers' filters
+    spend their time.
     """
     vx, vy, rate, ax, ay = motion
     cos, sin, omega, force_x, mu = wheels
@@ -156,7 +166,9 @@ def _pull(
     wheel: tuple[float, float, float, float, float, float],
     rear: bool,
 ) -> tuple[float, float]:
-    """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given longitudinal force."""
+    """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given
+    longitudinal force.
+    """
     load, mu, cos, sin, omega, given_x = wheel
     slip = _slips(body.radius, ahead, aside, cos, sin, omega)
     force_x, force_y = combined_dugoff(slip, stiffness(body, load, mu, rear), mu, load)

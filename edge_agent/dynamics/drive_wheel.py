@@ -1,4 +1,5 @@
-"""The electric drive wheel: motor, wheel and tyre force, and the force's derivative by a sliding mode (paper 002).
+"""The electric drive wheel: motor, wheel and tyre force, and the force's derivative by a sliding
+mode (paper 002).
 
 Legend
     tau         motor torque at the wheel, K_t*i [N m]              J   inertia of wheel and rotor [kg m^2]
@@ -6,9 +7,10 @@ Legend
     omega       wheel speed [rad/s]                                 R   wheel radius [m]
     F, F'       longitudinal force and its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
 
-tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31).
-Torque stands for current: the paper's K_a, K_t and J are not of one machine, and there are no signals of current or
-voltage. (31) prints the derivative of F where that of F' belongs, and takes the sign of a difference of unlike units.
+tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31). Torque
+stands for current: the paper's K_a, K_t and J are not of one machine, and there are no signals of
+current or voltage. (31) prints the derivative of F where that of F' belongs, and takes the sign of
+a difference of unlike units.
 """
 
 from __future__ import annotations
@@ -52,7 +54,9 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at all ordinary slips."""
+    """Weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at all
+    ordinary slips.
+    """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)
     size = min(abs(turning - along) / most, 1.0)

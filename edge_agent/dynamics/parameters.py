@@ -33,15 +33,17 @@ class Parameter(IntEnum):
     PROPORTIONAL = 12  # 1: slip stiffness is proportional to friction (000, 003, 004 as printed)
     # e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
     QUADRATIC = 13
-    REAR_SLOPE = 14  # cornering stiffness per load of the rear tyres over that of the front ones (002, table 1)
+    # cornering stiffness per load of the rear tyres over that of the front ones (002, table 1)
+    REAR_SLOPE = 14
 
 
 def parameter_row(vehicle: Vehicle) -> FloatArray:
     """The parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
-    Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per newton of load makes
-    them valid for the lightly and the heavily loaded wheel alike. Where the file has a rear stiffness of its own, that
-    one counts: the front axle's difference from it is compliance, a state of the default estimator.
+    Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per
+    newton of load makes them valid for the lightly and the heavily loaded wheel alike. Where the
+    file has a rear stiffness of its own, that one counts: the front axle's difference from it is
+    compliance, a state of the default estimator.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
     rear = vehicle.cornering_stiffness_rear

@@ -1,7 +1,8 @@
 """Velocity of a wheel centre and the slip of its tyre.
 
-Legend: v_x, v_y velocity of the centre of gravity [m/s], r yaw rate [rad/s], (x, y) wheel position in the body [m],
-delta road-wheel angle [rad], R radius [m], omega wheel speed [rad/s]; index w: in the wheel's frame.
+Legend: v_x, v_y velocity of the centre of gravity [m/s], r yaw rate [rad/s], (x, y) wheel position
+in the body [m], delta road-wheel angle [rad], R radius [m], omega wheel speed [rad/s]; index w: in
+the wheel's frame.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip h
 
 @compiled
 def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
-    """(x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to the left."""
+    """(x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to the
+    left.
+    """
     front = wheel < 2
     x = row[Parameter.TO_FRONT] if front else -row[Parameter.TO_REAR]
     half = 0.5 * (row[Parameter.TRACK_FRONT] if front else row[Parameter.TRACK_REAR])
@@ -48,7 +51,8 @@ def along_wheel(
 
 @inlined
 def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
-    """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip angle.
+    """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip
+    angle.
 
     Positive slip_x drives forward, positive slip_y pushes to the left.
     """

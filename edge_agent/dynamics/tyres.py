@@ -8,9 +8,9 @@ Legend
     f           curve with f(0) = 0, f'(0) = 1, peak 1; the force is mu*Fz*f(theta)
     c, e        shape and curvature of the Magic Formula [1]
 
-Because K does not depend on mu, all roads share one initial slope: friction is seen in the bend of the curve only
-(errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapters 3 (brush) and 4; Dugoff, Fancher
-and Segel, SAE 700377.
+Because K does not depend on mu, all roads share one initial slope: friction is seen in the bend of
+the curve only (errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapters
+3 (brush) and 4; Dugoff, Fancher and Segel, SAE 700377.
 """
 
 from __future__ import annotations
@@ -24,14 +24,18 @@ TINY = 1e-12  # below it a slip has no direction and no force
 
 @compiled
 def magic_formula(theta: float, c: float, e: float) -> float:
-    """Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in theta; 1 < c <= 2, e < 1."""
+    """Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in theta; 1 <
+    c <= 2, e < 1.
+    """
     b = theta / c
     return math.sin(c * math.atan(b - e * (b - math.atan(b))))
 
 
 @compiled
 def magic_formula_inverse(rho: float, c: float) -> float:
-    """theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and beyond the peak, |rho| >= 1."""
+    """theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and beyond
+    the peak, |rho| >= 1.
+    """
     if rho >= 1.0:
         return math.inf
     if rho <= -1.0:
@@ -41,7 +45,9 @@ def magic_formula_inverse(rho: float, c: float) -> float:
 
 @compiled
 def brush(theta: float) -> float:
-    """Brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3, then 1; odd in theta."""
+    """Brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3, then 1;
+    odd in theta.
+    """
     size = min(abs(theta), 3.0)
     return math.copysign(size - size * size / 3.0 + size**3 / 27.0, theta)
 
@@ -63,7 +69,8 @@ def combined_magic(
 ) -> tuple[float, float]:
     """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
 
-    slip (along, tan of the slip angle) [1], stiffness (along [N], across [N/rad]), mu [1], load [N].
+    slip (along, tan of the slip angle) [1], stiffness (along [N], across [N/rad]), mu [1], load
+    [N].
     """
     grip = mu * load
     if grip <= 0.0:
@@ -81,9 +88,11 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`.
+    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as
+    `combined_magic`.
 
-    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it has no falling branch.
+    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it
+    has no falling branch.
     """
     grip = max(mu * load, 0.0)
     free_x = stiffness[0] * slip[0]

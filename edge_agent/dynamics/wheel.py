@@ -1,8 +1,8 @@
 """Torque balance of a wheel.
 
-Legend: T torque at the wheel, driving positive [N m], J inertia [kg m^2], omega wheel speed [rad/s], R radius [m],
-F_x longitudinal tyre force [N]: J*omega' = T - R*F_x. Torque is the quiet way to the force; wheel speed is a
-measurement, never an exact input (errata, what held up).
+Legend: T torque at the wheel, driving positive [N m], J inertia [kg m^2], omega wheel speed
+[rad/s], R radius [m], F_x longitudinal tyre force [N]: J*omega' = T - R*F_x. Torque is the quiet
+way to the force; wheel speed is a measurement, never an exact input (errata, what held up).
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Estimators by name, through one interface: `create(name, vehicles)` and `EstimatorBank.advance`."""
+"""Estimators by name, through one interface: `create(name, vehicles)` and
+`EstimatorBank.advance`.
+"""
 
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.estimates import Estimates

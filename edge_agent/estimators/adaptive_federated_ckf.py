@@ -1,9 +1,11 @@
-"""`adaptive-federated-ckf`: the federated cubature filter with fuzzy R and adaptive shares of paper 001.
+"""`adaptive-federated-ckf`: the federated cubature filter with fuzzy R and adaptive shares of paper
+001.
 
-"Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated Kalman filter",
-Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see `gaussian/federated_motion`. Factor on R of each
-sub-filter from the window mismatch of its innovations and the mismatch's rate by 7 x 5 rules (section 3.1, table 1, see
-`rules`); shares from the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
+"Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated
+Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see
+`gaussian/federated_motion`. Factor on R of each sub-filter from the window mismatch of its
+innovations and the mismatch's rate by 7 x 5 rules (section 3.1, table 1, see `rules`); shares from
+the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
 
 Friction is no state: it is set by hand (section 4.1), here to DRY, and the prior is reported.
 
@@ -81,10 +83,11 @@ AS_PRINTED: Final = AdaptiveSetting(
         wheel_speed=False,
     )
 )
-"""Q and R of section 4.3's first experiment, Q read per second squared: .01*T^2 is what a step adds.
+"""Q and R of section 4.3's first experiment, Q read per second squared: .01*T^2 is what a step
+adds.
 
-P_0 is 1e-6*I, because the paper begins at the truth: with the printed I the first samples move u, which nothing printed
-measures, by decimetres per second.
+P_0 is 1e-6*I, because the paper begins at the truth: with the printed I the first samples move u,
+which nothing printed measures, by decimetres per second.
 """
 
 
@@ -183,7 +186,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(16)",
         "innovation covariance C_k over a window of M samples",
         "corrected",
-        "exponential window, half-life .5 s: M is not given, and a box needs M innovations in memory",
+        "exponential window, half-life .5 s: M is not given, and a box needs M innovations in "
+        "memory",
         "adaptive_federated_ckf._adapt",
     ),
     Element(
@@ -220,7 +224,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(34) to (52)",
         "sub-filters and master",
         "corrected",
-        "a_y and r, used by both sub-filters, have twice the variance in each; sub-filter 1 also measures the "
+        "a_y and r, used by both sub-filters, have twice the variance in each; sub-filter 1 also "
+        "measures the "
         "wheels' speed, off by wheel_speed=False",
         "gaussian.federated_motion",
     ),
@@ -234,7 +239,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "section 4.3",
         "P_0, Q, R of the double lane change",
         "option",
-        "R by hand for each drive, Q in no unit (read as .01*T^2); by default one table for all drives",
+        "R by hand for each drive, Q in no unit (read as .01*T^2); by default one table for all "
+        "drives",
         "AS_PRINTED",
     ),
     Element(

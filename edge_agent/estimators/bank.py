@@ -1,7 +1,7 @@
 """The estimator bank: N vehicles side by side through one compiled path.
 
-No vehicle's numbers meet another's, and all that is carried lies in the vehicle's own record, so results are bit-equal
-whatever N is and however the samples are cut into calls.
+No vehicle's numbers meet another's, and all that is carried lies in the vehicle's own record, so
+results are bit-equal whatever N is and however the samples are cut into calls.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ Part: TypeAlias = tuple[int, int, int]
 """Which context a thread has to itself, and its vehicles [first, last)."""
 
 Kernel: TypeAlias = Callable[..., None]
-"""kernel(filters, contexts, t, signals, outputs, part), or with visits = (closes, evidence) before part.
+"""kernel(filters, contexts, t, signals, outputs, part), or with visits = (closes, evidence) before
+part.
 
-Takes t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), writes outputs (T, N, …)
-indexed by Column and, where closes (T, N) says so and where friction jumps within a visit, evidence (T, N, 32); closes
-(0, N) is nowhere. A context holds the tables that all filters read, and arrays that a step writes before it reads them.
+Takes t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), writes
+outputs (T, N, …) indexed by Column and, where closes (T, N) says so and where friction jumps within
+a visit, evidence (T, N, 32); closes (0, N) is nowhere. A context holds the tables that all filters
+read, and arrays that a step writes before it reads them.
 """
 
 
@@ -65,13 +67,16 @@ class EstimatorBank:
         """Take the next samples of all vehicles.
 
         Args:
-            t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and health says so.
+            t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and
+                health says so.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
-            closes: (T, N), True at the first sample that belongs to a new visit; None for no visits.
+            closes: (T, N), True at the first sample that belongs to a new visit; None for no
+                visits.
             threads: how many share the vehicles among them; changes no bit of the result.
 
         Returns:
-            Estimates at the same samples; none of them is NaN, except evidence away from closes and jumps.
+            Estimates at the same samples; none of them is NaN, except evidence away from closes and
+            jumps.
 
         Raises:
             InputError: shapes do not agree with the bank, or threads is below 1.
@@ -101,11 +106,14 @@ class EstimatorBank:
         return _estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
-        """Return a copy of the field `name` of all filters, (N, ...): for figures of a filter's inside."""
+        """Return a copy of the field `name` of all filters, (N, ...): for figures of a filter's
+        inside.
+        """
         return np.array(self._filters[name])
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N, 32) each, maximum 0.
+        """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N,
+        32) each, maximum 0.
 
         None where the estimator has no such belief.
         """

@@ -1,16 +1,20 @@
-"""`compensated-wckf`: weighted square-root cubature filters on the electric drive wheel, with force compensation (002).
+"""`compensated-wckf`: weighted square-root cubature filters on the electric drive wheel, with force
+compensation (002).
 
-Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using Kalman filters and
-tire force compensation method", IEEE Access 2019, doi 10.1109/ACCESS.2019.2925370 (paper 002).
+Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using
+Kalman filters and tire force compensation method", IEEE Access 2019, doi
+10.1109/ACCESS.2019.2925370 (paper 002).
 
-WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurement [r, tau x 4, omega x 4] (30) to
-(32), see `drive_wheel`. Forces: Magic Formula (12), compensated by (33). WCKF-B: [v_x, v_y, r], measurement
-[r, a_x, a_y] (35), (36). Both with R from a weighted moving window (25), see `adaptation.windows`.
+WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurement [r, tau x 4,
+omega x 4] (30) to (32), see `drive_wheel`. Forces: Magic Formula (12), compensated by (33). WCKF-B:
+[v_x, v_y, r], measurement [r, a_x, a_y] (35), (36). Both with R from a weighted moving window (25),
+see `adaptation.windows`.
 
 Friction is no state: it is set by hand, here to DRY, and the prior is reported.
 
-A's states are `EstimatorBank.memory("mean")`, the compensated forces `memory("compensated")`; figures compare A with B.
-ELEMENTS lists each element of the paper and every departure with its reason.
+A's states are `EstimatorBank.memory("mean")`, the compensated forces `memory("compensated")`;
+figures compare A with B. ELEMENTS lists each element of the paper and every departure with its
+reason.
 """
 
 from __future__ import annotations
@@ -59,7 +63,8 @@ WINDOW = 25  # samples; the paper's N is not given
 # of the nominal R
 LEAST = 0.5
 LARGEST = 20.0
-# process standard deviations per s^.5: offsets of the accelerometers, yaw model error, then torque, speed, force
+# process standard deviations per s^.5: offsets of the accelerometers, yaw model error, then torque,
+# speed, force
 A_PROCESS = np.array([0.05, 0.05, 0.2, *[20.0] * 4, *[0.5] * 4, *[100.0] * 4, *[2e4] * 4])
 A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of r, tau, omega
 B_PROCESS = np.array([0.1, 0.1, 0.1])
@@ -101,7 +106,9 @@ class FrictionSet:
 def bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
 ) -> EstimatorBank:
-    """Return N of these filters on a road whose friction is set; the tyre holds C_f and C_r of table 1."""
+    """Return N of these filters on a road whose friction is set; the tyre holds C_f and C_r of
+    table 1.
+    """
     context = records(FrictionSet, 1)
     context["friction"] = friction
     return EstimatorBank(new_filters(CompensatedMemory, vehicles, tyre), context, KERNEL)
@@ -155,7 +162,9 @@ def _forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces `observed` by A."""
+    """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces
+    `observed` by A.
+    """
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
     delta = use[S.DELTA : S.DELTA + 4]
@@ -320,8 +329,10 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(7) to (11)",
         "electric drive wheel: current, voltage, back-EMF K_a, damping b",
         "corrected",
-        "torque stands for current, because cars send no current and voltage; K_a = .06 and K_t = 11.43 are not of "
-        "one machine; K_a*omega and b*omega are losses inside the torque that is measured at the wheel",
+        "torque stands for current, because cars send no current and voltage; K_a = .06 and K_t = "
+        "11.43 are not of "
+        "one machine; K_a*omega and b*omega are losses inside the torque that is measured at the "
+        "wheel",
         "dynamics.drive_wheel",
     ),
     Element("(12)", "Magic Formula", "as printed", where="dynamics.tyres.combined_magic"),
@@ -345,7 +356,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(24), (25)",
         "R from a weighted window of innovations",
         "corrected",
-        "1/N lacks in (24), weights are not normalised, one half makes it right for normal errors; bounded, N = 25",
+        "1/N lacks in (24), weights are not normalised, one half makes it right for normal errors; "
+        "bounded, N = 25",
         "adaptation.windows",
     ),
     Element(
@@ -366,13 +378,15 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(34)",
         "compensation of F_y",
         "left out",
-        "it adds a longitudinal force to a lateral one, with the same sign on both sides and gains that are not given",
+        "it adds a longitudinal force to a lateral one, with the same sign on both sides and gains "
+        "that are not given",
     ),
     Element(
         "(35), (36)",
         "WCKF-B: v_x, v_y, yaw rate",
         "corrected",
-        "the tyre model is evaluated at its points: with forces as plain inputs nothing observes v_x and v_y",
+        "the tyre model is evaluated at its points: with forces as plain inputs nothing observes "
+        "v_x and v_y",
         "compensated_wckf._fuse",
     ),
     Element(

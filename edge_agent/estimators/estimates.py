@@ -1,4 +1,6 @@
-"""What a bank reports: numbers per sample and vehicle, written by the kernels, and its columns by name."""
+"""What a bank reports: numbers per sample and vehicle, written by the kernels, and its columns
+by name.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def _column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says
 
 
 class Estimates:
-    """What a bank reports of T samples of N vehicles; columns are arrays of shape (T, N), documented in `Column`."""
+    """What a bank reports of T samples of N vehicles; columns are arrays of shape (T, N),
+    documented in `Column`.
+    """
 
     __slots__ = ("evidence", "jumps", "values")
 
@@ -80,8 +84,8 @@ class Estimates:
         self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None
     ) -> None:
         self.values = values  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Column
-        # (T, N, 32) log-likelihood on the friction grid: at closes of the visit's last part, at jumps of the part that
-        # ends there, else NaN
+        # (T, N, 32) log-likelihood on the friction grid: at closes of the visit's last part, at
+        # jumps of the part that ends there, else NaN
         self.evidence = evidence
         self.jumps = jumps  # (T, N) where the friction has become another within a visit
 
@@ -92,7 +96,9 @@ class Estimates:
 
     @property
     def mu_wheel(self) -> FloatArray | None:
-        """(T, N, 4, 3) median, lower, upper per wheel; None where the estimator has one friction."""
+        """(T, N, 4, 3) median, lower, upper per wheel; None where the estimator has one
+        friction.
+        """
         if self.values.shape[-1] == ONE_FRICTION:
             return None
         return self.values[..., Column.WHEELS :].reshape(*self.values.shape[:-1], 4, 3)

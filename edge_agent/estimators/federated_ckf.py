@@ -1,15 +1,18 @@
-"""`federated-ckf`: joint federated cubature filters for motion and for the friction of four wheels, paper 000.
+"""`federated-ckf`: joint federated cubature filters for motion and for the friction of four wheels,
+paper 000.
 
-Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive electric vehicle",
-IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion: see `gaussian/federated_motion`. Friction: state [mu_fl,
-mu_fr, mu_rl, mu_rr], random walk (28), measurements [a_x, a_y, r] and [a_y, r] in two sub-filters again (40) to (48),
-fused (51), (52). The motion goes to the friction filter and the friction to the motion filter's tyres (figure 3).
-Shares by (54).
+Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive
+electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion: see
+`gaussian/federated_motion`. Friction: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28),
+measurements [a_x, a_y, r] and [a_y, r] in two sub-filters again (40) to (48), fused (51), (52). The
+motion goes to the friction filter and the friction to the motion filter's tyres (figure 3). Shares
+by (54).
 
-The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to friction: see
-`literal.federated_friction`, which holds the friction filter as printed. On a real tyre it is not, so here R is sensor
-noise and model error, and friction returns to the prior over the metres driven: what is not observable is as wide as
-the prior. ELEMENTS lists each element of the paper and every departure with its reason.
+The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
+friction: see `literal.federated_friction`, which holds the friction filter as printed. On a real
+tyre it is not, so here R is sensor noise and model error, and friction returns to the prior over
+the metres driven: what is not observable is as wide as the prior. ELEMENTS lists each element of
+the paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -115,7 +118,9 @@ def _step(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa
 
 @compiled
 def share_by_information(first: float, second: float) -> float:
-    """Share of sub-filter 1 [1] from the traces of the two covariances: the better one gets more (54, turned round)."""
+    """Share of sub-filter 1 [1] from the traces of the two covariances: the better one gets more
+    (54, turned round).
+    """
     return min(max(second / (first + second), LEAST_BETA), 1.0 - LEAST_BETA)
 
 
@@ -218,7 +223,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(4) to (6)",
         "accelerations from wheel forces",
         "corrected",
-        "rear axle: a_x takes -F_y*sin(delta), a_y takes +F_x*sin(delta) + F_y*cos(delta), arms accordingly",
+        "rear axle: a_x takes -F_y*sin(delta), a_y takes +F_x*sin(delta) + F_y*cos(delta), arms "
+        "accordingly",
         "dynamics.chassis.response",
     ),
     Element(
@@ -247,7 +253,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(11) to (13)",
         "Dugoff lateral force, proportional to mu",
         "option",
-        "mu*F_z*C_y counts the load twice; 1/2 and mu*F_z are missing in (13). By default stiffness does not depend "
+        "mu*F_z*C_y counts the load twice; 1/2 and mu*F_z are missing in (13). By default "
+        "stiffness does not depend "
         "on mu, because that of a real tyre does not",
         "common.tyre_option, literal.wheel_forces",
     ),
@@ -275,7 +282,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(28)",
         "friction as a random walk",
         "option",
-        "by default it returns to the prior over 190 m, so that it is not believed where nothing shows it; as "
+        "by default it returns to the prior over 190 m, so that it is not believed where nothing "
+        "shows it; as "
         "printed in the literal filter",
         "gaussian.wheel_friction, literal.federated_friction",
     ),
@@ -286,21 +294,24 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(49) to (52)",
         "fusion in the master",
         "corrected",
-        "P_f, printed is its inverse; a_y and r, used by both sub-filters, have twice the variance in each",
+        "P_f, printed is its inverse; a_y and r, used by both sub-filters, have twice the variance "
+        "in each",
         "filters.federated.fuse",
     ),
     Element(
         "(53)",
         "states, measurements and inputs",
         "corrected",
-        "sub-filter 1 also measures the wheels' speed: nothing printed observes u. Off by wheel_speed=False",
+        "sub-filter 1 also measures the wheels' speed: nothing printed observes u. Off by "
+        "wheel_speed=False",
         "gaussian.federated_motion",
     ),
     Element(
         "(54)",
         "shares beta_i by traces",
         "option",
-        "printed, the worse filter gets more, and beta = 0 divides by zero: turned round, from one half; as "
+        "printed, the worse filter gets more, and beta = 0 divides by zero: turned round, from one "
+        "half; as "
         "printed from one half in the literal filter",
         "share_by_information, literal.federated_friction",
     ),
@@ -308,7 +319,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(55), (56)",
         "P_0, Q, R of the motion",
         "left out",
-        "u is lost with them (error 14 m/s), whichever way (54) is read; MotionSetting takes any others",
+        "u is lost with them (error 14 m/s), whichever way (54) is read; MotionSetting takes any "
+        "others",
     ),
     Element(
         "(57)",

@@ -1,13 +1,15 @@
-"""`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004, as printed with the errata corrected.
+"""`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004, as printed with the errata
+corrected.
 
-Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for vehicle networking
-applications", IEEE Access 2019, doi 10.1109/ACCESS.2019.2895413.
+Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for
+vehicle networking applications", IEEE Access 2019, doi 10.1109/ACCESS.2019.2895413.
 
-State [v_x, v_y, a_x, a_y, r, mu], input [omega, delta], measurement [a_x, a_y, r] (below equation 29); motion (1) to
-(3), Dugoff tyres (7) to (12), cubature filter (13) to (28), fuzzy factor on R (30), sets tuned by ants (31) to (33).
+State [v_x, v_y, a_x, a_y, r, mu], input [omega, delta], measurement [a_x, a_y, r] (below equation
+29); motion (1) to (3), Dugoff tyres (7) to (12), cubature filter (13) to (28), fuzzy factor on R
+(30), sets tuned by ants (31) to (33).
 
-ELEMENTS lists each element of the paper and every departure with its reason. Friction keeps to its range and to the
-prior's spread.
+ELEMENTS lists each element of the paper and every departure with its reason. Friction keeps to its
+range and to the prior's spread.
 """
 
 from __future__ import annotations
@@ -84,11 +86,14 @@ class Setting(NamedTuple):
 AT_THE_TRUTH = Setting(
     start=(1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6), noise=(0.05, 0.05, 0.05), mu=0.85, straight=True
 )
-"""The paper's experiments: R known, and the start (section IV.A) so well known that the printed mu error can be met."""
+"""The paper's experiments: R known, and the start (section IV.A) so well known that the printed
+mu error can be met.
+"""
 
 
 AS_PRINTED = AT_THE_TRUTH._replace(process=(0.1 * STEP_S**2,) * STATES, start=(0.2,) * STATES)
-"""The printed P_0 = .2*I and R = .05*I, and Q = .1*I read per second squared: .1*T^2 is what a step adds.
+"""The printed P_0 = .2*I and R = .05*I, and Q = .1*I read per second squared: .1*T^2 is what a step
+adds.
 
 With Q = .1*I per step the yaw-rate error stays near .13 rad/s, which the printed tables contradict.
 """
@@ -105,7 +110,9 @@ class FuzzyMemory(PaperMemory):
 
 
 class FuzzyContext:
-    """What the filters of a thread share: the setting, and arrays that a step writes before it reads them."""
+    """What the filters of a thread share: the setting, and arrays that a step writes before it
+    reads them.
+    """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
     start: Annotated[FloatArray, STATES]  # standard deviations
@@ -125,7 +132,9 @@ def bank(
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
 ) -> EstimatorBank:
-    """Return N of these filters; `setting` replaces the one for ordinary sensors and an unknown road."""
+    """Return N of these filters; `setting` replaces the one for ordinary sensors and an unknown
+    road.
+    """
     chosen = Setting() if setting is None else setting
     context = records(FuzzyContext, 1)
     context["process"] = np.sqrt(chosen.process)
@@ -240,7 +249,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(4) to (6)",
         "dual-motor torque output model",
         "option",
-        "the mean of two wheel speeds is the axle's midpoint, the larger is the outer wheel; by default F_x comes "
+        "the mean of two wheel speeds is the axle's midpoint, the larger is the outer wheel; by "
+        "default F_x comes "
         "from slip as in (7); i_t and eta_t are not given",
         "dynamics.dual_motor, Setting.dual_motor",
     ),
@@ -301,7 +311,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(30)",
         "mismatch e of actual and theoretical innovation variance",
         "corrected",
-        "the innovation, where z-hat is printed; a quotient, row by row, because rows have unlike units",
+        "the innovation, where z-hat is printed; a quotient, row by row, because rows have unlike "
+        "units",
         "paper_aco_fckf._adapt",
     ),
     Element(
@@ -321,7 +332,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "III.C",
         "lower vertices of the triangles as tuned variables",
         "option",
-        "the shipped sets have feet at the neighbours' peaks, which need ten numbers instead of sixteen",
+        "the shipped sets have feet at the neighbours' peaks, which need ten numbers instead of "
+        "sixteen",
         "adaptation.lower_vertices",
     ),
     Element(
@@ -334,14 +346,16 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(32)",
         "pheromone update, rho = .284",
         "corrected",
-        "called residual and evaporation at once: read as what remains; deposits by rank within bounds",
+        "called residual and evaporation at once: read as what remains; deposits by rank within "
+        "bounds",
         "lab.tuning.colony",
     ),
     Element(
         "(33)",
         "objective 1/(1 + e)",
         "option",
-        "it has a pole at e = -1: |e|; inflating R wins it, so that it makes the filter worse (measured)",
+        "it has a pole at e = -1: |e|; inflating R wins it, so that it makes the filter worse "
+        "(measured)",
         "lab.tuning.paper_004_tuning",
     ),
     Element(

@@ -1,10 +1,11 @@
 """The estimators by name.
 
-`aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with square-root cubature filters
-as its nodes. They differ in the fuzzy adaptation of the measurement noise: tuned by the ant colony, untuned, none.
-Departures from paper 004, whose family it is: kinematic prediction, wheel speed as a measurement, force from torque,
-residuals by total least squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states,
-bounded adaptation in the direction of the errata.
+`aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
+square-root cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
+noise: tuned by the ant colony, untuned, none. Departures from paper 004, whose family it is:
+kinematic prediction, wheel speed as a measurement, force from torque, residuals by total least
+squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states, bounded
+adaptation in the direction of the errata.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ ESTIMATORS = {
     "compensated-wckf": "paper 002: electric drive wheels, then motion by compensated tyre forces; friction is set",
     "sr-ukf": "paper 003: square-root unscented filter for four-wheel friction with wheel torque",
 }
-# whose memberships come from the ant colony, and the name of the file that `banks.bank_of` takes them from
+# whose memberships come from the ant colony, and the name of the file that `banks.bank_of` takes
+# them from
 TUNED: Final = {"aco-fckf": "aco-fckf", "paper-aco-fckf": "paper-aco-fckf"}
 
 # the papers' estimators without fuzzy sets that could be tuned
@@ -63,12 +65,15 @@ def create(
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
-        memberships: the fuzzy sets; needed by the estimators in TUNED, and replacing the untuned ones of others.
-        curve: of the tyres, in place of the usual one; for the default estimator and its two ablations.
+        memberships: the fuzzy sets; needed by the estimators in TUNED, and replacing the untuned
+            ones of others.
+        curve: of the tyres, in place of the usual one; for the default estimator and its two
+            ablations.
 
     Raises:
-        InputError: the name is unknown, no vehicle is given, tuned memberships are missing, memberships are given to an
-            estimator that has none, or a curve that is none, or to one that has its own.
+        InputError: the name is unknown, no vehicle is given, tuned memberships are missing,
+            memberships are given to an estimator that has none, or a curve that is none, or to one
+            that has its own.
     """
     if name not in ESTIMATORS:
         raise InputError(

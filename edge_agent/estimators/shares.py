@@ -1,4 +1,5 @@
-"""What every bank does around its kernel: check the samples, and give the vehicles to threads in equal shares.
+"""What every bank does around its kernel: check the samples, and give the vehicles to threads in
+equal shares.
 
 Kernels release the interpreter's lock and share no state.
 """
@@ -39,7 +40,8 @@ def checked(
 
 
 def in_shares(work: Callable[[int, int, int], None], count: int, threads: int) -> None:
-    """Call work(share, first, last) for `threads` runs of vehicles, together all `count`, at the same time.
+    """Call work(share, first, last) for `threads` runs of vehicles, together all `count`, at the
+    same time.
 
     Raises:
         InputError: threads is below 1.

@@ -1,16 +1,18 @@
 """`sr-ukf`: the square-root unscented filter for the friction of four wheels of paper 003.
 
-"Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for distributed drive vehicles
-(paper 003; the equations are lost in the text copy, so its sections are cited). Seven degrees of freedom with Dugoff
-tyres (section 2), unscented points, time and measurement update (3.1), posterior factor by downdates (3.2).
+"Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for
+distributed drive vehicles (paper 003; the equations are lost in the text copy, so its sections are
+cited). Seven degrees of freedom with Dugoff tyres (section 2), unscented points, time and
+measurement update (3.1), posterior factor by downdates (3.2).
 
-State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of freedom are their torque balances, taken as
-measurements: F_x = (T - J*omega')/R. With them each driven wheel is observable; with the paper's a_x, a_y, r alone two
-of four frictions are, at most (errata).
+State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of freedom are their
+torque balances, taken as measurements: F_x = (T - J*omega')/R. With them each driven wheel is
+observable; with the paper's a_x, a_y, r alone two of four frictions are, at most (errata).
 
-The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This one is for a car, where
-nobody gives v_x and v_y: they are states, a_x and a_y are inputs of the kinematics, and the wheel torques stand for
-a_x. ELEMENTS lists each element of the paper and every departure with its reason.
+The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This one
+is for a car, where nobody gives v_x and v_y: they are states, a_x and a_y are inputs of the
+kinematics, and the wheel torques stand for a_x. ELEMENTS lists each element of the paper and every
+departure with its reason.
 """
 
 from __future__ import annotations
@@ -146,7 +148,9 @@ def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG0
 
 @compiled
 def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
-    """mu (4,) of a point x (7,), which deviates from the mean's by `share` of its own, within the range of friction."""
+    """mu (4,) of a point x (7,), which deviates from the mean's by `share` of its own, within
+    the range of friction.
+    """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel
         mu[wheel] = min(max(mean[i] + share * (x[i] - mean[i]), LOWER), UPPER)
@@ -291,7 +295,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "section 2",
         "Dugoff tyre, proportional to mu",
         "option",
-        "on a real tyre stiffness does not depend on mu; printed in the literal filter and by TyreOption",
+        "on a real tyre stiffness does not depend on mu; printed in the literal filter and by "
+        "TyreOption",
         "literal.wheel_forces, common.tyre_option",
     ),
     Element(
@@ -321,7 +326,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "3.1",
         "unscented points, alpha .001, kappa 0, beta 2",
         "option",
-        "alpha = .001 gives the centre a weight of -10^6; sr-ukf uses 1. Both give the same result in double precision",
+        "alpha = .001 gives the centre a weight of -10^6; sr-ukf uses 1. Both give the same result "
+        "in double precision",
         "literal.wheel_friction_ukf.UnscentedSetting.alpha",
     ),
     Element(
@@ -340,14 +346,16 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "3.2",
         "Q, R and P_0",
         "corrected",
-        "their values are lost in the text; AS_PRINTED has values of the size that the text describes",
+        "their values are lost in the text; AS_PRINTED has values of the size that the text "
+        "describes",
         "literal.wheel_friction_ukf.AS_PRINTED",
     ),
     Element(
         "4.1",
         "Magic Formula in the plant, Dugoff in the filter",
         "option",
-        "shown as a row of its own: the mismatch costs .025, stiffness that does not depend on mu costs .3",
+        "shown as a row of its own: the mismatch costs .025, stiffness that does not depend on mu "
+        "costs .3",
         "lab.evaluation.papers.reproduction_003",
     ),
     Element(

@@ -1,8 +1,9 @@
 """The square root of a covariance, and the covariance of a square root.
 
-Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q variances (n,).
-A pivot is what is left of a state's variance when the states before it are known; where it is below what is surely
-there (its own noise), rounding has taken it, and what is surely there takes its place.
+Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q
+variances (n,). A pivot is what is left of a state's variance when the states before it are known;
+where it is below what is surely there (its own noise), rounding has taken it, and what is surely
+there takes its place.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from schemas.runtime.jit import compiled, inlined
 
 @inlined
 def factorize_column(a: FloatArray, j: int, least: float) -> None:
-    """Column j of the factor of a (n, n) in place, the columns before it being done; a pivot is at least `least` > 0.
+    """Column j of the factor of a (n, n) in place, the columns before it being done; a pivot is at
+    least `least` > 0.
 
     Only the lower half is read; what is right of the diagonal becomes zero.
     """
@@ -46,7 +48,9 @@ def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> Non
 
 @compiled
 def multiply(sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray) -> None:
-    """covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,) of independent noise."""
+    """covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,) of
+    independent noise.
+    """
     n = sqrt_cov.shape[0]
     for i in range(n):
         for j in range(i + 1):

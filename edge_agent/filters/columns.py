@@ -1,12 +1,14 @@
-"""The cubature filter with its points side by side, for kernels that step millions of times a second.
+"""The cubature filter with its points side by side, for kernels that step millions of times a
+second.
 
 Legend
     m, L        state's mean (n,), and its lower-triangular square root of the covariance, P = L*L'     (n, n)
     x           points in columns                                                                      (n, 2n)
     q           standard deviations of the process noise, independent                                  (n,)
 
-The same points and the same prediction as `points` and `householder` with `sigma.cubature`, for less work: all weights
-are 1/(2n). Points lie along the fast axis, so that the model moves several at once.
+The same points and the same prediction as `points` and `householder` with `sigma.cubature`, for
+less work: all weights are 1/(2n). Points lie along the fast axis, so that the model moves several
+at once.
 """
 
 from __future__ import annotations
@@ -33,11 +35,13 @@ def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
 def gather(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
-    """Mean and sqrt_cov of moved points (n, 2n), which become deviations, with process noise pace*q.
+    """Mean and sqrt_cov of moved points (n, 2n), which become deviations, with process noise
+    pace*q.
 
-    The mean is the first point and deviations from it, so that large offsets lose no digits. The covariance is summed
-    and factorized, at half the cost of an orthogonal transformation; a pivot cannot be less than its own noise, for
-    what has been taken from it is what others explain of the deviations alone.
+    The mean is the first point and deviations from it, so that large offsets lose no digits. The
+    covariance is summed and factorized, at half the cost of an orthogonal transformation; a pivot
+    cannot be less than its own noise, for what has been taken from it is what others explain of the
+    deviations alone.
     """
     n, count = points.shape
     weight = 1.0 / count

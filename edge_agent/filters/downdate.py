@@ -15,7 +15,8 @@ LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding d
 
 @compiled
 def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> bool:
-    """sqrt_cov (n, n) becomes the factor without column (n,); False, and nothing changed, where there is none.
+    """sqrt_cov (n, n) becomes the factor without column (n,); False, and nothing changed, where
+    there is none.
 
     white (n,) is scratch.
     """
@@ -56,10 +57,11 @@ def update_by_downdate(
     noise_std: FloatArray,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
-    """Measurement update in place as paper 003 does it: L loses the columns of U = P_xz*S^-T/2, one after the other.
+    """Measurement update in place as paper 003 does it: L loses the columns of U = P_xz*S^-T/2, one
+    after the other.
 
-    Arguments as `householder.update`. Returns what it returns, and whether a downdate was refused: then `update` has
-    done the work, whose orthogonal transformation cannot fail.
+    Arguments as `householder.update`. Returns what it returns, and whether a downdate was refused:
+    then `update` has done the work, whose orthogonal transformation cannot fail.
     """
     n, points = state_deviations.shape
     rows = innovation.shape[0]

@@ -1,4 +1,6 @@
-"""The two operations of a federated filter: the master shares its information, and fuses the sub-filters' results."""
+"""The two operations of a federated filter: the master shares its information, and fuses the
+sub-filters' results.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
-    """out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the information."""
+    """out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the
+    information.
+    """
     gain = 1.0 / math.sqrt(beta)
     for i in range(sqrt_cov.shape[0]):
         for j in range(sqrt_cov.shape[1]):
@@ -26,7 +30,9 @@ def fuse(
     other_root: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Fuse the independent estimate (other, other_root) into (mean, sqrt_cov), in place; work (2n, 2n) or larger."""
+    """Fuse the independent estimate (other, other_root) into (mean, sqrt_cov), in place; work
+    (2n, 2n) or larger.
+    """
     n = mean.shape[0]
     for i in range(n):
         for j in range(n):

@@ -1,4 +1,5 @@
-"""Square-root predict and update by orthogonal transformations, for use inside larger compiled kernels.
+"""Square-root predict and update by orthogonal transformations, for use inside larger compiled
+kernels.
 
 Legend
     x, m        state, its mean                                            (n,)
@@ -9,8 +10,9 @@ Legend
     r           standard deviations of the measurement noise, independent    (k,)
     S           innovation covariance Z*Z' + diag(r^2)                       (k, k)
 
-Everything is an orthogonal transformation of an array of factors (Householder): no covariance is ever subtracted, so
-none can lose its sign. Kernels write into arrays of the caller; they allocate nothing.
+Everything is an orthogonal transformation of an array of factors (Householder): no covariance is
+ever subtracted, so none can lose its sign. Kernels write into arrays of the caller; they allocate
+nothing.
 """
 
 from __future__ import annotations
@@ -26,9 +28,11 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 @compiled
 def triangularize(a: FloatArray, rows: int, columns: int) -> None:
-    """Replace a[:rows, :columns] by its lower-triangular factor with the same a*a', diagonal not negative.
+    """Replace a[:rows, :columns] by its lower-triangular factor with the same a*a', diagonal not
+    negative.
 
-    Householder reflections from the right; entries right of the diagonal become zero. columns >= rows.
+    Householder reflections from the right; entries right of the diagonal become zero. columns >=
+    rows.
     """
     for i in range(rows):
         square = 0.0
@@ -65,7 +69,8 @@ def predict(
     sqrt_cov: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Mean and sqrt_cov of propagated points (points, n) with process noise factor sqrt_noise (n, n).
+    """Mean and sqrt_cov of propagated points (points, n) with process noise factor sqrt_noise (n,
+    n).
 
     Writes mean (n,) and sqrt_cov (n, n); work is (n, points + n) or larger.
     """

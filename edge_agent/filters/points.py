@@ -21,7 +21,9 @@ from schemas.runtime.jit import compiled
 def sigma_points(
     mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray
 ) -> None:
-    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points, n)."""
+    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points,
+    n).
+    """
     count, n = xi.shape
     for p in range(count):
         for i in range(n):
@@ -33,7 +35,9 @@ def sigma_points(
 
 @compiled
 def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
-    """points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points (points, n)."""
+    """points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points (points,
+    n).
+    """
     axes, size, _ = np.linalg.svd(sqrt_cov)
     count, n = xi.shape
     for p in range(count):
@@ -46,7 +50,9 @@ def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: 
 
 @compiled
 def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large offsets lose no digits."""
+    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large
+    offsets lose no digits.
+    """
     count, n = points.shape
     for i in range(n):
         total = 0.0
@@ -59,7 +65,9 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 def deviations(
     points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
 ) -> None:
-    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from centred deviations."""
+    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from
+    centred deviations.
+    """
     count, n = points.shape
     for p in range(count):
         root = math.sqrt(w_cov[p])

@@ -6,8 +6,9 @@ Legend
     r, a        variance of the noise, and of the innovation, a = f'*f + r
     nu          innovation, measured minus predicted
 
-No variance is ever subtracted from another, so none can lose its sign. Rows whose noise is independent may be taken in
-one by one in any order; what the next rows deviate by changes with L, and `project` changes it alike.
+No variance is ever subtracted from another, so none can lose its sign. Rows whose noise is
+independent may be taken in one by one in any order; what the next rows deviate by changes with L,
+and `project` changes it alike.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def potter(f: FloatArray, noise: float) -> tuple[float, float]:
-    """(a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963)."""
+    """(a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I -
+    g*f*f') (Potter 1963).
+    """
     a = noise
     for c in range(f.shape[0]):
         a += f[c] ** 2
@@ -50,10 +53,11 @@ def carlson(
     variance: float,
     gain: FloatArray,
 ) -> tuple[float, float]:
-    """Take in a `reading` of state i itself with noise `variance` > 0: (innovation squared over a, a).
+    """Take in a `reading` of state i itself with noise `variance` > 0: (innovation squared over a,
+    a).
 
-    L stays triangular (Carlson 1973): its rows are turned by 2 x 2 rotations whose cosines come from sums of squares
-    alone. gain (n,) is scratch.
+    L stays triangular (Carlson 1973): its rows are turned by 2 x 2 rotations whose cosines come
+    from sums of squares alone. gain (n,) is scratch.
     """
     n = mean.shape[0]
     for k in range(n):

@@ -27,8 +27,8 @@ class SigmaRule:
     """Points and weights of one rule; refuses to exist where its moments are wrong.
 
     Raises:
-        InputError: shapes do not agree, a moment up to the second is not exact, or a covariance weight is negative
-            (a square-root filter has no use for one).
+        InputError: shapes do not agree, a moment up to the second is not exact, or a covariance
+            weight is negative (a square-root filter has no use for one).
     """
 
     name: str
@@ -71,8 +71,8 @@ class SigmaRule:
 def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
     """The scaled unscented rule (Julier 2002); a centre without any weight is left out.
 
-    lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i;
-    w_mean_0 = lambda/(n + lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).
+    lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i; w_mean_0 = lambda/(n +
+    lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).
     """
     scale = alpha**2 * (n + kappa)
     if n < 1 or scale <= 0.0:
@@ -95,7 +95,9 @@ def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
 
 
 def cubature(n: int) -> SigmaRule:
-    """The third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i with weights 1/(2n)."""
+    """The third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i with
+    weights 1/(2n).
+    """
     if n < 1:
         raise InputError("cubature", "n must be at least 1", "give the dimension of the state")
     spread = np.sqrt(float(n)) * np.eye(n)

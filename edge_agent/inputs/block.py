@@ -1,4 +1,6 @@
-"""Where signals come from: a recorded log, or a simulated fleet. A source gives blocks of samples."""
+"""Where signals come from: a recorded log, or a simulated fleet. A source gives blocks of
+samples.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,11 @@ from schemas.thresholds import NS
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T, N, channels).
+    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T,
+    N, channels).
 
-    `context` (T, N, len(CONTEXT)) is what controllers and surroundings say; None where the source knows nothing of it.
+    `context` (T, N, len(CONTEXT)) is what controllers and surroundings say; None where the source
+    knows nothing of it.
     """
 
     t: FloatArray

@@ -1,4 +1,6 @@
-"""Sources to a signal log: which reader for which file, then the profile, then Parquet with its provenance."""
+"""Sources to a signal log: which reader for which file, then the profile, then Parquet with its
+provenance.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
     """A recording of any kind: what the profile asks for, or everything where there is none yet.
 
     Raises:
-        InputError: the file is unknown, broken, needs a database, or needs a library that is not installed.
+        InputError: the file is unknown, broken, needs a database, or needs a library that is not
+            installed.
     """
     wanted = None if profile is None else profile.needs()
     suffix = path.suffix.lower()
@@ -113,7 +116,8 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
 
 
 def profile_of(log: Path) -> Profile:
-    """The profile that a log was imported with; of another log, one that takes its columns as they are.
+    """The profile that a log was imported with; of another log, one that takes its columns as they
+    are.
 
     Raises:
         InputError: the file cannot be read.
@@ -129,7 +133,9 @@ def profile_of(log: Path) -> Profile:
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:
-    """The log as Parquet; where the date is known as `timestamp`, else as `t`; what was done stands in its metadata."""
+    """The log as Parquet; where the date is known as `timestamp`, else as `t`; what was done
+    stands in its metadata.
+    """
     columns: dict[str, Any] = {}
     if merged.start_ns is not None:
         whole = merged.start_ns + np.rint(merged.t * NS).astype(np.int64)

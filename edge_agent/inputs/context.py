@@ -1,7 +1,9 @@
-"""Context signals: what controllers and surroundings say, from the readings of a source to the rows of a log.
+"""Context signals: what controllers and surroundings say, from the readings of a source to the rows
+of a log.
 
-A flag or a temperature is not interpolated. A row has the last reading at or before its time, as long as that is not
-older than HELD_S; a channel that the profile calls `lasting` is sent when it changes, and holds until its next reading.
+A flag or a temperature is not interpolated. A row has the last reading at or before its time, as
+long as that is not older than HELD_S; a channel that the profile calls `lasting` is sent when it
+changes, and holds until its next reading.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from edge_agent.inputs.recording import Series
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CONTEXT, FLAGS
 
-# Design parameters. A controller's flag comes at 10 to 100 Hz and lives as long as the intervention does; the air
-# and the wipers change slowly and come once or twice a second.
+# Design parameters. A controller's flag comes at 10 to 100 Hz and lives as long as the intervention
+# does; the air and the wipers change slowly and come once or twice a second.
 HELD_S: Final = {name: 1.0 if name in FLAGS else 30.0 for name in CONTEXT}
 AIR_C: Final = (
     -60.0,
@@ -45,7 +47,9 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
 
 
 def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) -> FloatArray:
-    """The last reading at or before each time t (T,) [s], NaN where it is too old or there is none."""
+    """The last reading at or before each time t (T,) [s], NaN where it is too old or there is
+    none.
+    """
     known = np.isfinite(series.values)
     times = series.t[known]
     if not len(times):
@@ -80,12 +84,14 @@ def context_block(
 
     The way in for a source that has no profile, a simulation for one:
 
-        Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature": -3.0}))
+        Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature":
+        -3.0}))
 
     Args:
         samples: T.
         vehicles: N.
-        values: by the names of CONTEXT, each (T, N), (N,) or one number; flags may be boolean; NaN is unknown.
+        values: by the names of CONTEXT, each (T, N), (N,) or one number; flags may be boolean; NaN
+            is unknown.
 
     Raises:
         KeyError: a name is not one of CONTEXT.

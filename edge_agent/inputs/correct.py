@@ -1,7 +1,9 @@
-"""Signals as a calibrated vehicle means them: offsets off, wheels alike, steering by its true map, devices together.
+"""Signals as a calibrated vehicle means them: offsets off, wheels alike, steering by its true map,
+devices together.
 
-What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering stays. So does a_y:
-what it reads straight on is crossfall too, which tyres truly hold, and no drive tells them apart.
+What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering
+stays. So does a_y: what it reads straight on is crossfall too, which tyres truly hold, and no drive
+tells them apart.
 """
 
 from __future__ import annotations
@@ -19,10 +21,12 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
-    """One vehicle's signals, less what its calibration knows of their errors; blocks may be cut anywhere.
+    """One vehicle's signals, less what its calibration knows of their errors; blocks may be cut
+    anywhere.
 
-    Devices that speak early wait for the latest one: of each the reading is taken that is nearest to the moment that
-    the latest tells of, as it came. So a row is of a moment up to a tenth of a second before its time.
+    Devices that speak early wait for the latest one: of each the reading is taken that is nearest
+    to the moment that the latest tells of, as it came. So a row is of a moment up to a tenth of a
+    second before its time.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -33,7 +37,9 @@ class Corrector:
         self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is known."""
+        """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is
+        known.
+        """
         if self._known is not None:
             signals = _mended(signals, self._known)
         if self._waits:
@@ -73,7 +79,8 @@ def corrected(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArra
 
 
 def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return signals (T, 18) of wheels that all have `wheel_radius`: speed at the rim and force on the road stay.
+    """Return signals (T, 18) of wheels that all have `wheel_radius`: speed at the rim and force on
+    the road stay.
 
     The same array where the vehicle file gives no axle a radius of its own.
     """
@@ -89,10 +96,11 @@ def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
 
 
 def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return signals (T, 18) whose rear wheels turn as freely rolling ones with the same mean do at the yaw rate.
+    """Return signals (T, 18) whose rear wheels turn as freely rolling ones with the same mean do at
+    the yaw rate.
 
-    Wheels of a locked axle turn alike, so that each slips by half the track times the yaw rate in every turn. That slip
-    tells nothing of the force that the axle transmits as a whole.
+    Wheels of a locked axle turn alike, so that each slips by half the track times the yaw rate in
+    every turn. That slip tells nothing of the force that the axle transmits as a whole.
     """
     signals = signals.copy()
     half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius
@@ -117,7 +125,9 @@ def _mended(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return how long the readings of a device's channels wait for the latest device [s]; the latest is left out."""
+    """Return how long the readings of a device's channels wait for the latest device [s]; the
+    latest is left out.
+    """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}
     late = {

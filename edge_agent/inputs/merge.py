@@ -1,10 +1,10 @@
 """Recordings, each with its own clock, to one signal log by a profile.
 
-Clocks: the log's time is that of the source with the wheel speeds; a source with a date is put where its date says,
-and one without begins when the first does. Loggers write local time without saying so: dates that do not meet are
-tried in other time zones, in quarters of an hour.
-Rows: those of the table where all comes from one; else a fixed rate, linear between readings that are near enough, and
-positions only at the row next to their fix.
+Clocks: the log's time is that of the source with the wheel speeds; a source with a date is put
+where its date says, and one without begins when the first does. Loggers write local time without
+saying so: dates that do not meet are tried in other time zones, in quarters of an hour. Rows: those
+of the table where all comes from one; else a fixed rate, linear between readings that are near
+enough, and positions only at the row next to their fix.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ SMOOTH: Final = 50  # readings to either side over which bursts of arrival are s
 
 @dataclass
 class Merged:
-    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source knew it, and what was done."""
+    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source knew it,
+    and what was done.
+    """
 
     t: FloatArray
     columns: dict[str, FloatArray]
@@ -75,7 +77,8 @@ def merge(
         shifts: source name -> seconds to add to its clock.
 
     Raises:
-        InputError: no signal of the profile is there, dates do not meet, or a radius or ratio is missing.
+        InputError: no signal of the profile is there, dates do not meet, or a radius or ratio is
+            missing.
     """
     radius = wheel_radius or profile.wheel_radius
     ratio = steering_ratio or profile.steering_ratio
@@ -126,7 +129,9 @@ def merge(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Channel -> the recording that has its signals, and how; a receiver fills what the profile's signals do not."""
+    """Channel -> the recording that has its signals, and how; a receiver fills what the
+    profile's signals do not.
+    """
     found: dict[str, tuple[int, Channel]] = {}
     for name in (*CHANNELS, GROUND, *CONTEXT):
         asked = profile.channels.get(name)
@@ -165,7 +170,8 @@ def _clocks(
             if place != reference:
                 shift += spans[reference][0] - spans[place][0]
                 notes.append(
-                    f"{recording.name}: no common date; taken to begin when {recordings[reference].name} does"
+                    f"{recording.name}: no common date; taken to begin when "
+                    f"{recordings[reference].name} does"
                 )
             offsets.append(shift)
             continue
@@ -185,7 +191,8 @@ def _clocks(
         if meets[0]:
             hours = meets[0] * ZONE_S / 3600.0
             notes.append(
-                f"{recording.name}: its date is {-hours:g} h from the others', as of another time zone"
+                f"{recording.name}: its date is {-hours:g} h from the others', as of another time "
+                "zone"
             )
             if dated is not None and recording.start_ns == dated:
                 start_ns = base - round(meets[0] * ZONE_S * NS)  # the receiver is right
@@ -276,10 +283,12 @@ def _rates(series: Series) -> dict[str, object]:
 
 
 def steady(t: FloatArray) -> tuple[FloatArray, float]:
-    """Times of a periodic signal whose stamps come in bursts, straightened; and how far they were off (std) [s].
+    """Times of a periodic signal whose stamps come in bursts, straightened; and how far they were
+    off (std) [s].
 
-    Arrival wanders about a line through the count of readings, which a running mean over SMOOTH readings to either
-    side follows. Times that are not periodic (off by more than a period), or already even, come back as they are.
+    Arrival wanders about a line through the count of readings, which a running mean over SMOOTH
+    readings to either side follows. Times that are not periodic (off by more than a period), or
+    already even, come back as they are.
     """
     if len(t) < FEWEST:
         return t, 0.0

@@ -1,7 +1,9 @@
-"""A profile drafted from the names of signals: what is likely which channel, for a person to look over.
+"""A profile drafted from the names of signals: what is likely which channel, for a person to look
+over.
 
-Names are cut into words at case, digits and signs. A wheel is recognised by its two letters or words, in
-English or German (VL VR HL HR: vorn and hinten, links and rechts). Units come from the recording where it tells them.
+Names are cut into words at case, digits and signs. A wheel is recognised by its two letters or
+words, in English or German (VL VR HL HR: vorn and hinten, links and rechts). Units come from the
+recording where it tells them.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ PLACES: Final = {
     "rl": ("rl", "lr", "hl", "bl", "rear left"),
     "rr": ("rr", "hr", "br", "rear right"),
 }
-# channel -> what its name must contain (any of), and must not (any of); the first that fits is taken
-# a name fits when the first is found in it and the second is not; the first channel that fits is taken
+# channel -> what its name must contain (any of), and must not (any of); the first that fits is
+# taken a name fits when the first is found in it and the second is not; the first channel that fits
+# is taken
 Rule: TypeAlias = tuple[str, str]
 STATES: Final = "stat|diag|valid|q bit|fault|counter|check|alive|cov|std|v z|sta$"
 ROLLS: Final = (
@@ -105,7 +108,10 @@ def draft(signals: Mapping[str, str], name: str) -> Profile:
         and channels["delta_fl"].at == "steering wheel"
     ):
         channels["delta_fr"] = channels["delta_fl"]
-    about = "Drafted from names: look at every signal, unit and sign, then let `edge-agent check` do it again."
+    about = (
+        "Drafted from names: look at every signal, unit and sign, then let `edge-agent check` "
+        "do it again."
+    )
     order = {channel: channels[channel] for channel in QUANTITY if channel in channels}
     return Profile(name=re.sub(r"\W+", "-", name)[:64] or "drafted", about=about, channels=order)
 

@@ -2,8 +2,8 @@
 
     value of a channel = scale · (sum of its signals, in SI) · sign + offset,     at the time stamped − delay_s
 
-A speed at the rim becomes a wheel speed by `wheel_radius`, an angle of the steering wheel a road wheel's by
-`steering_ratio`; the vehicle file's radius and ratio go before those of the profile.
+A speed at the rim becomes a wheel speed by `wheel_radius`, an angle of the steering wheel a road
+wheel's by `steering_ratio`; the vehicle file's radius and ratio go before those of the profile.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class Part(BaseModel):
 
 
 class Sign(Part):
-    """A sign that has a signal of its own: the value is negative where `signal` equals `negative`."""
+    """A sign that has a signal of its own: the value is negative where `signal` equals
+    `negative`.
+    """
 
     signal: Text
     negative: Finite = 1.0
@@ -143,7 +145,8 @@ def shipped() -> list[str]:
 
 
 def load_profile(name: str) -> tuple[Profile, Path]:
-    """A profile by path or by the name of a shipped one, and the folder that its DBC is looked for in.
+    """A profile by path or by the name of a shipped one, and the folder that its DBC is looked for
+    in.
 
     Raises:
         InputError: it cannot be read, or a field is missing, unknown or out of range.

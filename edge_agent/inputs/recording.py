@@ -16,7 +16,9 @@ from schemas.numeric import FloatArray
 
 @dataclass(frozen=True)
 class Series:
-    """One recorded signal: times t (n,) [s] since its recording's start, values (n,), and the unit if it is known."""
+    """One recorded signal: times t (n,) [s] since its recording's start, values (n,), and the
+    unit if it is known.
+    """
 
     t: FloatArray
     values: FloatArray

@@ -1,11 +1,12 @@
 """A recorded drive: a Parquet signal log as blocks of one vehicle.
 
-Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each of them must hold
-at least one reading. The other channels may be missing, and NaN or null is a missing reading anywhere.
-A front wheel whose steering angle has no column takes that of the other; rear wheels without a column do not steer.
-What controllers and surroundings say (`schemas.signals.CONTEXT`) may be there too.
-`timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
-Time may stand still (the estimator says so in `health`) but not go back.
+Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each
+of them must hold at least one reading. The other channels may be missing, and NaN or null is a
+missing reading anywhere. A front wheel whose steering angle has no column takes that of the other;
+rear wheels without a column do not steer. What controllers and surroundings say
+(`schemas.signals.CONTEXT`) may be there too. `timestamp` is an Arrow timestamp, or a number:
+integer ns since 1970 UTC, float s since 1970 UTC. Time may stand still (the estimator says so in
+`health`) but not go back.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ BLOCK_ROWS: Final = 16_384
 
 @dataclass(frozen=True)
 class SignalLog:
-    """A read log: t (T,) [s] as recorded, signals (T, channels), and the ns UTC of t = 0 where the log knows it."""
+    """A read log: t (T,) [s] as recorded, signals (T, channels), and the ns UTC of t = 0 where
+    the log knows it.
+    """
 
     t: FloatArray
     signals: FloatArray
@@ -62,8 +65,9 @@ def read_log(path: Path) -> SignalLog:
     """Read and check a signal log.
 
     Raises:
-        InputError: not a readable Parquet file, a needed column missing or without a reading, a column that is not
-            numeric, no row, or time that is missing or goes back; names the column (and row) and the fix.
+        InputError: not a readable Parquet file, a needed column missing or without a reading, a
+            column that is not numeric, no row, or time that is missing or goes back; names the
+            column (and row) and the fix.
     """
     table = _table(path)
     if not table.num_rows:
@@ -116,7 +120,9 @@ def _context(table: pa.Table) -> FloatArray | None:
 
 
 def _numbers(table: pa.Table, name: str) -> FloatArray:
-    """A column as float64, null as NaN; a copy, since Arrow's own is read-only and numba would compile again for it."""
+    """A column as float64, null as NaN; a copy, since Arrow's own is read-only and numba would
+    compile again for it.
+    """
     try:
         values: Any = pc.cast(table[name], pa.float64())
     except pa.ArrowException as error:
@@ -190,7 +196,9 @@ def _check(table: pa.Table, signals: FloatArray) -> None:
 
 
 def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
-    """Fill the steering angles of wheels (4,) that have no channel (not of those that have one without readings)."""
+    """Fill the steering angles of wheels (4,) that have no channel (not of those that have one
+    without readings).
+    """
     if missing[0]:
         signals[:, S.DELTA] = signals[:, S.DELTA + 1]
     if missing[1]:

@@ -105,7 +105,9 @@ def understood(channel: str, text: str) -> str | None:
 
 
 def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
-    """Factor to the signal log's unit; None where a rim's speed needs a radius that is not known."""
+    """Factor to the signal log's unit; None where a rim's speed needs a radius that is not
+    known.
+    """
     factor = QUANTITY[channel][unit]
     if channel.startswith("omega") and unit in SPEED:
         return None if wheel_radius is None else factor / wheel_radius

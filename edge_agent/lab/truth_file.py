@@ -1,4 +1,6 @@
-"""What a simulated fleet really drove over: one row per true visit of a cell, to hold the map against."""
+"""What a simulated fleet really drove over: one row per true visit of a cell, to hold the map
+against.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ class TruthRecorder:
         mu: FloatArray,
         used: FloatArray,
     ) -> None:
-        """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share per wheel (T, N, 4)."""
+        """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share
+        per wheel (T, N, 4).
+        """
         cells = grid.cell_of(*position)
         sectors = grid.sector_of(yaw)
         mean = mu.mean(axis=-1)

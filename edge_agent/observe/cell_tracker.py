@@ -1,9 +1,11 @@
-"""Where visits begin and end: satellite fixes and yaw -> the cell and sector that a vehicle is in, sample by sample.
+"""Where visits begin and end: satellite fixes and yaw -> the cell and sector that a vehicle is in,
+sample by sample.
 
-A visit begins with a fix in a new cell or heading sector. Fixes jitter, and a road may run along a border, so a visit
-is left only when a fix lies clearly outside: CELL_MARGIN beyond the cell, SECTOR_KEEP beyond the sector.
-Without a fix for FIX_HELD_S the vehicle is nowhere (cell -1). Without yaw the course over ground serves.
-Pure; what must be carried between blocks is a `CellTrack` per vehicle. Any split of the samples gives the same result.
+A visit begins with a fix in a new cell or heading sector. Fixes jitter, and a road may run along a
+border, so a visit is left only when a fix lies clearly outside: CELL_MARGIN beyond the cell,
+SECTOR_KEEP beyond the sector. Without a fix for FIX_HELD_S the vehicle is nowhere (cell -1).
+Without yaw the course over ground serves. Pure; what must be carried between blocks is a
+`CellTrack` per vehicle. Any split of the samples gives the same result.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """What is carried of one vehicle between blocks, as a record; NaN where nothing was received yet."""
+    """What is carried of one vehicle between blocks, as a record; NaN where nothing was received
+    yet.
+    """
 
     fix_time: float  # of the last fix [s]
     latitude: float  # of it [deg]
@@ -49,7 +53,9 @@ class CellTrack:
 
 
 class ReceiverSample:
-    """One sample of the satellite receiver, as a record: position [deg], yaw [rad], its cell and the cell's borders."""
+    """One sample of the satellite receiver, as a record: position [deg], yaw [rad], its cell and
+    the cell's borders.
+    """
 
     latitude: float
     longitude: float

@@ -1,13 +1,17 @@
-"""Controller flags that cannot be true carry no weight: a lamp that always burns, a bit that was decoded wrongly.
+"""Controller flags that cannot be true carry no weight: a lamp that always burns, a bit that was
+decoded wrongly.
 
 A flag counts as unknown
 
 - until it was read as off for OFF_S in this trip: what never was off tells nothing;
-- while the vehicle has stood for STANDING_S with the flag on: no controller acts on wheels that do not turn;
-- while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S of them.
+- while the vehicle has stood for STANDING_S with the flag on: no controller acts on wheels that do
+  not turn;
+- while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S
+  of them.
 
-Being off for OFF_S ends the second doubt, and the third ends as the share falls. Pure. A `FlagRecord` per vehicle and
-flag is carried between blocks, so that any split of the samples gives the same result.
+Being off for OFF_S ends the second doubt, and the third ends as the share falls. Pure. A
+`FlagRecord` per vehicle and flag is carried between blocks, so that any split of the samples gives
+the same result.
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from schemas.signals import FLAGS, S
 
 # Design parameters.
 OFF_S: Final = 1.0
-STANDING_S: Final = 5.0  # locked wheels stand still too, but a controller releases them within a fraction of a second
+# locked wheels stand still too, but a controller releases them within a fraction of a second
+STANDING_S: Final = 5.0
 MOST_ACTIVE: Final = 0.3  # of the time; a long way of ice is less, an average winter drive far less
 LEAST_ACTIVE_S: Final = 30.0  # a braking from 30 m/s to rest on ice of .1 lasts as long
 MEMORY_S: Final = 600.0  # over which the share is taken, with exponential forgetting
@@ -105,7 +110,9 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Sequential core of `trusted_context`: moves the records on, and takes doubtful flags out of the context."""
+    """Sequential core of `trusted_context`: moves the records on, and takes doubtful flags out
+    of the context.
+    """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
             for i in range(3):

@@ -1,8 +1,8 @@
 """Estimates -> what is published: one observation per cell visit, and states at a set rate.
 
-For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is advanced with these
-`closes`, and `observe` makes the records. What must be carried is an `OpenVisits`. Any split of the samples gives the
-same records in the same order. Pure.
+For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is
+advanced with these `closes`, and `observe` makes the records. What must be carried is an
+`OpenVisits`. Any split of the samples gives the same records in the same order. Pure.
 """
 
 from __future__ import annotations
@@ -29,14 +29,16 @@ if TYPE_CHECKING:
 FLAG_UNKNOWN: Final = -1
 KNOWN_SHARE: Final = 0.5  # of a visit's samples, from which on "not active" can be said of a flag
 WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
-# No wheel uses more than this over what the vehicle feels: load moves to wheels that then bear more, and the wheels of
-# one driven axle, with half of the load or more, drive all of it. A reading of g is right to FELT_STD.
+# No wheel uses more than this over what the vehicle feels: load moves to wheels that then bear
+# more, and the wheels of one driven axle, with half of the load or more, drive all of it. A reading
+# of g is right to FELT_STD.
 WHEEL_SHARE: Final = 1.3
 DRIVEN_SHARE: Final = 1.5
 FELT_STD: Final = 0.03
 FELT_S: Final = 0.06  # smoothing of the accelerometers: their largest reading would be noise
-# What was felt belongs to the cell so near a fix in it, and once as much of it is behind as a fix may be wrong: of ice
-# that was left or entered by dry road a sixth of the visits told a grip that the dry road had given.
+# What was felt belongs to the cell so near a fix in it, and once as much of it is behind as a fix
+# may be wrong: of ice that was left or entered by dry road a sixth of the visits told a grip that
+# the dry road had given.
 NEAR_FIX_M: Final = 3.0
 EXCLUDED_NATS: Final = (
     -3.0
@@ -44,7 +46,9 @@ EXCLUDED_NATS: Final = (
 
 
 class RecordBlock(NamedTuple):
-    """Records of one kind: wire columns (n, …), the vehicle's index (n,), and which are to be sent at once (n,)."""
+    """Records of one kind: wire columns (n, …), the vehicle's index (n,), and which are to be
+    sent at once (n,).
+    """
 
     kind: Kind
     columns: Columns
@@ -131,8 +135,8 @@ def observe(
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
     """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states.
 
-    Without `signals` (T, N, channels) observations do not tell how the grip was used, and without `context`
-    (T, N, len(CONTEXT)) they tell nothing of controllers and surroundings.
+    Without `signals` (T, N, channels) observations do not tell how the grip was used, and without
+    `context` (T, N, len(CONTEXT)) they tell nothing of controllers and surroundings.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -151,8 +155,8 @@ def observe(
 class SampleNotes(NamedTuple):
     """Context of samples.
 
-    row, told: where the friction became another within a visit (T, N), and what its part before told: row of (k, 32).
-    context: (T, N, len(CONTEXT)); no rows where nothing is known.
+    row, told: where the friction became another within a visit (T, N), and what its part before
+    told: row of (k, 32). context: (T, N, len(CONTEXT)); no rows where nothing is known.
     """
 
     row: IntArray  # -1: nowhere
@@ -191,7 +195,9 @@ def _visit(
     ended: Records[Visit],
     position_std: float,
 ) -> int:
-    """Sequential core: add each sample to its visit, write out a visit when the next begins; returns how many."""
+    """Sequential core: add each sample to its visit, write out a visit when the next begins;
+    returns how many.
+    """
     count = 0
     for k in range(time.shape[0]):
         for n in range(time.shape[1]):
@@ -249,7 +255,9 @@ def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """The friction has become another: what was used before counts as far as the part that ends did not exclude it."""
+    """The friction has become another: what was used before counts as far as the part that ends
+    did not exclude it.
+    """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):
         if told[i] >= EXCLUDED_NATS:
@@ -295,7 +303,9 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """What the accelerometers feel `dt` [s] after the sample before; a visit without them rules nothing out."""
+    """What the accelerometers feel `dt` [s] after the sample before; a visit without them rules
+    nothing out.
+    """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
         visit.ax += share * (sample.ax - visit.ax)
@@ -316,9 +326,11 @@ def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
 
 
 def _directions(ended: RecordArray) -> dict[str, FloatArray]:
-    """The grip used along and across the vehicle, (n,): shared out by squared acceleration; NaN where there was none.
+    """The grip used along and across the vehicle, (n,): shared out by squared acceleration; NaN
+    where there was none.
 
-    The sign is that of the direction with more of it: a visit that braked and then drove is one of braking or driving.
+    The sign is that of the direction with more of it: a visit that braked and then drove is one of
+    braking or driving.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -335,7 +347,9 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 
 def _used(ended: RecordArray) -> FloatArray:
-    """Grip used in visits (n,): the window may hold the cell before; where friction jumped, that of the least part."""
+    """Grip used in visits (n,): the window may hold the cell before; where friction jumped, that
+    of the least part.
+    """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))
 
@@ -378,7 +392,8 @@ def _observations(
 def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     """Return the columns of controllers and surroundings of visits, (n,) each.
 
-    A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of them, else unknown.
+    A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of
+    them, else unknown.
     """
     known = ended["known"]
     told = ended["told"]
@@ -395,8 +410,8 @@ def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
     """Bytes (n, 32) of visits; (n, 0) of a bank without evidence.
 
-    A visit that the bank did not follow from its start is flat. Where the friction jumped in the cell it was one or the
-    other, and the larger likelihood counts.
+    A visit that the bank did not follow from its start is flat. Where the friction jumped in the
+    cell it was one or the other, and the larger likelihood counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)

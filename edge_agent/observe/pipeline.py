@@ -1,6 +1,7 @@
 """The estimation loop's one step: where are the vehicles, what do they estimate, what is published.
 
-The same for one car and a fleet, live and replayed: a block of samples in, estimates and records out.
+The same for one car and a fleet, live and replayed: a block of samples in, estimates and records
+out.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 
 
 class Seen(NamedTuple):
-    """Where the vehicles were at a block's end, each (N,): [deg], yaw [rad from east], [m/s], [ns]; NaN: unknown."""
+    """Where the vehicles were at a block's end, each (N,): [deg], yaw [rad from east], [m/s],
+    [ns]; NaN: unknown.
+    """
 
     latitude: FloatArray
     longitude: FloatArray
@@ -36,7 +39,9 @@ class Seen(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """What the vehicles believed at a block's end, each (N,): quantiles of mu, grip used, [ns]; NaN: unknown."""
+    """What the vehicles believed at a block's end, each (N,): quantiles of mu, grip used, [ns];
+    NaN: unknown.
+    """
 
     mu: FloatArray
     mu_lower: FloatArray
@@ -46,7 +51,9 @@ class Grip(NamedTuple):
 
 
 class Pipeline:
-    """A bank of N vehicles with its open visits. Use `step` for each block in order, then `finish` once."""
+    """A bank of N vehicles with its open visits. Use `step` for each block in order, then
+    `finish` once.
+    """
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
         self._bank = bank
@@ -61,7 +68,9 @@ class Pipeline:
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
-        """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
+        """Estimates, observations and states of a block of at least one sample, the latter two
+        without trip ends.
+        """
         self._tracks, located = locate(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
         context = block.context
@@ -92,18 +101,22 @@ class Pipeline:
         return estimates, self._ends.cut(observations), self._ends.cut(states)
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """What the estimators believe now, and the evidence of the visits so far; see `EstimatorBank.beliefs`."""
+        """What the estimators believe now, and the evidence of the visits so far; see
+        `EstimatorBank.beliefs`.
+        """
         return self._bank.beliefs()
 
     def doubted_flags(self) -> list[tuple[int, str, str]]:
-        """Controller flags that carry no weight now: index of the vehicle, name of the flag, and why."""
+        """Controller flags that carry no weight now: index of the vehicle, name of the flag, and
+        why.
+        """
         return doubted_flags(self._flags)
 
     def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None when there was no sample.
 
-        A visit's evidence is reported at the sample that follows it, so one sample without readings is added, with the
-        position given up.
+        A visit's evidence is reported at the sample that follows it, so one sample without readings
+        is added, with the position given up.
         """
         if self._last is None:
             return None

@@ -1,8 +1,10 @@
-"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not published.
+"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not
+published.
 
-Where somebody parks identifies them. A record passes when the trip's beginning lies `metres` and `seconds` behind it,
-and its end at least as far ahead; so it waits until the vehicle has driven on. A trip is the life of a pipeline: what
-waits when it ends is never published. Pure; with both at zero every record passes at once.
+Where somebody parks identifies them. A record passes when the trip's beginning lies `metres` and
+`seconds` behind it, and its end at least as far ahead; so it waits until the vehicle has driven on.
+A trip is the life of a pipeline: what waits when it ends is never published. Pure; with both at
+zero every record passes at once.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Batching: records become columns per (vehicle, kind, region) until a batch is due. Pure; time is an argument.
+"""Batching: records become columns per (vehicle, kind, region) until a batch is due. Pure; time is
+an argument.
 
-A batch is due when it is full, when its oldest record has waited long enough, or at once when a record is urgent.
+A batch is due when it is full, when its oldest record has waited long enough, or at once when a
+record is urgent.
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ class _Group:
 
 
 class Batcher:
-    """Collects records of the named vehicles; at most `rows` per batch, waiting at most `flush_s`."""
+    """Collects records of the named vehicles; at most `rows` per batch, waiting at most
+    `flush_s`.
+    """
 
     def __init__(
         self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int
@@ -67,7 +71,9 @@ class Batcher:
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:
-        """Add records; rows of one vehicle and region keep their order. IndexError for an unknown vehicle."""
+        """Add records; rows of one vehicle and region keep their order. IndexError for an
+        unknown vehicle.
+        """
         if not len(records.vehicle):
             return
         if records.vehicle.min() < 0 or records.vehicle.max() >= len(self._names):
@@ -122,8 +128,8 @@ class Batcher:
 
 
 def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield the first and last position of each batch, limited in rows and in time span (a replayed drive can be
-    long)."""
+    """Yield the first and last position of each batch, limited in rows and in time span (a replayed
+    drive can be long)."""
     first = 0
     for at in range(1, ready + 1):
         if at == ready or at - first == rows or abs(int(time[at]) - int(time[first])) > SPAN_NS:

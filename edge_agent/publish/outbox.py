@@ -1,14 +1,14 @@
 """Outbox: batches on disk until they are acknowledged, so that no report is lost or counted twice.
 
-A batch is committed here before it is sent and is removed only when the service has settled it. It is identified by its
-stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each stream. `boot` is random per start, so a
-restarted agent opens new streams and never reuses a name. Batches of an earlier start are sent again under their old
-name.
+A batch is committed here before it is sent and is removed only when the service has settled it. It
+is identified by its stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each
+stream. `boot` is random per start, so a restarted agent opens new streams and never reuses a name.
+Batches of an earlier start are sent again under their old name.
 
-The size is bounded: when the payloads exceed the capacity, the oldest states are dropped first, then the oldest
-observations, and both are counted. SQLite runs in WAL mode with a sync per commit. The exclusive lock of the database
-file is held while the outbox is open, so that one file never serves two agents. Time is an argument, in monotonic
-seconds.
+The size is bounded: when the payloads exceed the capacity, the oldest states are dropped first,
+then the oldest observations, and both are counted. SQLite runs in WAL mode with a sync per commit.
+The exclusive lock of the database file is held while the outbox is open, so that one file never
+serves two agents. Time is an argument, in monotonic seconds.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
 FIRST_RESEND_S = 2.0
 # for an answer of a service that does answer; see `pacing` for one that does not
 LONGEST_RESEND_S = 6.0
-# A batch that no service can read is answered by none. Once so many later ones of its stream were settled, a service is
-# about to take no more (it remembers 65 536 above one that is missing), so that this one must go.
+# A batch that no service can read is answered by none. Once so many later ones of its stream were
+# settled, a service is about to take no more (it remembers 65 536 above one that is missing), so
+# that this one must go.
 PASSED_OVER = 50_000
 LEAST_OLDEST = 1000  # keys that may be gone before they are looked through
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
@@ -43,7 +44,9 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 
 class Stream(NamedTuple):
-    """Numbering scope of `seq`: one vehicle, one start, one kind of record, one region (z10 quadint)."""
+    """Numbering scope of `seq`: one vehicle, one start, one kind of record, one region (z10
+    quadint).
+    """
 
     vehicle: str
     boot: int
@@ -90,7 +93,9 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Seqs of one stream: the next number and those still held. All its entries share the stream's name."""
+    """Seqs of one stream: the next number and those still held. All its entries share the
+    stream's name.
+    """
 
     stream: Stream
     next: int = 1
@@ -98,15 +103,17 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Return the lowest seq still held, or the next one if none is; settled seqs are skipped once."""
+        """Return the lowest seq still held, or the next one if none is; settled seqs are skipped
+        once.
+        """
         while self.first < self.next and self.first not in self.held:
             self.first += 1
         return self.first
 
 
 class Outbox:
-    """Unsettled batches of one agent process. Raises InputError if the file belongs to another agent or is no
-    outbox."""
+    """Unsettled batches of one agent process. Raises InputError if the file belongs to another
+    agent or is no outbox."""
 
     def __init__(
         self,
@@ -138,7 +145,8 @@ class Outbox:
     def _restore(self) -> None:
         """Load the batches of an earlier start; all are due at once."""
         rows = self._database.execute(
-            "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch ORDER BY id"
+            "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch "
+            "ORDER BY id"
         )
         for key, vehicle, boot, kind, region, seq, records, size in rows:
             self._hold(key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size))
@@ -217,7 +225,9 @@ class Outbox:
         )
 
     def stranded(self, vehicles: Collection[str]) -> int:
-        """Return the number of records of other vehicles than these: of a former name, which is not sent."""
+        """Return the number of records of other vehicles than these: of a former name, which is
+        not sent.
+        """
         return sum(
             e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles
         )
@@ -233,7 +243,8 @@ class Outbox:
         return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Number the drafts and commit them in one transaction; nothing changes if the commit fails.
+        """Number the drafts and commit them in one transaction; nothing changes if the commit
+        fails.
 
         Raises sqlite3.Error if the disk refuses.
         """
@@ -262,7 +273,8 @@ class Outbox:
         payload = draft.encode(seq, known.first_held())
         name = (stream.vehicle, stream.boot, str(stream.kind), stream.region, seq, draft.records)
         cursor = self._database.execute(
-            f"INSERT INTO batch ({spool_file.NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            f"INSERT INTO batch ({spool_file.NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, "
+            "?, ?)",
             (*name, payload, spool_file.checksum(name, payload)),
         )
         ahead[stream] = seq + 1
@@ -312,17 +324,20 @@ class Outbox:
         )
 
     def delete_settled(self) -> None:
-        """Delete settled batches from the disk now, without waiting for the next `store`. Raises sqlite3.Error."""
+        """Delete settled batches from the disk now, without waiting for the next `store`. Raises
+        sqlite3.Error.
+        """
         if self._deletable:
             with self._database:
                 self._delete()
             self._deletable.clear()
 
     def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
-        """Remove the batches of inclusive seq ranges; return the number of records. Unknown seqs are ignored.
+        """Remove the batches of inclusive seq ranges; return the number of records. Unknown seqs
+        are ignored.
 
-        The rows are deleted with the next `store` or `delete_settled`, so that an acknowledgement costs no sync. A
-        batch that a crash restores is sent again, and the service recognises it.
+        The rows are deleted with the next `store` or `delete_settled`, so that an acknowledgement
+        costs no sync. A batch that a crash restores is sent again, and the service recognises it.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -338,8 +353,8 @@ class Outbox:
     def due(
         self, now: float, limit: int, vehicles: Collection[str] | None = None
     ) -> list[StoredBatch]:
-        """Return at most `limit` batches to send now, oldest first, of these vehicles or of all; `pacing` decides how
-        many.
+        """Return at most `limit` batches to send now, oldest first, of these vehicles or of all;
+        `pacing` decides how many.
 
         Raises sqlite3.Error if the disk refuses.
         """
@@ -366,7 +381,9 @@ class Outbox:
         return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
 
     def _is_passed_over(self, entry: _Entry) -> bool:
-        """Return True if PASSED_OVER later batches of the stream were settled and this one, the oldest, was not."""
+        """Return True if PASSED_OVER later batches of the stream were settled and this one, the
+        oldest, was not.
+        """
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)
         return later >= PASSED_OVER and sequence.first_held() == entry.seq

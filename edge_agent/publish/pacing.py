@@ -1,10 +1,12 @@
-"""Pacing of one vehicle's batches for one region, so that unanswered batches do not flood the network. Pure.
+"""Pacing of one vehicle's batches for one region, so that unanswered batches do not flood the
+network. Pure.
 
-Open, while acknowledgements arrive: fresh batches are sent at once. Of waiting batches, as many are in flight as a
-window allows. The window grows with each settled batch and is halved when one is not answered in time (slow start and
-congestion avoidance, Jacobson 1988: loss indicates overload). Silent, when nothing was answered for SILENT_S: fresh
-batches stay on disk, and a single one is sent as a probe at intervals that double up to LONGEST_PROBE_S. The first
-acknowledgement opens the route again. Time is monotonic seconds.
+Open, while acknowledgements arrive: fresh batches are sent at once. Of waiting batches, as many are
+in flight as a window allows. The window grows with each settled batch and is halved when one is not
+answered in time (slow start and congestion avoidance, Jacobson 1988: loss indicates overload).
+Silent, when nothing was answered for SILENT_S: fresh batches stay on disk, and a single one is sent
+as a probe at intervals that double up to LONGEST_PROBE_S. The first acknowledgement opens the route
+again. Time is monotonic seconds.
 """
 
 from __future__ import annotations
@@ -16,8 +18,9 @@ from typing import Final
 # A service writes a segment each second and starts within some; it is not away before that.
 SILENT_S: Final = 8.0
 FIRST_PROBE_S: Final = 4.0
-# A thousand cars then cost a service that is away eight messages a second. After five minutes, cars came back one after
-# the other for longer than their backlog of an hour takes, and the service was idle in between.
+# A thousand cars then cost a service that is away eight messages a second. After five minutes, cars
+# came back one after the other for longer than their backlog of an hour takes, and the service was
+# idle in between.
 LONGEST_PROBE_S: Final = 120.0
 FIRST_WINDOW: Final = 16.0  # batches in flight; 3 kB, as much as TCP begins with
 LEAST_WINDOW: Final = 8.0  # a batch a vehicle, kind and second is put in any case
@@ -119,14 +122,18 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again: batches in flight are lost, and a silent route is probed at once."""
+        """Record that a router is available again: batches in flight are lost, and a silent
+        route is probed at once.
+        """
         self.flying = 0
         self._unanswered_since = None
         self._probe_at = now
         self._probe_s = FIRST_PROBE_S
 
     def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
-        """Return the keys of at most `most` batches to send now, oldest first; keys that are not `held` are dropped."""
+        """Return the keys of at most `most` batches to send now, oldest first; keys that are not
+        `held` are dropped.
+        """
         if self._answered:
             self._answered = False
             self._unanswered_since = now if self.flying else None
@@ -141,7 +148,9 @@ class Pacer:
         return out
 
     def _probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """Return the oldest or the newest batch in turn, so that an unreadable one does not block the route."""
+        """Return the oldest or the newest batch in turn, so that an unreadable one does not
+        block the route.
+        """
         if now < self._probe_at:
             return []
         self._waiting = sorted({key for key in self._waiting if key in held})

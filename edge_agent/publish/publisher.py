@@ -1,8 +1,9 @@
-"""Publisher: the thread between the estimation loop and the network: batch, store, send, settle, resend.
+"""Publisher: the thread between the estimation loop and the network: batch, store, send, settle,
+resend.
 
-The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every batch is on disk
-before it is sent, and stays there until the service has settled it. A second thread opens the sessions and waits for
-the routers as long as necessary.
+The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every
+batch is on disk before it is sent, and stays there until the service has settled it. A second
+thread opens the sessions and waits for the routers as long as necessary.
 """
 
 from __future__ import annotations
@@ -59,9 +60,11 @@ class Counts:
 
 
 class Publisher:
-    """Publishes records of the named vehicles; column `vehicle` of the records is an index into `names`.
+    """Publishes records of the named vehicles; column `vehicle` of the records is an index into
+    `names`.
 
-    `on_open` is called with each vehicle's session when it is open, for other publications and subscriptions.
+    `on_open` is called with each vehicle's session when it is open, for other publications and
+    subscriptions.
     """
 
     def __init__(
@@ -144,7 +147,9 @@ class Publisher:
 
     @property
     def broken(self) -> bool:
-        """True if the sending thread has died: records are accepted, and dropped when there is no room."""
+        """True if the sending thread has died: records are accepted, and dropped when there is
+        no room.
+        """
         return (
             self._sender.ident is not None
             and not self._sender.is_alive()
@@ -152,7 +157,9 @@ class Publisher:
         )
 
     def unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of unsettled records: in the outbox, also of an earlier start, or on their way to it."""
+        """Return the number of unsettled records: in the outbox, also of an earlier start, or on
+        their way to it.
+        """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
@@ -175,7 +182,9 @@ class Publisher:
                 self.counts.dropped[records.kind] += len(records.vehicle)
 
     def close(self, within_s: float) -> bool:
-        """Flush, wait at most `within_s` for acknowledgements, stop; False if something hung and was abandoned."""
+        """Flush, wait at most `within_s` for acknowledgements, stop; False if something hung and
+        was abandoned.
+        """
         self._deadline = self._clock() + within_s
         self._closing.set()
         self._sender.join(within_s + CLOSE_GRACE_S)
@@ -262,7 +271,9 @@ class Publisher:
             log.exception("%d records that nobody can send are dropped", len(records.vehicle))
 
     def _store(self) -> None:
-        """Commit waiting records, then send them. A disk that refuses is tried again in the next round."""
+        """Commit waiting records, then send them. A disk that refuses is tried again in the next
+        round.
+        """
         if not self._waiting:
             return
         try:
@@ -308,7 +319,9 @@ class Publisher:
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
     def _compare_clocks(self, reported: int) -> None:
-        """Compare our clock with that of a service [ns], 0 if unknown; an acknowledgement is about a second old."""
+        """Compare our clock with that of a service [ns], 0 if unknown; an acknowledgement is
+        about a second old.
+        """
         if not reported:
             return
         behind = (reported - self._wall()) / NS
@@ -320,8 +333,8 @@ class Publisher:
         self.clock_behind_s = behind
 
     def _check_connections(self) -> None:
-        """Note for each vehicle whether it has a router. Batches in flight when a link breaks are lost; they are sent
-        again on the next link."""
+        """Note for each vehicle whether it has a router. Batches in flight when a link breaks are
+        lost; they are sent again on the next link."""
         for name, link in list(self._links.items()):
             epoch = link.watch.epoch
             if epoch != self._epochs.get(name, 0):

@@ -1,7 +1,9 @@
-"""Recovery of rows from a damaged SQLite file, page by page without its tree. Pure: bytes in, rows out.
+"""Recovery of rows from a damaged SQLite file, page by page without its tree. Pure: bytes in, rows
+out.
 
-After "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1 (write-ahead log). A
-recovered row may be torn, deleted or older than another copy. The caller must verify it, so batches have a checksum.
+After "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1
+(write-ahead log). A recovered row may be torn, deleted or older than another copy. The caller must
+verify it, so batches have a checksum.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ Value = int | str | bytes | None
 
 
 def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
-    """Yield row id and columns of every intact cell; the cells of the write-ahead log first, from its end on."""
+    """Yield row id and columns of every intact cell; the cells of the write-ahead log first,
+    from its end on.
+    """
     pages = {at // PAGE + 1: database[at : at + PAGE] for at in range(0, len(database), PAGE)}
     newer = [
         (int.from_bytes(log[at : at + 4], "big"), log[at + _FRAME : at + _FRAME + PAGE])

@@ -1,6 +1,8 @@
-"""SQLite file of an outbox: opened exclusively; a damaged one is set aside, and its readable batches are saved.
+"""SQLite file of an outbox: opened exclusively; a damaged one is set aside, and its readable
+batches are saved.
 
-A batch has a checksum of its name and its bytes, because SQLite does not detect changed bits in them.
+A batch has a checksum of its name and its bytes, because SQLite does not detect changed bits in
+them.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ def is_damage(error: sqlite3.Error) -> bool:
 
 
 def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Return the file, checked and locked for this process, and the path to which a damaged one was set aside.
+    """Return the file, checked and locked for this process, and the path to which a damaged one was
+    set aside.
 
     Raises:
         InputError: the file belongs to another agent or is no outbox, or the path cannot be used.
@@ -109,7 +112,8 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
     with database:
         for row in _readable(aside):
             database.execute(
-                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, "
+                "?, ?, ?, ?, ?)",
                 row,
             )
             saved += 1
@@ -139,14 +143,18 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _ours(path: Path) -> bool:
-    """Return True if a file was an outbox: it begins like SQLite except for a few bytes, or is completely erased."""
+    """Return True if a file was an outbox: it begins like SQLite except for a few bytes, or is
+    completely erased.
+    """
     with path.open("rb") as file:
         begin = file.read(len(_MAGIC))
     return not any(begin) or sum(a == b for a, b in zip(begin, _MAGIC, strict=False)) >= _SIMILAR
 
 
 def _readable(path: Path) -> list[Row]:
-    """Return the batches of a damaged file by age, each once, with a correct checksum or from before checksums."""
+    """Return the batches of a damaged file by age, each once, with a correct checksum or from
+    before checksums.
+    """
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}
     for key, values in salvage.recover_rows(

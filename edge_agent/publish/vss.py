@@ -1,8 +1,9 @@
 """Friction at the car as signals of the Vehicle Signal Specification (COVESA VSS 4 and later).
 
-`Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion of 1: 50 %, 5 % and
-95 % quantiles, clipped at 100 as the standard requires. Unknown values are absent, never a default. MostProbable is
-also absent if less than EXCITED_SHARE of the grip was used within UTILISED_WINDOW_S, because mu is then mostly prior.
+`Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion
+of 1: 50 %, 5 % and 95 % quantiles, clipped at 100 as the standard requires. Unknown values are
+absent, never a default. MostProbable is also absent if less than EXCITED_SHARE of the grip was used
+within UTILISED_WINDOW_S, because mu is then mostly prior.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ def road_friction(
 
 
 class RoadFrictionOutput:
-    """Reports the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh key.
+    """Reports the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh
+    key.
 
     Args:
         names: row k of the reported values is vehicle k.

@@ -1,4 +1,6 @@
-"""Zenoh session of one vehicle: sends its batches, receives its acknowledgements, declares its liveliness token."""
+"""Zenoh session of one vehicle: sends its batches, receives its acknowledgements, declares its
+liveliness token.
+"""
 
 from __future__ import annotations
 
@@ -70,9 +72,11 @@ class Link:
         return self.watch.is_connected
 
     def put(self, batch: StoredBatch) -> bool:
-        """Send a batch; False if the session refuses. Only the acknowledgement proves that it arrived.
+        """Send a batch; False if the session refuses. Only the acknowledgement proves that it
+        arrived.
 
-        Waits until GAP_S after the last message of its kind, because a router drops messages that follow too soon.
+        Waits until GAP_S after the last message of its kind, because a router drops messages that
+        follow too soon.
         """
         stream = batch.stream
         early = self._free_at[stream.kind] - self._clock()

@@ -1,1 +1,3 @@
-"""Questions to the archive, written once as Ibis expressions: DuckDB runs them on one machine, Spark on a cluster."""
+"""Questions to the archive, written once as Ibis expressions: DuckDB runs them on one machine,
+Spark on a cluster.
+"""

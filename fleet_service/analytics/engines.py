@@ -1,4 +1,6 @@
-"""Query engines: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis tables."""
+"""Query engines: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis
+tables.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ Table: TypeAlias = Any  # an ibis.Table, whose package has no types
 ENGINES: Final = ("duckdb", "spark")
 _MAP_COLUMNS: Final = (
     # Ibis does not know geometries with a crs; files before 1.2 give bounds a mu
-    "cell, sector, CASE WHEN basis = 'bound' THEN NULL ELSE mu END AS mu, mu_lower, mu_upper, basis, vehicles"
+    "cell, sector, CASE WHEN basis = 'bound' THEN NULL ELSE mu END AS mu, mu_lower, mu_upper, "
+    "basis, vehicles"
 )
 NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshots.TABLE}
 
@@ -65,7 +68,9 @@ class QueryEngine:
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
-        """Return the files of a table that may hold rows of the part; a snapshot counts until the day after its own."""
+        """Return the files of a table that may hold rows of the part; a snapshot counts until
+        the day after its own.
+        """
         before = 1 if table == "map" else 0
         first = self.part.since // layout.DAY_NS - before
         last = self.part.until // layout.DAY_NS
@@ -121,7 +126,9 @@ class QueryEngine:
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of files, with whole seconds since 1970 for one column; the engines count them differently."""
+        """Return a table of files, with whole seconds since 1970 for one column; the engines
+        count them differently.
+        """
         texts = [str(path) for path in paths]
         if self._spark is None:
             quoted = ", ".join("'" + text.replace("'", "''") + "'" for text in texts)
@@ -143,7 +150,8 @@ class QueryEngine:
 
 
 def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Return which rows give a value of mu and not only a bound: they used EXCITED_SHARE of it (see the contract).
+    """Return which rows give a value of mu and not only a bound: they used EXCITED_SHARE of it (see
+    the contract).
 
     NaN is larger than any number in both engines, so it is checked explicitly.
     """
@@ -152,4 +160,5 @@ def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     return ~t.mu.isnan() & ~t.mu_utilised.isnan() & enough
 
 
-_NEARLY: Final = 1e-6  # far below the steps of both, so that engines that round otherwise agree where they are equal
+# far below the steps of both, so that engines that round otherwise agree where they are equal
+_NEARLY: Final = 1e-6

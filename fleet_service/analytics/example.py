@@ -1,6 +1,7 @@
 """Example to start from: a week of an archive in five figures.
 
-python -m fleet_service.analytics.example --archive DIR --out FOLDER python -m fleet_service.analytics.example --out
+python -m fleet_service.analytics.example --archive DIR --out FOLDER python -m
+fleet_service.analytics.example --out
 FOLDER            # of a synthetic archive
 """
 

@@ -32,10 +32,12 @@ def ask_archive(
     options: Options | None = None,
     engine: str = "duckdb",
 ) -> pa.Table:
-    """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO 8601, UTC.
+    """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO
+    8601, UTC.
 
     Raises:
-        InputError: there is no such question or archive, no data in that part, or an option is missing.
+        InputError: there is no such question or archive, no data in that part, or an option is
+            missing.
     """
     root = Path(archive)
     require_archive(root)
@@ -56,5 +58,7 @@ def map_of_archive(
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
-    """Write an answer in the format of the ending: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
+    """Write an answer in the format of the ending: .parquet, .geo.parquet, .geojson, .csv, .png,
+    .svg, .pdf, .html.
+    """
     output.write(table, question_of(question), Path(path))

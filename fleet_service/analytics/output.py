@@ -1,4 +1,6 @@
-"""Output of answers: terminal table, Parquet, GeoParquet, GeoJSON, CSV, plot, or a map that needs no network."""
+"""Output of answers: terminal table, Parquet, GeoParquet, GeoJSON, CSV, plot, or a map that
+needs no network.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +128,9 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
 
 
 def times_as_timestamps(table: pa.Table) -> pa.Table:
-    """Return an answer whose seconds since 1970 are timestamps, which text files write as ISO 8601."""
+    """Return an answer whose seconds since 1970 are timestamps, which text files write as ISO
+    8601.
+    """
     for place, field in enumerate(table.schema):
         if field.name in TIMES and pa.types.is_integer(field.type):
             table = table.set_column(
@@ -136,7 +140,9 @@ def times_as_timestamps(table: pa.Table) -> pa.Table:
 
 
 def add_places(table: pa.Table) -> pa.Table:
-    """Return an answer with the coordinates of its cells, if it has cells and no coordinates yet."""
+    """Return an answer with the coordinates of its cells, if it has cells and no coordinates
+    yet.
+    """
     names = table.schema.names
     if "cell" not in names or "latitude" in names or "west" in names:
         return table
@@ -182,7 +188,9 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
 
 
 def page(table: pa.Table, question: Question) -> str:
-    """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs no network."""
+    """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs
+    no network.
+    """
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError(
             "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"

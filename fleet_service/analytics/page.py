@@ -1,4 +1,5 @@
-"""Map of cells as one HTML file that needs no network: panels, frames that play, a scale with ticks.
+"""Map of cells as one HTML file that needs no network: panels, frames that play, a scale with
+ticks.
 
 It works with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
 """

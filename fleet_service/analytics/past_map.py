@@ -28,7 +28,9 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 
 
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
-    """Return the map at the end of a part, replayed from everything received by then, as a GeoParquet table."""
+    """Return the map at the end of a part, replayed from everything received by then, as a
+    GeoParquet table.
+    """
     return snapshot_table(
         visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox),
         part.until,

@@ -45,8 +45,8 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
 
 
 def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
-    """Return squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m from the
-    south-west]."""
+    """Return squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m
+    from the south-west]."""
     west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
     x, y = grid.outline(cell, sector)
@@ -127,8 +127,10 @@ def _worst(figure: Figure, table: pa.Table) -> None:
             axes, cell_shapes(cells), np.full(len(cells), one["mu"])
         )  # whole: all head the same way
         axes.set_title(
-            f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} {ARROWS[one['sector']]}\n"
-            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} values",
+            f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} "
+            f"{ARROWS[one['sector']]}\n"
+            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} "
+            "values",
             fontsize=9,
         )
         axes.margins(0.1)

@@ -1,11 +1,12 @@
-"""Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here, or on Spark.
+"""Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here,
+or on Spark.
 
     OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all visited cells
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all days
 
-Cells do not depend on each other once the weights are known. A zone therefore needs its own rows and those of a margin
-around it, and gives the same result as a replay of everything. Both engines run the same function for each zone and
-write the same bytes.
+Cells do not depend on each other once the weights are known. A zone therefore needs its own rows
+and those of a margin around it, and gives the same result as a replay of everything. Both engines
+run the same function for each zone and write the same bytes.
 """
 
 from __future__ import annotations
@@ -72,8 +73,8 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
     """Rebuild all zones; yield the result of each, in order.
 
     Raises:
-        InputError: there are no compacted observations, a file is of a newer version, the engine is unknown or not
-            installed.
+        InputError: there are no compacted observations, a file is of a newer version, the engine is
+            unknown or not installed.
         OSError: something cannot be read or written.
     """
     if engine not in ENGINES:

@@ -1,6 +1,7 @@
 """Synthetic archive for example, tests and benchmarks: roads, trips, ice at night, biased vehicles.
 
-Its rows have the shape of the real estimator's: two visits in three only bound mu, a third gives a value.
+Its rows have the shape of the real estimator's: two visits in three only bound mu, a third gives a
+value.
 """
 
 from __future__ import annotations
@@ -155,7 +156,9 @@ def _chunk(
 def _places(
     road: IntArray, along: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
+    """Return position with the receiver's noise, and yaw; a road is straight, one in two runs
+    north.
+    """
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
     row = road // 2 % 20
@@ -186,7 +189,9 @@ def truth_of(
 def _likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
-    """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a bound."""
+    """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a
+    bound.
+    """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)
     below = 0.5 * np.square(distance / flank[0]) * (distance < 0)

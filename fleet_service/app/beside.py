@@ -1,4 +1,6 @@
-"""Work in a separate process: its memory is returned at the end, and it shares no interpreter with the worker."""
+"""Work in a separate process: its memory is returned at the end, and it shares no interpreter
+with the worker.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ LOOK_S: Final = 0.1  # between two looks whether it shall stop
 def run_module(
     what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None
 ) -> str | None:
-    """Run a module as a process with `document` on its stdin; return its stdout, or None if it was stopped. The process
-    must tolerate a kill at any instant.
+    """Run a module as a process with `document` on its stdin; return its stdout, or None if it was
+    stopped. The process must tolerate a kill at any instant.
 
     Raises:
         InputError: it failed.

@@ -1,9 +1,11 @@
-"""Clock of the service: neither a jump of the system clock nor a wrong one at the start loses or refuses data.
+"""Clock of the service: neither a jump of the system clock nor a wrong one at the start loses or
+refuses data.
 
-A wall clock may jump: a time server corrects it, a machine wakes up, a person sets it. The service therefore runs on a
-monotonic clock from its start. It follows a jump of more than JUMP_NS only when reports confirm it: the clock that more
-of the current vehicles agree with is right. Until then nothing is refused for its time if it may be right by the other
-clock. It is not acknowledged either, so its sender keeps it.
+A wall clock may jump: a time server corrects it, a machine wakes up, a person sets it. The service
+therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS only when
+reports confirm it: the clock that more of the current vehicles agree with is right. Until then
+nothing is refused for its time if it may be right by the other clock. It is not acknowledged
+either, so its sender keeps it.
 """
 
 from __future__ import annotations
@@ -69,7 +71,9 @@ class SteadyClock:
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
-        """Return the time. It follows small forward steps of the wall clock, and larger ones when reports agree."""
+        """Return the time. It follows small forward steps of the wall clock, and larger ones
+        when reports agree.
+        """
         even = self._zero + self._steady()
         wall = self._wall()
         if abs(wall - even) <= JUMP_NS:
@@ -112,7 +116,7 @@ class SteadyClock:
             self._confirmed = True
 
     def lag(self) -> int:
-        """Return how far the wall clock is behind [ns], or ahead if negative: the size of a jump that is not
-        followed."""
+        """Return how far the wall clock is behind [ns], or ahead if negative: the size of a jump
+        that is not followed."""
         now = self.now()
         return max(now, self._seen if self._seen > now else now) - self._wall()

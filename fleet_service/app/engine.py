@@ -1,7 +1,8 @@
-"""Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers out.
+"""Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers
+out.
 
-The parts share one state (`app.state`). One worker uses `intake`, `settlement` and `alerts`. Other threads use
-`queries` and `run_between_segments`.
+The parts share one state (`app.state`). One worker uses `intake`, `settlement` and `alerts`. Other
+threads use `queries` and `run_between_segments`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class Engine:
     Args:
         config: settings.
         root: of the archive; it is locked while the engine is open.
-        holding: ownership of the archive, closed with the engine; None to open the archive now, without a lease.
+        holding: ownership of the archive, closed with the engine; None to open the archive now,
+            without a lease.
 
     Raises:
         InputError: another service holds the archive.
@@ -91,7 +93,8 @@ class Engine:
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state by what the archive holds; call it in `run_between_segments`.
+        """Call `before`, then replace the state by what the archive holds; call it in
+        `run_between_segments`.
 
         Raises:
             OSError: the archive cannot be read; the state stays.
@@ -105,14 +108,17 @@ class Engine:
             self.alerts.end_erased(standing)
 
     def drop_old(self) -> int:
-        """Drop old cells that are back at the prior; return their number. Call it in `run_between_segments`."""
+        """Drop old cells that are back at the prior; return their number. Call it in
+        `run_between_segments`.
+        """
         with self._shared.guard:
             return self.state.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
         """Return the state and the last segment it includes; None if stopped meanwhile.
 
-        The worker copies the state right after a segment, when every row in it is on disk. Another thread calls this.
+        The worker copies the state right after a segment, when every row in it is on disk. Another
+        thread calls this.
         """
         return self.settlement.run_between_segments(self._image, stop)
 

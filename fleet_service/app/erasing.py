@@ -1,13 +1,14 @@
-"""Erasure in a running service: handles the requests of `archive.requests` in the thread of the background jobs.
+"""Erasure in a running service: handles the requests of `archive.requests` in the thread of the
+background jobs.
 
     a segment; the service's state is on disk up to it
     in a separate process:    the vehicle's rows leave the files, and all others, read again, make a checkpoint
     between two segments:     the service drops its state and begins from that checkpoint and the log since
 
-Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an incomplete erasure.
-Others wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. If the service
-dies during the erasure, its next start finds the request, and no checkpoint contains the vehicle. Later measurements of
-the vehicle are new.
+Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an
+incomplete erasure. Others wait for the lock of compaction. Messages wait for as long as a start
+from a checkpoint takes. If the service dies during the erasure, its next start finds the request,
+and no checkpoint contains the vehicle. Later measurements of the vehicle are new.
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ def handle_requests(
 
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
-    """Erase in the copy too; return why this is incomplete, in which case a background job does it later."""
+    """Erase in the copy too; return why this is incomplete, in which case a background job does
+    it later.
+    """
     try:
         copy.sync()
     except OSError as error:

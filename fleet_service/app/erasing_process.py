@@ -1,4 +1,6 @@
-"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure for a service, read from stdin."""
+"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure for a service, read from
+stdin.
+"""
 
 from __future__ import annotations
 

@@ -81,8 +81,8 @@ class Intake:
         self.weather.fusion = self._shared.state.fusion
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a number is
-        certain."""
+        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a
+        number is certain."""
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         ahead = int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(at.now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
@@ -131,8 +131,8 @@ class Intake:
         return raised
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
-        """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
-        places."""
+        """Return which rows are archived and not fused: their vehicle cannot be there, or reports
+        too many new places."""
         witness = rows["witness"]
         beyond = self._paths.find_implausible(
             witness, rows["leave_time"], rows["latitude"], rows["longitude"]

@@ -42,7 +42,9 @@ _NICE: Final = 10  # the worker goes first
 
 
 class Job(NamedTuple):
-    """Periodic work: returns a line for the operator, or None; a period of 0 seconds means never."""
+    """Periodic work: returns a line for the operator, or None; a period of 0 seconds means
+    never.
+    """
 
     name: str
     every_s: float
@@ -52,7 +54,9 @@ class Job(NamedTuple):
 def archive_jobs(
     engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]
 ) -> list[Job]:
-    """Return the jobs that maintain an archive, according to the settings; `moment` returns the service's time."""
+    """Return the jobs that maintain an archive, according to the settings; `moment` returns the
+    service's time.
+    """
 
     def compaction(stop: threading.Event) -> str | None:
         if (
@@ -203,7 +207,9 @@ class BackgroundJobs:
             due[job] = time.monotonic() + again_s
 
     def _run_job(self, job: Job) -> bool:
-        """Run one turn of a job; return True on success. A failure must not affect the other jobs."""
+        """Run one turn of a job; return True on success. A failure must not affect the other
+        jobs.
+        """
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)

@@ -39,8 +39,8 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """Values that only the running service knows: seconds since the worker's last turn, queue length, routers, clock
-    lag [s], and how long the current tile of an answer takes [s]."""
+    """Values that only the running service knows: seconds since the worker's last turn, queue
+    length, routers, clock lag [s], and how long the current tile of an answer takes [s]."""
 
     turn_age_s: float
     queued: int

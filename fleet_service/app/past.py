@@ -1,7 +1,8 @@
-"""Maps of past moments, rebuilt in a separate process: its memory is bounded in advance and returned at the end.
+"""Maps of past moments, rebuilt in a separate process: its memory is bounded in advance and
+returned at the end.
 
-That process (`past_process`) reads questions as lines of JSON and writes the replies, each after its tile and length.
-Tile -1 marks an error and -2 the end of an answer.
+That process (`past_process`) reads questions as lines of JSON and writes the replies, each after
+its tile and length. Tile -1 marks an error and -2 the end of an answer.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from schemas.query import MapQuery
 from schemas.runtime.process import trim_memory
 
 MOST_ROWS: Final = 500_000  # that are fused: some seconds, and 100 MB
-LOOKED_ROWS: Final = 20_000_000  # of row groups near the box, by the files' footers, read one at a time: half a minute
+# of row groups near the box, by the files' footers, read one at a time: half a minute
+LOOKED_ROWS: Final = 20_000_000
 IDLE_S: Final = 60.0  # for which a process waits for the next question
 ANSWERS: Final = 100  # after which it leaves: what it holds back of memory goes with it
 _HEAD: Final = struct.Struct("<qQ")
@@ -41,8 +43,8 @@ _END = -2
 class PastQuery(NamedTuple):
     """Query about a moment [ns].
 
-    It has the lateness of the service [s], `only` (the only selected tile) and `public` (minimum number of recent
-    vehicles of a visible cell).
+    It has the lateness of the service [s], `only` (the only selected tile) and `public` (minimum
+    number of recent vehicles of a visible cell).
     """
 
     query: MapQuery
@@ -53,7 +55,8 @@ class PastQuery(NamedTuple):
 
 
 class HistoricalMaps:
-    """Answers about the past. The process is kept for IDLE_S for the next question, because it takes a second to start.
+    """Answers about the past. The process is kept for IDLE_S for the next question, because it
+    takes a second to start.
 
     Args:
         root: of the archive.
@@ -117,7 +120,9 @@ class HistoricalMaps:
 
 
 class _Process:
-    """Process that answers one question after the other, and exits when none arrives for a while."""
+    """Process that answers one question after the other, and exits when none arrives for a
+    while.
+    """
 
     def __init__(self, root: Path) -> None:
         command = [sys.executable, "-m", "fleet_service.app.past_process", str(root)]

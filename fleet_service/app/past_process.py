@@ -1,4 +1,6 @@
-"""`python -m fleet_service.app.past_process ARCHIVE`: answers questions about the past, from stdin to stdout."""
+"""`python -m fleet_service.app.past_process ARCHIVE`: answers questions about the past, from
+stdin to stdout.
+"""
 
 from __future__ import annotations
 

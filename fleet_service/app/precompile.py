@@ -1,4 +1,6 @@
-"""Loads or compiles kernels before the service is ready, because compiling takes seconds while vehicles wait."""
+"""Loads or compiles kernels before the service is ready, because compiling takes seconds while
+vehicles wait.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,8 @@ DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
 def warm_up() -> None:
-    """Load the kernels. If they were never compiled, a separate process compiles them: the compiler leaves a hundred
-    megabytes of fragmented memory, into which a service would grow for hours."""
+    """Load the kernels. If they were never compiled, a separate process compiles them: the compiler
+    leaves a hundred megabytes of fragmented memory, into which a service would grow for hours."""
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
         beside = subprocess.run(
@@ -43,7 +45,9 @@ def warm_up() -> None:
 
 
 def live() -> None:
-    """Run a temporary map through its life: update, grow, advance, update late within the window, commit, believe."""
+    """Run a temporary map through its life: update, grow, advance, update late within the
+    window, commit, believe.
+    """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
         o = _visits(epoch * EPOCH_NS, cells)

@@ -38,12 +38,16 @@ class Queries:
         return shown.payload if shown.cells.num_rows else b""
 
     def changed_tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Return tile and payload of every tile that changed since the last call and is not empty."""
+        """Return tile and payload of every tile that changed since the last call and is not
+        empty.
+        """
         changed = self._shared.state.map.take_dirty()
         return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
-        """Return all public cells; the lock is held for a few at a time, so that ingest continues."""
+        """Return all public cells; the lock is held for a few at a time, so that ingest
+        continues.
+        """
         tables = []
         shared = self._shared
         for start in range(0, shared.state.fusion.size, SLOTS):
@@ -56,10 +60,12 @@ class Queries:
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield tile and payload of every reply to a query, computed on demand; see `serve.query.answer`.
+        """Yield tile and payload of every reply to a query, computed on demand; see
+        `serve.query.answer`.
 
         Raises:
-            InputError: the route is too long, the time is in the future, or the archive cannot be read.
+            InputError: the route is too long, the time is in the future, or the archive cannot be
+                read.
         """
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})

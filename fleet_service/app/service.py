@@ -120,7 +120,9 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another service took over."""
+        """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another
+        service took over.
+        """
         return (
             1
             if self.failure is not None or self._followed or self.engine.settlement.unsettled
@@ -141,7 +143,8 @@ class Service:
         ):
             self._session = session
             self._log_line(
-                f"ready: {self._config.name}, {self.engine.state.fusion.size} cells from the archive{address}"
+                f"ready: {self._config.name}, {self.engine.state.fusion.size} cells from the "
+                f"archive{address}"
             )
             watchdog.notify_alive()
             try:
@@ -154,8 +157,8 @@ class Service:
                 raise
 
     def _lost(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over, by the lease, or by its tokens while the bucket does not
-        answer."""
+        """Return True if another service has taken over, by the lease, or by its tokens while the
+        bucket does not answer."""
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
             holding.mark_lost()
@@ -342,8 +345,10 @@ class Service:
             f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)
         )
         text = (
-            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
-            f"{self.engine.state.fusion.size} cells, {self.engine.alerts.count} alerts, queue {len(self.inbox)}"
+            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} "
+            "states, "
+            f"{self.engine.state.fusion.size} cells, {self.engine.alerts.count} alerts, queue "
+            f"{len(self.inbox)}"
             + (f"; {rest}" if rest else "")
             + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
             + (

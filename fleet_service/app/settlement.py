@@ -1,4 +1,6 @@
-"""Settlement of admitted batches: segments on disk (and in the bucket) first, then acknowledgements."""
+"""Settlement of admitted batches: segments on disk (and in the bucket) first, then
+acknowledgements.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from fleet_service.ingest.dedup import BatchId
 from fleet_service.replication.bucket import CopyError
 from fleet_service.replication.ownership import Ownership
 
-# Most rows that wait for the disk. With more, nothing is taken from the queue until a segment is written.
+# Most rows that wait for the disk. With more, nothing is taken from the queue until a segment is
+# written.
 WAITING_ROWS: Final = 1_000_000
 # the same for batches that are on disk and not yet in the copy: 100 MB
 WAITING_BATCHES: Final = 1_000_000
@@ -74,7 +77,8 @@ class Settlement:
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker run `work` right after a segment, when every row it took is on disk; return the result.
+        """Let the worker run `work` right after a segment, when every row it took is on disk;
+        return the result.
 
         None if stopped meanwhile. Another thread calls this.
 
@@ -84,7 +88,8 @@ class Settlement:
         return self._tasks.ask(work, stop)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements to send.
+        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements
+        to send.
 
         A full disk is counted, and the next call tries again; nothing of it is acknowledged.
         """
@@ -94,7 +99,8 @@ class Settlement:
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
-        """Begin a flush; messages may be processed while segments are written. `end_flush` returns the acks.
+        """Begin a flush; messages may be processed while segments are written. `end_flush` returns
+        the acks.
 
         If work waits for `run_between_segments`, this is `flush`.
         """

@@ -58,7 +58,9 @@ class StandingAlerts:
         ]
 
     def next_to_repeat(self, most: int) -> list[Alert]:
-        """Return at most `most` standing alerts, in turn, so that clients that were away receive them too."""
+        """Return at most `most` standing alerts, in turn, so that clients that were away receive
+        them too.
+        """
         with self._shared.guard:
             standing = self.all
         self._turn = self._turn % max(len(standing), 1)
@@ -67,7 +69,9 @@ class StandingAlerts:
         return out
 
     def end_erased(self, before: Iterable[Alert]) -> None:
-        """End those of the alerts `before` an erasure that do not stand any more; call with the guard held."""
+        """End those of the alerts `before` an erasure that do not stand any more; call with the
+        guard held.
+        """
         still = {(alert.cell, alert.sector) for alert in self.all}
         ended = [alert for alert in before if (alert.cell, alert.sector) not in still]
         self._erased += [replace(alert, raised=False, reason=ERASED) for alert in ended]

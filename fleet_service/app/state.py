@@ -1,4 +1,6 @@
-"""State of a service, loaded from the newest checkpoint and the log after it, or from the log alone."""
+"""State of a service, loaded from the newest checkpoint and the log after it, or from the log
+alone.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 
-# After fifty-six times the mean time between changes (fusion.constants.CHANGE_S) nothing of a belief is left.
+# After fifty-six times the mean time between changes (fusion.constants.CHANGE_S) nothing of a
+# belief is left.
 KEPT_NS: Final = 7 * DAY_NS
 LEAST_DROPPED: Final = 0.01  # of all cells: fewer are not worth copying the others
 VISITORS: Final = "visitors"  # a table of a checkpoint
@@ -56,7 +59,9 @@ class ServiceState(NamedTuple):
     visitors: Visitors | None
 
     def drop_old(self) -> int:
-        """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their number."""
+        """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their
+        number.
+        """
         newest = self.fusion.checkpoint or 0
         stale = self.fusion.untouched(newest - KEPT_NS)
         stale[sorted(self.alerts.slots)] = False
@@ -71,8 +76,8 @@ class ServiceState(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """Return the content of a checkpoint, which includes everything up to the segment `cut` and these weather
-        files."""
+        """Return the content of a checkpoint, which includes everything up to the segment `cut` and
+        these weather files."""
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(
             self.visitors
         )
@@ -104,7 +109,9 @@ class SharedState:
 
 
 def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:
-    """Return visitors as tables of a checkpoint: bits and part of the window in columns of one length."""
+    """Return visitors as tables of a checkpoint: bits and part of the window in columns of one
+    length.
+    """
     if visitors is None:
         return {}
     columns = visitors.columns()

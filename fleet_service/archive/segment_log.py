@@ -1,7 +1,8 @@
-"""The log: rows that wait for the disk. The order is the guarantee: rows, fsynced segment, then settled.
-
-A thread of its own writes segments, so that messages are processed meanwhile. Only batches returned by `end` are
+"""The log: rows that wait for the disk. The order is the guarantee: rows, fsynced segment, then
 settled.
+
+A thread of its own writes segments, so that messages are processed meanwhile. Only batches returned
+by `end` are settled.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ class SegmentLog(Generic[Batch]):
     Args:
         root: of the archive.
         shard: name of the service.
-        upload: makes segments durable in a second place; with one, a batch is settled when it is in both places.
+        upload: makes segments durable in a second place; with one, a batch is settled when it is in
+            both places.
         epoch: smallest epoch, from the lease.
     """
 
@@ -109,8 +111,8 @@ class SegmentLog(Generic[Batch]):
         self._next.batches += batches
 
     def begin(self) -> None:
-        """Start writing waiting rows and rows that failed before; do nothing while a write is not collected by
-        `end`."""
+        """Start writing waiting rows and rows that failed before; do nothing while a write is not
+        collected by `end`."""
         if self._written is None:
             self._load.take(self._next)
             self._next = _Load()
@@ -121,8 +123,8 @@ class SegmentLog(Generic[Batch]):
         """Wait for the current write; return the batches that it made durable, each once.
 
         Raises:
-            OSError: the disk is full or broken, or the copy is not reached; rows that are not durable wait for the next
-                write.
+            OSError: the disk is full or broken, or the copy is not reached; rows that are not
+                durable wait for the next write.
         """
         if self._written is None:
             return []

@@ -1,8 +1,8 @@
-"""`fleet-service`: run, query, watch, page, router, hand-over, compact, retention, forget, export, roads, analyze,
-rebuild, certs, evaluate, completion.
+"""`fleet-service`: run, query, watch, page, router, hand-over, compact, retention, forget, export,
+roads, analyze, rebuild, certs, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
-needs them, so that help is fast.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported
+when a command needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ COMMANDS: Final = (
     Command(
         "analyze",
         "fleet_service.cli.analyze",
-        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, "
+        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, "
+        "change-rates, "
         "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),

@@ -1,4 +1,6 @@
-"""`fleet-service analyze`: ask one of the questions about a part of an archive; print the answer or write a file."""
+"""`fleet-service analyze`: ask one of the questions about a part of an archive; print the answer
+or write a file.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
         report=_report,
     )
     _report(
-        f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations"
+        f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} "
+        "observations"
     )
     found = question.ask(engine, options)
     print(output.lines(found, question) if arguments.json else output.text(found, question))

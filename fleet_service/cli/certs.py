@@ -10,7 +10,8 @@ from schemas.errors import InputError
 from schemas.runtime.installing import install_command
 
 LONGEST_DAYS = 36525.0  # a century; beyond, dates end
-ASKED = 3  # names that may be revoked without a word: a list that is short by mistake must not end a fleet
+# names that may be revoked without a word: a list that is short by mistake must not end a fleet
+ASKED = 3
 SHOWN = 8  # names of a kind
 
 

@@ -1,4 +1,5 @@
-"""`fleet-service cits`: alerts as DENM at an AMQP 1.0 interchange, and foreign DENM as a witness, until a signal.
+"""`fleet-service cits`: alerts as DENM at an AMQP 1.0 interchange, and foreign DENM as a witness,
+until a signal.
 
 Messages are not signed: that is the gateway's task.
 """

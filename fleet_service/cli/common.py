@@ -181,7 +181,8 @@ def on_archive(
 
 
 def compact_first(root: Path) -> None:
-    """Compact waiting segments so that they count; if that is impossible, print how much is left out.
+    """Compact waiting segments so that they count; if that is impossible, print how much is left
+    out.
 
     Raises:
         InputError: the folder is no archive.

@@ -1,4 +1,6 @@
-"""`fleet-service compact`: sort the log into files by date and zone. The service may run meanwhile."""
+"""`fleet-service compact`: sort the log into files by date and zone. The service may run
+meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,10 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
         raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
     done = compact(arguments.archive, rows)
     parts = rollup.complete(arguments.archive)
-    summary = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
+    summary = (
+        f"{done.rows} rows of {done.segments} segments moved into {done.files} files, "
+        f"{parts} rolled up"
+    )
     values: dict[str, object] = {
         "rows": done.rows,
         "segments": done.segments,

@@ -1,7 +1,8 @@
-"""`fleet-service export`: write a part of the archive, or the map as of a moment, as a file for other programs.
+"""`fleet-service export`: write a part of the archive, or the map as of a moment, as a file for
+other programs.
 
-`export datex` queries the running services instead, and writes the slippery stretches for road authorities. `export
-iceberg` writes no file: it registers the compacted files in Iceberg tables.
+`export datex` queries the running services instead, and writes the slippery stretches for road
+authorities. `export iceberg` writes no file: it registers the compacted files in Iceberg tables.
 """
 
 from __future__ import annotations
@@ -136,7 +137,10 @@ def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
         arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri()
     )
     done = register(root, place)
-    line = f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in {place.catalog}"
+    line = (
+        f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in "
+        f"{place.catalog}"
+    )
     return ArchiveReport(line, dict(done._asdict()))
 
 

@@ -1,4 +1,6 @@
-"""`fleet-service forget`: forget a vehicle or a complete month; a running service does it itself."""
+"""`fleet-service forget`: forget a vehicle or a complete month; a running service does it
+itself.
+"""
 
 from __future__ import annotations
 

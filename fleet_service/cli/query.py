@@ -87,7 +87,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _say_what_is_covered(arguments: argparse.Namespace) -> None:
-    """Print the box of the whole map if a queried box is empty: latitude and longitude may be swapped."""
+    """Print the box of the whole map if a queried box is empty: latitude and longitude may be
+    swapped.
+    """
     from fleet_service.client import map_client
 
     whole = map_client.ask(map_client.settings(arguments.connect, arguments.config), {}).table

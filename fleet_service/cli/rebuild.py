@@ -1,4 +1,6 @@
-"""`fleet-service rebuild`: compute the map and the roll-ups of an archive again from raw observations."""
+"""`fleet-service rebuild`: compute the map and the roll-ups of an archive again from raw
+observations.
+"""
 
 from __future__ import annotations
 

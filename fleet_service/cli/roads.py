@@ -1,4 +1,6 @@
-"""`fleet-service roads`: assign each cell and sector to a link of a road network, for `analyze contract`."""
+"""`fleet-service roads`: assign each cell and sector to a link of a road network, for `analyze
+contract`.
+"""
 
 from __future__ import annotations
 

@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("archive", problem, "give a folder you may read and write") from error
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
-    gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
+    # what came from the archive stays: looking through it takes longer than an alert may
+    gc.freeze()
     stopped = threading.Event()
     threading.Thread(
         target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True
@@ -104,7 +105,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
 ) -> Ownership | None:
-    """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
+    """Open the archive once it is available; None if stopped before. A standby serves its
+    metrics while it waits.
+    """
     from fleet_service.app.metrics import standby_metrics
     from fleet_service.replication.ownership import acquire
     from fleet_service.shards.serving import standby_signs
@@ -139,8 +142,9 @@ def _force_exit_when_stuck(
 ) -> None:
     """End a service whose shutdown hangs, on a frozen router or a long compaction.
 
-    Whatever it is doing may end at any instant: senders keep what is not acknowledged. The exit code is that of a
-    normal end. The lease is released, because a standby would otherwise wait until it expires.
+    Whatever it is doing may end at any instant: senders keep what is not acknowledged. The exit
+    code is that of a normal end. The lease is released, because a standby would otherwise wait
+    until it expires.
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):

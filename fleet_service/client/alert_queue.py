@@ -33,7 +33,8 @@ class AlertQueue:
             )
             self._file.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._file.execute(
-                "CREATE TABLE IF NOT EXISTS waiting (number INTEGER PRIMARY KEY AUTOINCREMENT, text TEXT)"
+                "CREATE TABLE IF NOT EXISTS waiting (number INTEGER PRIMARY KEY AUTOINCREMENT, "
+                "text TEXT)"
             )
             self._file.execute("BEGIN EXCLUSIVE")
             self._file.execute("COMMIT")

@@ -1,11 +1,12 @@
 """Slippery stretches as a DATEX II publication (version 3) for a National Access Point. Pure.
 
-A stretch is a situation of category a of the safety-related traffic information (Regulation (EU) 886/2013, temporary
-slippery road). Its condition is `slippery`, never `ice`: grip is known, its cause is not. A situation keeps its id. The
-version of its record increases with every change. When the alert is over, the record is published with its end for
-another KEPT_S.
+A stretch is a situation of category a of the safety-related traffic information (Regulation (EU)
+886/2013, temporary slippery road). Its condition is `slippery`, never `ice`: grip is known, its
+cause is not. A situation keeps its id. The version of its record increases with every change. When
+the alert is over, the record is published with its end for another KEPT_S.
 
-Only the previous publication must be kept: the next one is made from it and from the standing alerts.
+Only the previous publication must be kept: the next one is made from it and from the standing
+alerts.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ def publication(
         standing: every stretch under alert.
         now: [ns UTC].
         before: the previous publication; None to start a new one.
-        is_heard: returns True if a service answers for a place (latitude, longitude); elsewhere nothing ends.
+        is_heard: returns True if a service answers for a place (latitude, longitude); elsewhere
+            nothing ends.
 
     Raises:
         InputError: `before` is not a publication.
@@ -206,7 +208,9 @@ def _location(alert: StretchAlert) -> ET.Element:
 
 
 def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
-    """Return a record as the next version of an old one; the old one if nothing but times has changed."""
+    """Return a record as the next version of an old one; the old one if nothing but times has
+    changed.
+    """
     for tag in (
         "sit:situationRecordCreationTime",
         "sit:validity/com:validityTimeSpecification/com:overallStartTime",
@@ -243,7 +247,9 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the situation that has a cell of a stretch, if a restarted reader gave it another name."""
+    """Return the situation that has a cell of a stretch, if a restarted reader gave it another
+    name.
+    """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points
     }

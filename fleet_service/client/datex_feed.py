@@ -144,7 +144,8 @@ def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | 
     """Write the publication once, or with `stop` keep it current until that is set.
 
     Raises:
-        InputError: no router, or no service answers at the start: an absent service does not mean a dry road.
+        InputError: no router, or no service answers at the start: an absent service does not mean a
+            dry road.
     """
     with open_connected(connection) as session:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))

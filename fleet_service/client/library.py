@@ -19,7 +19,8 @@ def ask_map(
     min_vehicles: int = 1,
     at: datetime | None = None,
 ) -> pa.Table:
-    """Return the cells of the map, one row per cell and heading sector, with the columns of schemas.tables.MAP_CELL.
+    """Return the cells of the map, one row per cell and heading sector, with the columns of
+    schemas.tables.MAP_CELL.
 
     Args:
         endpoint: of a router, e.g. tcp/127.0.0.1:7447; or settings with certificates.

@@ -75,7 +75,9 @@ class Answer:
 
 
 def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
-    """Return the connection settings: the configuration's, with `connect` instead of its endpoints."""
+    """Return the connection settings: the configuration's, with `connect` instead of its
+    endpoints.
+    """
     found = load(config, ServiceConfig).zenoh
     return found if connect is None else found.model_copy(update={"connect": [connect]})
 
@@ -141,7 +143,8 @@ def replies(
 
 
 def served_table(answer: Answer) -> pa.Table:
-    """Return the cells of an Arrow answer; missing regions are logged and named in the schema's metadata.
+    """Return the cells of an Arrow answer; missing regions are logged and named in the schema's
+    metadata.
 
     Raises:
         InputError: no service answered, or the answer is empty and part of the area has no service.
@@ -163,11 +166,13 @@ def served_table(answer: Answer) -> pa.Table:
 
 
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
-    """Return True if any service answers for the map. This distinguishes an empty answer from no answer.
+    """Return True if any service answers for the map. This distinguishes an empty answer from no
+    answer.
 
-    A service has a token, which not every reader may see, and it answers for the tiles of its regions. A router matches
-    only services that answer for all of a key expression. Without a place, a service of the whole world is found by any
-    tile, and a service of a region by its answer.
+    A service has a token, which not every reader may see, and it answers for the tiles of its
+    regions. A router matches only services that answer for all of a key expression. Without a
+    place, a service of the whole world is found by any tile, and a service of a region by its
+    answer.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
@@ -181,7 +186,9 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
-    """Return True if a service answers for the tile of a place [deg]; a negative result takes SERVED_S."""
+    """Return True if a service answers for the tile of a place [deg]; a negative result takes
+    SERVED_S.
+    """
     tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
     querier: Any = session.declare_querier(keys.map_key(int(tile)))
     deadline = time.monotonic() + SERVED_S

@@ -1,8 +1,10 @@
-"""Grip along road links as costs of a route planner: factors for Valhalla, a model for GraphHopper. Pure.
+"""Grip along road links as costs of a route planner: factors for Valhalla, a model for GraphHopper.
+Pure.
 
-The factor comes from the lower bound of grip. Only measured and borrowed cells count: a cell without excitation has a
-low bound because nothing is known there, and unknown is not slippery. A factor is a cost, not a time: Valhalla scales
-the travel time that it reports by it, so the time of a chosen route must be asked for again without factors.
+The factor comes from the lower bound of grip. Only measured and borrowed cells count: a cell
+without excitation has a low bound because nothing is known there, and unknown is not slippery. A
+factor is a cost, not a time: Valhalla scales the travel time that it reports by it, so the time of
+a chosen route must be asked for again without factors.
 """
 
 from __future__ import annotations
@@ -18,11 +20,12 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
 STEP_M: Final = 5.0  # between two looks along a link
-# Braking distance grows with 1/mu. Squared, a way round of a fifth is worth it from mu .45 of .5 on, and ten times the
-# length at mu .16.
+# Braking distance grows with 1/mu. Squared, a way round of a fifth is worth it from mu .45 of .5
+# on, and ten times the length at mu .16.
 GOOD_GRIP: Final = 0.5  # lower bound of a wet road; above it costs nothing
 POWER: Final = 2.0
-MOST: Final = 20.0  # Valhalla refuses too great a spread, and finds no way round ice at the destination otherwise
+# Valhalla refuses too great a spread, and finds no way round ice at the destination otherwise
+MOST: Final = 20.0
 STEPS: Final = (
     1.0,
     1.5,
@@ -151,7 +154,9 @@ def _known(table: pa.Table) -> tuple[IntArray, FloatArray]:
 
 
 def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return points every STEP_M along a road, with the yaw there; none of a road without length."""
+    """Return points every STEP_M along a road, with the yaw there; none of a road without
+    length.
+    """
     east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(road.latitude))))
     dx = np.diff(road.longitude) * east
     dy = np.diff(road.latitude) * METRES_PER_DEGREE
@@ -167,7 +172,9 @@ def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> list[CostLine]:
-    """Return the runs of one factor; a run that is too short joins the dearer neighbour's class by its own end."""
+    """Return the runs of one factor; a run that is too short joins the dearer neighbour's class
+    by its own end.
+    """
     ends = np.flatnonzero(np.r_[True, np.diff(cost) != 0.0, True])
     out = []
     for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):

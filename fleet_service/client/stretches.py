@@ -1,8 +1,8 @@
 """Alerts of stretches of road, made from alerts of cells and headings. Pure.
 
-Cells under alert within LINK_CELLS of each other are one stretch, both driving directions together. A stretch keeps its
-id from the first cell to the last. When two grow together the older id stays; when one splits, the larger part keeps
-it.
+Cells under alert within LINK_CELLS of each other are one stretch, both driving directions together.
+A stretch keeps its id from the first cell to the last. When two grow together the older id stays;
+when one splits, the larger part keeps it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class StretchAlert:
         mu, mu_lower, mu_upper, p_slippery: of the cell with the lowest mu.
         vehicles: largest number of any cell.
         reason: of the last cell that changed it.
-        points: latitude and longitude [deg] of the cells from one end to the other; branches are left out.
+        points: latitude and longitude [deg] of the cells from one end to the other; branches are
+            left out.
     """
 
     id: str
@@ -73,9 +74,12 @@ class StretchAlert:
         """Return the alert as one line of text."""
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
         return (
-            f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m {self.direction}, "
-            f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, {self.mu_upper:.2f}], "
-            f"{self.vehicles} vehicles; since {iso(self.since)}, {iso(self.time)}; {self.reason}; id {self.id}"
+            f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m "
+            f"{self.direction}, "
+            f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, "
+            f"{self.mu_upper:.2f}], "
+            f"{self.vehicles} vehicles; since {iso(self.since)}, {iso(self.time)}; {self.reason}; "
+            f"id {self.id}"
         )
 
 
@@ -194,7 +198,9 @@ class Stretches:
 
 
 def link_cells(cell: IntArray) -> IntArray:
-    """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong together."""
+    """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong
+    together.
+    """
     if not len(cell):
         return np.zeros(0, np.int64)
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
@@ -214,7 +220,9 @@ def _new(first: Alert) -> str:
 
 
 def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
-    """Return the centres [deg] of distinct cells along the longest path from neighbour to neighbour."""
+    """Return the centres [deg] of distinct cells along the longest path from neighbour to
+    neighbour.
+    """
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
     apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
@@ -234,8 +242,8 @@ def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
 def _shape(
     cell: IntArray,
 ) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
-    """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of the largest
-    spread."""
+    """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of
+    the largest spread."""
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
     x = (west + east) / 2 * scale

@@ -1,4 +1,6 @@
-"""Watching of the map: a line per changed tile, per stretch alert, and per region that loses or gets a service."""
+"""Watching of the map: a line per changed tile, per stretch alert, and per region that loses or
+gets a service.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ def watch(
     say: Callable[[str], None],
     hear: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Print a line per change until `stop` is set; wait for a router. `hear` is called with the stretches too.
+    """Print a line per change until `stop` is set; wait for a router. `hear` is called with the
+    stretches too.
 
     Raises:
         InputError: the box is not valid.

@@ -1,8 +1,9 @@
 """Webhook for alerts of stretches, in the format of Alertmanager's webhook receivers (version 4).
 
-Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts. Delivery is at least once
-and in order. A message leaves the queue only after a 2xx answer within TIMEOUT_S. Redirects are not followed, because
-a POST would become an empty GET. Whatever is not delivered is counted and reported.
+Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts.
+Delivery is at least once and in order. A message leaves the queue only after a 2xx answer within
+TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Whatever is not
+delivered is counted and reported.
 """
 
 from __future__ import annotations
@@ -195,7 +196,9 @@ class Webhook:
             runner.run(client.aclose())
 
     def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
-        """Send the oldest message; return None if there is none, "" if it is settled, else the reason of failure."""
+        """Send the oldest message; return None if there is none, "" if it is settled, else the
+        reason of failure.
+        """
         try:
             first = self._queue.first()
             if first is None:

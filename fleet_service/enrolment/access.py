@@ -1,4 +1,5 @@
-"""Configuration of a router: mutual TLS, and an access list that denies everything not listed here. Pure.
+"""Configuration of a router: mutual TLS, and an access list that denies everything not listed here.
+Pure.
 
 | role    | may publish                              | may read and query                  |
 |---------|------------------------------------------|-------------------------------------|
@@ -9,9 +10,10 @@
 | service | everything under gripmap/ but PRIVATE    | the same                            |
 | router  | messages that others may publish, between routers | the same                   |
 
-PRIVATE is ahead/NAME and vss/NAME: the map ahead of a vehicle, and the friction at it. Zenoh decides by the common name
-of the certificate and reads the list once, at its start. Denials are silent for the sender. A put on a wildcard counts
-as a put on every matching key, so it must lie completely within a rule.
+PRIVATE is ahead/NAME and vss/NAME: the map ahead of a vehicle, and the friction at it. Zenoh
+decides by the common name of the certificate and reads the list once, at its start. Denials are
+silent for the sender. A put on a wildcard counts as a put on every matching key, so it must lie
+completely within a rule.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ MESSAGES: Final = (
     "declare_liveliness_subscriber",
 )
 MAX_SESSIONS: Final = 5000  # one per vehicle; Zenoh's own limit is 1000
-# A whole tile as GeoJSON is about 50 MB; Zenoh would put together a gigabyte from fragments before it looks at it.
+# A whole tile as GeoJSON is about 50 MB; Zenoh would put together a gigabyte from fragments before
+# it looks at it.
 MAX_MESSAGE: Final = 64 * 1024 * 1024
 LEASE_MS: Final = 3000  # after which a silent peer counts as gone
 
@@ -48,7 +51,9 @@ Section = dict[str, Any]
 
 
 def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Section:
-    """Return the configuration of router `name`; `certificates` is the folder with its certificate and key."""
+    """Return the configuration of router `name`; `certificates` is the folder with its
+    certificate and key.
+    """
     router = fleet.routers[name]
     before = list(fleet.routers)[: list(fleet.routers).index(name)]
     certificate, key = (str(certificates / f"{name}.{ending}") for ending in ("pem", "key"))
@@ -84,11 +89,13 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
 
 
 def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
-    """Return the caps on messages of one session at router `name`, so that a flooding vehicle slows down nobody else.
+    """Return the caps on messages of one session at router `name`, so that a flooding vehicle slows
+    down nobody else.
 
-    Zenoh counts per session and rule, and cannot tell a vehicle from a router. A session of another router carries many
-    vehicles and must not be capped. Routers reach each other over TLS only, so QUIC is capped everywhere, and TLS where
-    no other router arrives: on the interfaces named for vehicles, and where there is one router.
+    Zenoh counts per session and rule, and cannot tell a vehicle from a router. A session of another
+    router carries many vehicles and must not be capped. Routers reach each other over TLS only, so
+    QUIC is capped everywhere, and TLS where no other router arrives: on the interfaces named for
+    vehicles, and where there is one router.
     """
     router = fleet.routers[name]
     caps = [_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []
@@ -120,7 +127,8 @@ def access_control(fleet: Enrolment) -> Section:
         | {"permission": "deny"},
         _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _rule("told", ("egress",), ("put", "reply"), PUBLIC),
-        # Declared publishers and queriers send nothing, silently, until they are told that somebody listens.
+        # Declared publishers and queriers send nothing, silently, until they are told that somebody
+        # listens.
         _rule(
             "listened",
             ("egress",),
@@ -129,7 +137,8 @@ def access_control(fleet: Enrolment) -> Section:
         ),
         _rule("weather", ("ingress",), ("put",), [WEATHER]),
         _rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
-        # Who serves which region is no secret: else a region without a service looks like one without grip reports.
+        # Who serves which region is no secret: else a region without a service looks like one
+        # without grip reports.
         _rule("who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]),
         _rule("there", ("egress",), ("liveliness_token",), [SERVED]),
         _rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),

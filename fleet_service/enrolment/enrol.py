@@ -1,4 +1,5 @@
-"""Enrolment: creates missing certificates and router configurations from the enrolment file, and revokes removed names.
+"""Enrolment: creates missing certificates and router configurations from the enrolment file, and
+revokes removed names.
 
 A repeated run changes only what changed in the file or is about to expire.
 """
@@ -148,7 +149,9 @@ class Registry:
         )
 
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
-        """Refuse a revoked name: the access list knows names, so a lost certificate would be valid again."""
+        """Refuse a revoked name: the access list knows names, so a lost certificate would be
+        valid again.
+        """
         lost = ca.read_certificate(self._revoked / f"{name}.pem")
         if (
             lost is None
@@ -164,7 +167,9 @@ class Registry:
         )
 
     def leaving(self, fleet: Enrolment) -> list[str]:
-        """Return names that have a certificate of this authority and are not on the list: `enrol` would revoke them."""
+        """Return names that have a certificate of this authority and are not on the list:
+        `enrol` would revoke them.
+        """
         found = (
             ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
         )
@@ -176,7 +181,9 @@ class Registry:
         ]
 
     def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
-        """Return True if a file is a certificate of this authority for a name that is not on the list."""
+        """Return True if a file is a certificate of this authority for a name that is not on the
+        list.
+        """
         if path.stem in {*fleet.names, "trust"}:
             return False
         try:

@@ -1,4 +1,6 @@
-"""Enrolment file: every name that may open a session, by role; the only source of certificates and access list."""
+"""Enrolment file: every name that may open a session, by role; the only source of certificates
+and access list.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,8 @@ class Router(Settings):
     )
     vehicle_interfaces: list[str] = Field(
         default=[],
-        description="network interfaces on which no other router arrives; sessions over TLS are capped there as well",
+        description="network interfaces on which no other router arrives; sessions over TLS are "
+        "capped there as well",
     )
 
     @property
@@ -59,7 +62,9 @@ class Router(Settings):
 
     @property
     def router_endpoint(self) -> str:
-        """Return its endpoint for other routers: TLS, so that caps on QUIC apply to vehicles only."""
+        """Return its endpoint for other routers: TLS, so that caps on QUIC apply to vehicles
+        only.
+        """
         return _endpoint("tls", self.hosts[0], self.port)
 
     @property
@@ -69,7 +74,9 @@ class Router(Settings):
 
     @property
     def protocols(self) -> list[str]:
-        """Return its transports: QUIC survives a change of the car's address and has a stream per priority."""
+        """Return its transports: QUIC survives a change of the car's address and has a stream
+        per priority.
+        """
         return ["quic", "tls"] if self.quic else ["tls"]
 
 
@@ -95,7 +102,8 @@ class Enrolment(Settings):
     )
     owners: dict[VehicleName, list[VehicleName]] = Field(
         default={},
-        description="who may see what lies ahead of and under which vehicles, and read as a reader does",
+        description="who may see what lies ahead of and under which vehicles, and read as a reader "
+        "does",
     )
 
     @property

@@ -1,4 +1,6 @@
-"""Fusion: one belief per cell and sector on the friction grid. Pure: no clocks, no files, no network."""
+"""Fusion: one belief per cell and sector on the friction grid. Pure: no clocks, no files, no
+network.
+"""
 
 from __future__ import annotations
 

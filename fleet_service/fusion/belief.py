@@ -1,4 +1,5 @@
-"""One cell's belief: what time does to it, and what a vote does. Compiled; every function works on one row of 32 bins.
+"""One cell's belief: what time does to it, and what a vote does. Compiled; every function works on
+one row of 32 bins.
 
 Legend
     p    belief about what the fleet takes the road for: probability of each bin (32,)
@@ -35,7 +36,8 @@ _BINS: Final = mugrid.BINS
 _DIFFUSION: Final = (
     0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
 )  # bins² per second, half the variance
-_STEP: Final = 0.25  # largest share that leaves a bin to each side in one diffusion step: stable and without ripple
+# largest share that leaves a bin to each side in one diffusion step: stable and without ripple
+_STEP: Final = 0.25
 _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)  # of steps
 _CENTRES: Final = mugrid.CENTRES
@@ -54,7 +56,9 @@ PADDED: Final = _BINS + 2 * REACH
 
 
 def bias_kernel() -> FloatArray:
-    """Return B of one vehicle's own error: a normal of hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut at REACH."""
+    """Return B of one vehicle's own error: a normal of hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE),
+    cut at REACH.
+    """
     spread = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / spread))
     kernel[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS))) > REACH] = 0.0
@@ -77,7 +81,9 @@ _TAPS: Final = _taps()
 
 @compiled
 def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Quantiles of beliefs (k, 32), a row for each level; bit for bit `mugrid.quantiles`, in a tenth of the time."""
+    """Quantiles of beliefs (k, 32), a row for each level; bit for bit `mugrid.quantiles`, in a
+    tenth of the time.
+    """
     out = np.empty((len(levels), len(belief)))
     for k in range(len(belief)):
         whole = 0.0
@@ -155,7 +161,9 @@ def unpack(belief: PackedArray, row: int, p: Bins) -> None:
 
 @refcount_free_inlined
 def pack(p: Bins, belief: PackedArray, row: int) -> None:
-    """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a uniform one uniform."""
+    """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a
+    uniform one uniform.
+    """
     scale = np.float32(FULL) / np.float32(largest(p))
     for i in range(_BINS):
         belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
@@ -171,10 +179,11 @@ def mix(p: Bins, change: float, prior: Float32Array) -> None:
 
 @refcount_free_inlined
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
-    """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change over `change_s`.
+    """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change
+    over `change_s`.
 
-    In place. Both keep the uniform belief and keep a rising one rising, so that time alone never lowers an upper end
-    below the prior's. `padded` (34 at least) is for keeps.
+    In place. Both keep the uniform belief and keep a rising one rising, so that time alone never
+    lowers an upper end below the prior's. `padded` (34 at least) is for keeps.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s
@@ -192,7 +201,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
-    """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
+    """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power`
+    is new. In place.
+    """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
         mix(p, lacking, prior)
@@ -200,7 +211,9 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """VALUE where the likelihood falls towards the upper end by more than senders differ; else BOUND."""
+    """VALUE where the likelihood falls towards the upper end by more than senders differ; else
+    BOUND.
+    """
     least = np.uint8(255)
     for i in range(_BINS):
         least = min(least, evidence[i])
@@ -209,10 +222,11 @@ def kind_of(evidence: ByteArray) -> int:
 
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
-    """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
+    """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is
+    levelled.
 
-    A bound has no error: whatever smoothed its step would let many of them climb above what anybody used. `padded`
-    (PADDED) must hold zeros in its first and last REACH places.
+    A bound has no error: whatever smoothed its step would let many of them climb above what anybody
+    used. `padded` (PADDED) must hold zeros in its first and last REACH places.
     """
     if kind == VALUE:
         for j in range(_BINS):
@@ -266,7 +280,9 @@ def mean_of(likelihood: Bins) -> float:
 
 @refcount_free_inlined
 def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
-    """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
+    """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the
+    uniform prior.
+    """
     second = 0.0
     slippery = 0.0
     for i in range(_BINS):

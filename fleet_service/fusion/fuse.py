@@ -1,7 +1,8 @@
 """The fusion of one service: observations in, beliefs out. Pure: time comes with the observations.
 
-T is the latest time seen, in whole epochs; the checkpoint lies at T - L. Trust moves with the checkpoint and acts on
-observations of the epoch that begins there, so that a vote's weight depends on its own time and not on when it came.
+T is the latest time seen, in whole epochs; the checkpoint lies at T - L. Trust moves with the
+checkpoint and acts on observations of the epoch that begins there, so that a vote's weight depends
+on its own time and not on when it came.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
 _ANY: Final = 1 << 62
-# What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape: (kernels, 2, 32).
+# What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape:
+# (kernels, 2, 32).
 SLIPPERY_WEIGHTS: Final = tuple(
     np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
 )
@@ -41,7 +43,8 @@ class Updated(NamedTuple):
 
     Attributes:
         late: whether each came after the checkpoint, or was one too many and so not fused.
-        late_by: how much later than its own a late one was fused [ns]; 0 for one in time or not fused.
+        late_by: how much later than its own a late one was fused [ns]; 0 for one in time or not
+            fused.
         weight: that was used; 0 where nothing was fused.
         slots: that changed, (k,).
     """
@@ -135,7 +138,8 @@ class Fusion:
     def update(self, o: Observations, before: Before | None = None) -> Updated:
         """Take in observations in any order.
 
-        A late one is taken at the checkpoint, as what it tells of the road at that time (`late.aged_evidence`).
+        A late one is taken at the checkpoint, as what it tells of the road at that time
+        (`late.aged_evidence`).
 
         Args:
             o: the observations.
@@ -184,13 +188,13 @@ class Fusion:
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Drop slots (size,) that are `untouched`, as if nobody had ever been there; returns where each slot went, -1
-        for those that are gone."""
+        """Drop slots (size,) that are `untouched`, as if nobody had ever been there; returns where
+        each slot went, -1 for those that are gone."""
         return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
-        """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
-        came."""
+        """Take in weather; each report must act from `next_epoch` on at the earliest, or the map
+        depends on when it came."""
         columns = (
             np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])
             for f in fields(Reports)
@@ -203,8 +207,8 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns], and with what
-        slippery neighbours tell of it."""
+        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns],
+        and with what slippery neighbours tell of it."""
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
@@ -212,13 +216,17 @@ class Fusion:
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
+        """P(slippery) of each slot's road at its last observation by its own reports alone,
+        (k,).
+        """
         return _slippery(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
         )
 
     def alarming(self, slots: IntArray) -> FloatArray:
-        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
+        """As `believed`, with the doubt about gentle values that an alarm has to bear, see
+        `shared`.
+        """
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
     def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
@@ -237,10 +245,11 @@ class Fusion:
         return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
-        """Return when corroborating sources of slots (k,) reported, the newest first, (k, SOURCES) [ns].
+        """Return when corroborating sources of slots (k,) reported, the newest first, (k, SOURCES)
+        [ns].
 
-        A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At most SOURCES are
-        remembered; 0 stands for none.
+        A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At
+        most SOURCES are remembered; 0 stands for none.
         """
         _, when = self._sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -253,7 +262,9 @@ class Fusion:
     def _sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does not count."""
+        """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does
+        not count.
+        """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
@@ -328,7 +339,9 @@ def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: Boo
 
 
 def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Votes of some observations: row, key and share; those of other cells and of a second sector too; by time."""
+    """Votes of some observations: row, key and share; those of other cells and of a second
+    sector too; by time.
+    """
     own = 1.0 - o.other_share[rows].sum(axis=1)
     key = o.cell[rows] * grid.SECTORS
     at = [rows]

@@ -1,7 +1,9 @@
-"""All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the fusion was. Pure.
+"""All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the
+fusion was. Pure.
 
-A column is a one-dimensional array, records are a column of bytes. Columns of one length belong together: `Image` is a
-table of tables, by name. LAYOUT says what the bytes mean, by every field's name, place and order of bytes.
+A column is a one-dimensional array, records are a column of bytes. Columns of one length belong
+together: `Image` is a table of tables, by name. LAYOUT says what the bytes mean, by every field's
+name, place and order of bytes.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Everything that a fusion holds. Windows, entries and pairs keep their places, since they point at each other."""
+    """Everything that a fusion holds. Windows, entries and pairs keep their places, since they
+    point at each other.
+    """
     store = fusion.store
     state = fusion.store.state
     live = state.live

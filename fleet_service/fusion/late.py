@@ -1,14 +1,16 @@
-"""What comes later than the checkpoint: fused at the checkpoint, as what it tells of the road at that time. Pure.
+"""What comes later than the checkpoint: fused at the checkpoint, as what it tells of the road at
+that time. Pure.
 
-A road that changes is a Markov chain which leaves the uniform belief uniform and in which both directions of time are
-alike (a diffusion that reflects at the ends, and a change to anything). So the likelihood of the road at the
-checkpoint, given what was measured at time t before it, is
+A road that changes is a Markov chain which leaves the uniform belief uniform and in which both
+directions of time are alike (a diffusion that reflects at the ends, and a change to anything). So
+the likelihood of the road at the checkpoint, given what was measured at time t before it, is
 
     L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = what forgetting makes of L over C - t
 
-and a late visit to a cell where nobody was meanwhile is fused as it would have been in time. Where others were, it
-counts beside them as an old word about the road now. Late visits stand in the window like all others, the newest
-first, so that of one vehicle's own the newest counts, and their order of arrival between two checkpoints is nothing.
+and a late visit to a cell where nobody was meanwhile is fused as it would have been in time. Where
+others were, it counts beside them as an old word about the road now. Late visits stand in the
+window like all others, the newest first, so that of one vehicle's own the newest counts, and their
+order of arrival between two checkpoints is nothing.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
-    """When late visits of `time` (n,) [ns] stand in the window: within a second, the newest first; whole µs."""
+    """When late visits of `time` (n,) [ns] stand in the window: within a second, the newest
+    first; whole µs.
+    """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
 
@@ -56,7 +60,9 @@ def delayed(o: Observations, late_by: IntArray, weather: Weather) -> Observation
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
-    """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same roads at `end` [ns]."""
+    """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same
+    roads at `end` [ns].
+    """
     out = np.empty_like(evidence)
     likelihood = np.empty(mugrid.BINS, np.float32)
     padded = np.empty(PADDED, np.float32)

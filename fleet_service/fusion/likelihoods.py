@@ -1,4 +1,5 @@
-"""What one visit says about μ: from a likelihood, a posterior with interval, or the grip used. Vectorised, pure.
+"""What one visit says about μ: from a likelihood, a posterior with interval, or the grip used.
+Vectorised, pure.
 
 Legend
     ℓ    log-likelihood on the friction grid, maximum 0        (n, 32), nats
@@ -31,15 +32,17 @@ _USED_STEP: Final = 0.005
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
-    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values as reported.
+    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values
+    as reported.
 
     Args:
-        columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
+        columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,),
+            NaN where absent.
         with_likelihood: (n,) whether the sender gave a likelihood.
 
-    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`.
-    A posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least
-    mu_utilised" remains. A visit with none of them is flat.
+    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`. A
+    posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`,
+    only "at least mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
@@ -58,10 +61,11 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
 
 
 def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
-    """Likelihoods (n, 32) that do not claim less than the grip used (n,) supports: of both what says more, bin by bin.
+    """Likelihoods (n, 32) that do not claim less than the grip used (n,) supports: of both what
+    says more, bin by bin.
 
-    An estimator whose model is contradicted says nothing about the road, yet its accelerometers felt what was used. The
-    two are of one visit, so that they are not multiplied.
+    An estimator whose model is contradicted says nothing about the road, yet its accelerometers
+    felt what was used. The two are of one visit, so that they are not multiplied.
     """
     out = steps.copy()
     _support(out, np.asarray(used, np.float64), _bounds())
@@ -92,8 +96,9 @@ def _support(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
 
-    A bound is made flat from the bin on that holds `used` less half its own error: a hundred of them then leave a lower
-    end of .95·used + .04 at most. A value stays as it is, and so does everything where `used` is NaN.
+    A bound is made flat from the bin on that holds `used` less half its own error: a hundred of
+    them then leave a lower end of .95·used + .04 at most. A value stays as it is, and so does
+    everything where `used` is NaN.
     """
     out = steps.copy()
     _level(out, np.asarray(used, np.float64))
@@ -112,14 +117,18 @@ def _level(steps: ByteArray, used: FloatArray) -> None:
 
 
 def at_least(used: FloatArray) -> FloatArray:
-    """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN. (n, 32)."""
+    """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN.
+    (n, 32).
+    """
     known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
     std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
     return log_distribution((mugrid.CENTRES - known_use) / std)
 
 
 def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """ℓ of a median with 5 % and 95 % bounds: a normal with one standard deviation to each side. (n, 32)."""
+    """ℓ of a median with 5 % and 95 % bounds: a normal with one standard deviation to each side.
+    (n, 32).
+    """
     below = _std(mu - lower)[:, None]
     above = _std(upper - mu)[:, None]
     distance = mugrid.CENTRES - np.nan_to_num(mu)[:, None]

@@ -1,20 +1,24 @@
-"""A belief as it is read: what time did to it, what slippery neighbours tell, and what all values share. Compiled.
+"""A belief as it is read: what time did to it, what slippery neighbours tell, and what all values
+share. Compiled.
 
-A surface rarely ends with a cell: snow and ice lie in stretches. So a cell near which others were found slippery is
-more probably slippery than one of which nobody knows anything. Each side of a cell, before, behind, and the other
-direction of the road, sends it one message, of the neighbour there that tells most:
+A surface rarely ends with a cell: snow and ice lie in stretches. So a cell near which others were
+found slippery is more probably slippery than one of which nobody knows anything. Each side of a
+cell, before, behind, and the other direction of the road, sends it one message, of the neighbour
+there that tells most:
 
     m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
 
-and the cell is read as K·(b·m·m·m) over its sum. Messages come from what a neighbour's own visitors told, never from
-what it was told, so that nothing goes round; and they are made when the map is read, so that no cell's own belief
-depends on another's. What all values share is shared with the neighbours' too: K comes last, once. Only slippery
-neighbours tell: a cell that nobody tested is not dry because others are (a message of grip would say so), and cells
-that know nothing send nothing (s < s₀). The least of m is 1 - w, .1 beside ice: a cell whose own visitors found grip
-keeps it. A neighbour with grip lets nothing past it: there the stretch has ended. Where nobody was but perhaps (see
-`space`), nothing is told.
+and the cell is read as K·(b·m·m·m) over its sum. Messages come from what a neighbour's own visitors
+told, never from what it was told, so that nothing goes round; and they are made when the map is
+read, so that no cell's own belief depends on another's. What all values share is shared with the
+neighbours' too: K comes last, once. Only slippery neighbours tell: a cell that nobody tested is not
+dry because others are (a message of grip would say so), and cells that know nothing send nothing (s
+< s₀). The least of m is 1 - w, .1 beside ice: a cell whose own visitors found grip keeps it. A
+neighbour with grip lets nothing past it: there the stretch has ended. Where nobody was but perhaps
+(see `space`), nothing is told.
 
-Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one step.
+Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one
+step.
 
 Legend
     b      what the fleet takes the cell for, by its own reports                          (32,)
@@ -45,7 +49,8 @@ from schemas.thresholds import NS
 
 _BINS: Final = mugrid.BINS
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
-# A belief at rest that is slippery with less tells nothing, however it is read: time takes it to the prior.
+# A belief at rest that is slippery with less tells nothing, however it is read: time takes it to
+# the prior.
 _ASKED: Final = 0.2  # the prior's .3 and what K adds to it
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
 _X: Final = 0x5555555555555555 & _WHOLE  # those of its column
@@ -78,7 +83,9 @@ def beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Belief of each slot about its road at a time of its own [ns], (k, 32); `table` finds slots by key."""
+    """Belief of each slot about its road at a time of its own [ns], (k, 32); `table` finds slots
+    by key.
+    """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
     p = np.empty(_BINS)
@@ -159,8 +166,8 @@ def _kept(live: Rows, row: int) -> float:
 
 @refcount_free
 def _aged(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """What the fleet takes a slot's road for, with what time did to it until `now` [ns], into the scratch; returns the
-    row of its region's prior."""
+    """What the fleet takes a slot's road for, with what time did to it until `now` [ns], into the
+    scratch; returns the row of its region's prior."""
     cells = live.cells
     p = scratch[P]
     unpack(live.belief, slot, p)

@@ -1,4 +1,6 @@
-"""The standard normal distribution, for arrays of any shape. Compiled: a library for it takes 15 MB of a service."""
+"""The standard normal distribution, for arrays of any shape. Compiled: a library for it takes 15
+MB of a service.
+"""
 
 from __future__ import annotations
 

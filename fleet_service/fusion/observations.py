@@ -1,4 +1,6 @@
-"""Observations as the fusion takes them, and how they are made of the columns of messages or of the archive. Pure."""
+"""Observations as the fusion takes them, and how they are made of the columns of messages or of
+the archive. Pure.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 SmallArray = NDArray[np.int8]
 # more than a batch has rows: seq and row become one number that keeps their order
 ROWS_PER_SEQ: Final = 64
-UNTOLD_SHARE: Final = 0.5  # of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
+# of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
+UNTOLD_SHARE: Final = 0.5
 USED_MOST: Final = 2.0  # of the grip, as in the contract
 _US: Final = 1000  # ns: the archive keeps whole microseconds
 
@@ -30,14 +33,15 @@ class Observations:
     Attributes:
         time: end of the visit [ns].
         cell, sector, second: where; `second` is a sector whose edge is near, or -1.
-        vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the vehicle, `sequence` counts
-            rows in the stream of (vehicle, boot, region).
+        vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the
+            vehicle, `sequence` counts rows in the stream of (vehicle, boot, region).
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
-        reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN to read them in
-            `evidence`.
+        reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN
+            to read them in `evidence`.
         used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not tell.
         manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
-        other: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
+        other: (n, k) other cells in which the vehicle may have been instead, -1 where there is
+            none.
         other_share: (n, k) probability that it was there; what is left belongs to `cell`.
     """
 
@@ -65,7 +69,8 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     """Columns (n,) of admitted rows as the fusion takes them.
 
     Args:
-        columns: those of the archive, times in ns; `with_likelihood` (n,) is true for rows with a `log_likelihood`.
+        columns: those of the archive, times in ns; `with_likelihood` (n,) is true for rows with a
+            `log_likelihood`.
         vehicle: (n,) number of each vehicle.
 
     Times are those that the archive keeps, in whole microseconds.

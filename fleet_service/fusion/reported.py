@@ -1,7 +1,8 @@
-"""Values as they were reported: mean, standard deviation and P(slippery) of a likelihood. Compiled, pure.
+"""Values as they were reported: mean, standard deviation and P(slippery) of a likelihood. Compiled,
+pure.
 
-Whether vehicles agree, whether one reports something new, and whom an alert may call a source is judged by what was
-reported; what is made of it for the belief (`belief.convolve_bias`) is wider.
+Whether vehicles agree, whether one reports something new, and whom an alert may call a source is
+judged by what was reported; what is made of it for the belief (`belief.convolve_bias`) is wider.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
 
 class Evidence(NamedTuple):
-    """Likelihoods as they are used (n, 32) in steps, and values as they were reported (n, 3): mean, standard deviation
-    and P(slippery) against the uniform prior; NaN for a bound."""
+    """Likelihoods as they are used (n, 32) in steps, and values as they were reported (n, 3): mean,
+    standard deviation and P(slippery) against the uniform prior; NaN for a bound."""
 
     steps: ByteArray
     reported: Float32Array

@@ -1,20 +1,23 @@
-"""The error that all values of a place have in common, and what is left of a belief when it is integrated out. Pure.
+"""The error that all values of a place have in common, and what is left of a belief when it is
+integrated out. Pure.
 
-Vehicles that do the same in the same place err alike: by the tyre's shape, which they assume, and the more, the less of
-the grip they used; by what else belongs to the manoeuvre. No number of them averages it out; other manoeuvres do, and
-who uses more. So a belief is about what the *fleet* takes a road for, and whoever reads it gets the road:
+Vehicles that do the same in the same place err alike: by the tyre's shape, which they assume, and
+the more, the less of the grip they used; by what else belongs to the manoeuvre. No number of them
+averages it out; other manoeuvres do, and who uses more. So a belief is about what the *fleet* takes
+a road for, and whoever reads it gets the road:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where μ_j < μ_i
     σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ w_k)²/Σ w_k²
 
-The error of the shape is one-sided, since only what reads low falls enough towards the upper end to be a value. Its
-slope is what `trust.shape_of` finds, and SHAPE_DOUBT. For an alarm it is the upper end of what that may be, so that the
-larger doubt of an alarm ends once the fleet's shape is known.
+The error of the shape is one-sided, since only what reads low falls enough towards the upper end to
+be a value. Its slope is what `trust.shape_of` finds, and SHAPE_DOUBT. For an alarm it is the upper
+end of what that may be, so that the larger doubt of an alarm ends once the fleet's shape is known.
 
-A sender states all of its error, and what of that does not show between senders that do the same is what they share:
-σ_s² = SHARED_PART·stated², relative, of the cell's values by weight; a = SHARED_ALWAYS.
+A sender states all of its error, and what of that does not show between senders that do the same is
+what they share: σ_s² = SHARED_PART·stated², relative, of the cell's values by weight; a =
+SHARED_ALWAYS.
 
 Legend
     ū     grip used by who gave values, mean by weight
@@ -70,7 +73,9 @@ def shared_parts(reported: Float32Array) -> ByteArray:
 
 
 class Shape(NamedTuple):
-    """Slope of the fleet's values over the share of the grip that was left unused, and its standard deviation."""
+    """Slope of the fleet's values over the share of the grip that was left unused, and its
+    standard deviation.
+    """
 
     slope: float
     std: float
@@ -82,10 +87,12 @@ class Shape(NamedTuple):
 
     @property
     def alarm(self) -> float:
-        """Return the slope that an alarm has to doubt: the upper end of its one-sided 95 % interval.
+        """Return the slope that an alarm has to doubt: the upper end of its one-sided 95 %
+        interval.
 
-        A service that knows nobody doubts .5, and one that knows its fleet little more than a reader. With .5 for all,
-        .044 of the icy cell-minutes of a clean fleet had no alert, with this .010 (tuning).
+        A service that knows nobody doubts .5, and one that knows its fleet little more than a
+        reader. With .5 for all, .044 of the icy cell-minutes of a clean fleet had no alert, with
+        this .010 (tuning).
         """
         return self.reader + Z_95 * self.std
 
@@ -97,7 +104,9 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 def shared_kernel(
     used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
 ) -> FloatArray:
-    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32)."""
+    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is
+    stated, (32, 32).
+    """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
     always += stated**2 * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
@@ -121,7 +130,9 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
 
 
 def _table(slope: float) -> Float32Array:
-    """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds them, (…, 32, 32)."""
+    """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds
+    them, (…, 32, 32).
+    """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
         for row in range(USED_ROWS)
@@ -187,8 +198,8 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
-    is, the less it counts."""
+    """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the
+    gentler or wider it is, the less it counts."""
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
@@ -218,7 +229,9 @@ def _mean(before: int, new: float, part: float) -> np.uint8:
 
 @refcount_free
 def fade(cells: RecordArray, row: int, begin: int, end: int) -> None:
-    """Let the weights of the manoeuvres, and the votes of those that are not trusted, fade between two times [ns]."""
+    """Let the weights of the manoeuvres, and the votes of those that are not trusted, fade
+    between two times [ns].
+    """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
     if borders > 0:
         for k in range(2):

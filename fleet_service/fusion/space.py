@@ -1,4 +1,5 @@
-"""Where a visit may have been instead: its fix's error spreads it over the cells before and behind. Vectorised, pure.
+"""Where a visit may have been instead: its fix's error spreads it over the cells before and behind.
+Vectorised, pure.
 
 Legend
     σ      standard deviation of the position along the heading     (n,), m
@@ -6,8 +7,8 @@ Legend
     π_k    P(what was learned belongs to the k-th cell further on)   (n,)
     G(x)   x·Φ(x) + φ(x), the integral of the normal distribution function
 
-A visit lies anywhere in its cell, so that π_k is a uniform of width w and a normal error, seen by cells of width w:
-π_k = σ/w · [G((k+1)·w/σ) - 2·G(k·w/σ) + G((k-1)·w/σ)]. All of them sum to one.
+A visit lies anywhere in its cell, so that π_k is a uniform of width w and a normal error, seen by
+cells of width w: π_k = σ/w · [G((k+1)·w/σ) - 2·G(k·w/σ) + G((k-1)·w/σ)]. All of them sum to one.
 """
 
 from __future__ import annotations
@@ -30,10 +31,12 @@ _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) 
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:
-    """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n, 2·SPREAD_CELLS).
+    """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n,
+    2·SPREAD_CELLS).
 
-    -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and in another region,
-    which another service may hold. The probabilities leave at least nothing for `cell`: no vote is doubled.
+    -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and
+    in another region, which another service may hold. The probabilities leave at least nothing for
+    `cell`: no vote is doubled.
     """
     cosine = np.cos(np.nan_to_num(yaw))
     sine = np.sin(np.nan_to_num(yaw))

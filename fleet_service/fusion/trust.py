@@ -1,13 +1,15 @@
 """What vehicles are worth, from what others found in the same cells. Pure, compiled where per row.
 
-Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed (`agreed`). Every other
-one counts once, however often they met, and in the measure of its own trust. So a group that agrees only with itself is
-as large as the number of its members and no larger, in however many cells it drives alone; and once the many distrust
-it, its word about others is worth nothing.
+Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
+(`agreed`). Every other one counts once, however often they met, and in the measure of its own
+trust. So a group that agrees only with itself is as large as the number of its members and no
+larger, in however many cells it drives alone; and once the many distrust it, its word about others
+is worth nothing.
 
-No error of a vehicle is learned from its differences to others. Only differences show there, and an error that value
-and grip used have in common looks like a slope of the one over the other. Differences of a vehicle with itself, at two
-visits to one cell, are free of it: they show how values fall with the grip that was left unused (`shape_of`).
+No error of a vehicle is learned from its differences to others. Only differences show there, and an
+error that value and grip used have in common looks like a slope of the one over the other.
+Differences of a vehicle with itself, at two visits to one cell, are free of it: they show how
+values fall with the grip that was left unused (`shape_of`).
 
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
@@ -47,10 +49,11 @@ def compare(
     entries: RecordArray,
     entry: int,
 ) -> None:
-    """Compare a value with those that others gave here lately; it takes the place of its vehicle's own, or the oldest.
+    """Compare a value with those that others gave here lately; it takes the place of its vehicle's
+    own, or the oldest.
 
-    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere, or comes late, is compared with
-    nobody.
+    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere, or comes
+    late, is compared with nobody.
     """
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:
@@ -100,7 +103,9 @@ def compare(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Note how a vehicle's values of one cell differ with the grip that it used: its gain error is in both of them."""
+    """Note how a vehicle's values of one cell differ with the grip that it used: its gain error
+    is in both of them.
+    """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)
     this.used_products += np.float32(used * difference / variance)
@@ -117,10 +122,11 @@ def _own_variance(mean: float, std: float) -> float:
 
 @refcount_free
 def _rank(vehicle: int, other: int) -> int:
-    """A fixed random number of a pair, by their own numbers and not by the order in which they came.
+    """A fixed random number of a pair, by their own numbers and not by the order in which they
+    came.
 
-    Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as a frequent one; or
-    those that report most would displace the others.
+    Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as
+    a frequent one; or those that report most would displace the others.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -149,7 +155,8 @@ def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: fl
 
 
 def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
-    """Standing of the vehicles (V,) from an epoch on, from whom they met and how these stood `before`.
+    """Standing of the vehicles (V,) from an epoch on, from whom they met and how these stood
+    `before`.
 
     In an established service, who has met few that are trusted is a newcomer.
     """
@@ -160,7 +167,9 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
 
 @compiled
 def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
-    """Fill the weights of vehicles (V,), from those `before`; returns whether the service is established."""
+    """Fill the weights of vehicles (V,), from those `before`; returns whether the service is
+    established.
+    """
     known = np.empty(len(out), np.bool_)
     trusted = 0
     for v in range(len(out)):
@@ -189,10 +198,12 @@ def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
 
 
 def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
-    """Return how much too low the fleet's values are for each μ that was left unused, λ in [0, 1], and its error.
+    """Return how much too low the fleet's values are for each μ that was left unused, λ in [0, 1],
+    and its error.
 
-    From differences of single vehicles with themselves, in which an error common to value and use cancels. λ corrects
-    no value; it says how much doubt upwards a gentle value bears (`shared.Shape`).
+    From differences of single vehicles with themselves, in which an error common to value and use
+    cancels. λ corrects no value; it says how much doubt upwards a gentle value bears
+    (`shared.Shape`).
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)

@@ -44,7 +44,8 @@ from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
-# Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and `convolve_bias`, the likelihood.
+# Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and
+# `convolve_bias`, the likelihood.
 P = 0
 PADDED = 1
 LIKELIHOOD = 2
@@ -102,7 +103,8 @@ def _clear(scratch: Bins) -> None:
 
 @refcount_free_inlined
 def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """How much of a vote is new, from what its vehicle reported here before: in the window, or before the checkpoint.
+    """How much of a vote is new, from what its vehicle reported here before: in the window, or
+    before the checkpoint.
 
     Times are whole seconds from either, so that it does not matter which.
     """
@@ -188,7 +190,9 @@ def update(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update a row of cells by one entry, whose likelihood is in the scratch; `sources` is where its sources lie."""
+    """Update a row of cells by one entry, whose likelihood is in the scratch; `sources` is where
+    its sources lie.
+    """
     belief = rows.belief
     cells = rows.cells
     time = entries[entry].time
@@ -254,12 +258,13 @@ def _aged(seconds: float) -> np.uint16:
 
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
-    """Return the evidence of a value for ice against grip: the log-likelihood ratio with the doubt about tyres [nat].
+    """Return the evidence of a value for ice against grip: the log-likelihood ratio with the doubt
+    about tyres [nat].
 
-    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST), one
-    standard deviation, with λ the slope that an alarm doubts of an unknown fleet: a witness vouches alone. So grip
-    explains the value as well as max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum
-    one.
+    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ),
+    0, SHARED_MOST), one standard deviation, with λ the slope that an alarm doubts of an unknown
+    fleet: a witness vouches alone. So grip explains the value as well as max over μ ≥ SLIPPERY, r ≤
+    μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum one.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED
@@ -298,9 +303,11 @@ def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> No
 def _untrusted_weight(
     cells: RecordArray, row: int, kind: int, power: float, weight: float
 ) -> float:
-    """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
+    """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all
+    together 1.6 votes.
 
-    So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.
+    So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power`
+    already.
     """
     if not 0.0 < weight < c.SOURCE_TRUST:
         return weight

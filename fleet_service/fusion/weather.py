@@ -1,7 +1,8 @@
-"""What the weather does to forgetting: how fast a region's roads age, and what is believed of one that nobody knows.
+"""What the weather does to forgetting: how fast a region's roads age, and what is believed of one
+that nobody knows.
 
-Without a word about a region its roads age by the clock. A report holds from its time on, until the next one or for
-VALID_S. Pure; the ageing is compiled.
+Without a word about a region its roads age by the clock. A report holds from its time on, until the
+next one or for VALID_S. Pure; the ageing is compiled.
 
 Legend
     τ_d, τ_c   road time of drift and of change: ∫ rate dt                     [s]
@@ -23,28 +24,33 @@ from schemas.thresholds import NS
 
 VALID_NS: Final = 3 * 3600 * NS  # a service's forecasts and stations renew hourly; two may fail
 WET_MM_H: Final = 0.1  # least that a gauge tells from nothing
-# Water on a road takes, and leaves, some tenths of an hour; a shower passes in as much (CHANGE_S / 4 is 45 minutes).
+# Water on a road takes, and leaves, some tenths of an hour; a shower passes in as much (CHANGE_S /
+# 4 is 45 minutes).
 WET_CHANGE: Final = 4.0
 WET_DRIFT: Final = 2.0
-# Around freezing the same water is ice, slush or wet within minutes, and salt comes: CHANGE_S / 8 is 22 minutes.
+# Around freezing the same water is ice, slush or wet within minutes, and salt comes: CHANGE_S / 8
+# is 22 minutes.
 FREEZING_C: Final = (-4.0, 1.0)  # road; below, snow is dry and the road keeps
 AIR_ABOVE_ROAD_C: Final = 2.0  # a road radiates: so much colder than the air on a clear night
 FREEZING_CHANGE: Final = 8.0
-# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge tells of them. With less a road
-# that was dry was called safe half an hour after black ice came under drivers who use a fifth of the grip.
+# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge tells of
+# them. With less a road that was dry was called safe half an hour after black ice came under
+# drivers who use a fifth of the grip.
 FROST_CHANGE: Final = 8.0
-# Warm and dry nothing comes over a road but dirt: it keeps twice as long. Not more: a gauge is not on this road.
+# Warm and dry nothing comes over a road but dirt: it keeps twice as long. Not more: a gauge is not
+# on this road.
 STEADY_CHANGE: Final = 0.5
 STEADY_C: Final = 5.0
-# A prior from outside is a guess about a region and not about this road: with this share it is uniform all the same, so
-# that a wrong one is outvoted by two vehicles.
+# A prior from outside is a guess about a region and not about this road: with this share it is
+# uniform all the same, so that a wrong one is outvoted by two vehicles.
 UNIFORM_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True)
 class Reports:
-    """Weather of regions, arrays of shape (n,): region, time from which it acts [ns], air and road temperature [°C],
-    precipitation [mm/h], each NaN where unknown; `prior` (n, 32), NaN where there is none."""
+    """Weather of regions, arrays of shape (n,): region, time from which it acts [ns], air and road
+    temperature [°C], precipitation [mm/h], each NaN where unknown; `prior` (n, 32), NaN where there
+    is none."""
 
     region: IntArray
     time: IntArray
@@ -59,7 +65,8 @@ class Reports:
 
 
 class Weather(NamedTuple):
-    """Road time of regions: rows `start[k]` to `start[k + 1]` belong to `region[k]`, in order of time; row 0 to none.
+    """Road time of regions: rows `start[k]` to `start[k + 1]` belong to `region[k]`, in order of
+    time; row 0 to none.
 
     Attributes:
         region: (r,) sorted.
@@ -160,7 +167,9 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key
 
 @refcount_free
 def aged(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
-    """Road time of drift and change between two times [ns], and the row whose prior holds at the end; 0 without one."""
+    """Road time of drift and change between two times [ns], and the row whose prior holds at the
+    end; 0 without one.
+    """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:
         return seconds, seconds, 0

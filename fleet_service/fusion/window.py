@@ -1,10 +1,12 @@
-"""The observations of the lateness window: kept per cell in order of time, in the belief whatever order they come in.
+"""The observations of the lateness window: kept per cell in order of time, in the belief whatever
+order they come in.
 
-A slot's live row is its belief after everything. While it has observations younger than the checkpoint it has a window:
-these observations, and its base, the row as it was before them. An observation at the end of the order updates the live
-row; one in between makes the window stale, and once a batch is in, stale windows are computed anew from their bases.
-When all of a window is older than the checkpoint the live row is what the base would be, and the window is given back.
-Both rows see the same operations in the same order, so that they agree bit for bit.
+A slot's live row is its belief after everything. While it has observations younger than the
+checkpoint it has a window: these observations, and its base, the row as it was before them. An
+observation at the end of the order updates the live row; one in between makes the window stale, and
+once a batch is in, stale windows are computed anew from their bases. When all of a window is older
+than the checkpoint the live row is what the base would be, and the window is given back. Both rows
+see the same operations in the same order, so that they agree bit for bit.
 """
 
 from __future__ import annotations
@@ -45,8 +47,8 @@ from schemas.runtime.records import RecordArray
 class Arrivals(NamedTuple):
     """A batch of observations, arrays of shape (n,): see `Observations`.
 
-    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `used`, `shared` and `late`
-    are as an entry has them.
+    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `used`,
+    `shared` and `late` are as an entry has them.
     """
 
     time: IntArray
@@ -64,7 +66,8 @@ class Arrivals(NamedTuple):
 
 
 class Votes(NamedTuple):
-    """Votes of a batch, arrays of shape (k,): row of the observation, slot, and P(the vehicle was there).
+    """Votes of a batch, arrays of shape (k,): row of the observation, slot, and P(the vehicle was
+    there).
 
     Of the votes of an observation its own cell's comes first.
     """
@@ -75,7 +78,9 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """What becomes of a batch: observations left out (n,), observations seen (n,), windows to be computed anew (k,)."""
+    """What becomes of a batch: observations left out (n,), observations seen (n,), windows to be
+    computed anew (k,).
+    """
 
     left_out: BoolArray
     seen: BoolArray
@@ -87,8 +92,9 @@ def absorb(
 ) -> BoolArray:
     """Take the votes of a batch into the windows of their slots, and update the beliefs.
 
-    Every pool must have k free places. Returns which observations (n,) were left out, because `most` of their vehicle
-    wait in their cell already; of the votes of an observation its own cell's decides.
+    Every pool must have k free places. Returns which observations (n,) were left out, because
+    `most` of their vehicle wait in their cell already; of the votes of an observation its own
+    cell's decides.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -173,9 +179,11 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch all that votes `begin` to `end` will touch; last what lies behind a number that has to come first.
+    """Prefetch all that votes `begin` to `end` will touch; last what lies behind a number that has
+    to come first.
 
-    No branch waits for memory: a processor that guesses it wrongly forgets what it has fetched meanwhile.
+    No branch waits for memory: a processor that guesses it wrongly forgets what it has fetched
+    meanwhile.
     """
     live = state.live
     base = state.base
@@ -263,7 +271,9 @@ def commit(
     due_windows: IntArray,
     before: int,
 ) -> None:
-    """Let the checkpoint pass to `before` [ns] in the windows (k,), one after the other: older entries leave them."""
+    """Let the checkpoint pass to `before` [ns] in the windows (k,), one after the other: older
+    entries leave them.
+    """
     _commit(state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32))
 
 

@@ -10,7 +10,8 @@ from fleet_service.ingest.dedup import BatchId, SequenceTracker
 from schemas.wire import Kind, StreamAck, encode_ack
 from schemas.wire.batches import Head
 
-# A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of 150 bytes.
+# A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of
+# 150 bytes.
 STREAMS_PER_ACK: Final = 16
 ITEMS_PER_STREAM: Final = 24
 AckedStream = tuple[int, Kind, int]  # boot, kind, region
@@ -33,7 +34,9 @@ class Acks:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches arrived after the map had moved on; sent with those of them that are durable."""
+        """Record that batches arrived after the map had moved on; sent with those of them that
+        are durable.
+        """
         for stream, seq in batches:
             self._late[stream].add(seq)
 
@@ -44,7 +47,9 @@ class Acks:
         )
 
     def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
-        """Return vehicle and `Ack` bytes of everything collected, with the service's `time` [ns]; reset."""
+        """Return vehicle and `Ack` bytes of everything collected, with the service's `time`
+        [ns]; reset.
+        """
         settled: dict[str, dict[AckedStream, list[int]]] = {
             vehicle: {} for vehicle in self._rejected
         }

@@ -16,7 +16,8 @@ from schemas.numeric import BoolArray, IntArray
 NEW_CELLS_PER_HOUR: Final = 14_000.0
 # an hour on such roads, that a service was away: its backlog reaches the map
 NEW_CELLS_AT_ONCE: Final = 11_000.0
-# Such cells are kept for a week. 1 000 km of roads that nobody else drives: 100 MB at once, and as much in a week.
+# Such cells are kept for a week. 1 000 km of roads that nobody else drives: 100 MB at once, and as
+# much in a week.
 NEW_CELLS_PER_WEEK: Final = 100_000
 # A start, two kinds, and a region every quarter of an hour; after an outage a handful of starts.
 STREAMS_PER_HOUR: Final = 60.0
@@ -53,7 +54,9 @@ class NewCells:
         self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Return rows (n,) in new cells beyond their vehicle's budget; the others are charged. now [s]."""
+        """Return rows (n,) in new cells beyond their vehicle's budget; the others are charged.
+        now [s].
+        """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))
         who = vehicle[order]

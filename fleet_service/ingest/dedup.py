@@ -1,7 +1,9 @@
-"""Record of accepted batches: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
+"""Record of accepted batches: a watermark and the seqs above it, per (vehicle, boot, kind, region).
+Pure.
 
-It is bounded by accepted data: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of
-them, and a stream whose newest record is older than the service accepts is dropped.
+It is bounded by accepted data: every seq above a watermark is a batch in the archive, there are at
+most MAX_GAPS of them, and a stream whose newest record is older than the service accepts is
+dropped.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
-# Batches above the first that is missing: an agent sends old ones first, so that it has some hundreds after an outage.
+# Batches above the first that is missing: an agent sends old ones first, so that it has some
+# hundreds after an outage.
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
@@ -54,8 +57,8 @@ class SequenceTracker:
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Record a seq and the newest time of its records [ns]; False (and no record) if too many are missing before
-        it."""
+        """Record a seq and the newest time of its records [ns]; False (and no record) if too many
+        are missing before it."""
         if seq == self.low + 1:
             self.low = seq
             self._close()
@@ -129,7 +132,9 @@ class SequenceTrackers:
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Return which batches were accepted: `names` is (n, 4) of vehicle, boot, region and seq."""
+        """Return which batches were accepted: `names` is (n, 4) of vehicle, boot, region and
+        seq.
+        """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
         return np.array(
@@ -141,7 +146,9 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """Return all streams as columns (n,); `above` is how many seqs of the second value belong to each."""
+        """Return all streams as columns (n,); `above` is how many seqs of the second value
+        belong to each.
+        """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
         table = {
@@ -177,7 +184,9 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams without a batch from `before` [ns] on; a repeated batch would be refused as too old."""
+        """Drop streams without a batch from `before` [ns] on; a repeated batch would be refused
+        as too old.
+        """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]
 

@@ -1,4 +1,6 @@
-"""Grouping of rows by stream in one pass, because a restart processes tens of millions. Compiled, pure."""
+"""Grouping of rows by stream in one pass, because a restart processes tens of millions.
+Compiled, pure.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ Int32Array = NDArray[np.int32]
 
 @compiled
 def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
-    """Return the group of each row (n,), in order of first appearance, and the first row of each group (k,)."""
+    """Return the group of each row (n,), in order of first appearance, and the first row of each
+    group (k,).
+    """
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)
     group = np.empty(len(a), np.int32)

@@ -1,7 +1,8 @@
 """Inbox: a bounded queue behind the Zenoh subscribers, and the path from bytes to accepted rows.
 
-The subscriber's callback only copies bytes into the queue. If the queue is full, the message is dropped and counted. It
-is not acknowledged, so its sender keeps it and sends it again: this is the back-pressure.
+The subscriber's callback only copies bytes into the queue. If the queue is full, the message is
+dropped and counted. It is not acknowledged, so its sender keeps it and sends it again: this is the
+back-pressure.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 
-# Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
-# the work is by the record, of which 160 bytes are one.
+# Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than
+# a moment. Most of the work is by the record, of which 160 bytes are one.
 STEP_MESSAGES: Final = 4096
 STEP_BYTES: Final = 768 * 1024
-# A step costs as much as a hundred records even if it brings one. So what comes within a moment of the first message is
-# taken with it, unless enough waits already: at 2 000 messages a second that is a fifth of the processor time, and the
-# interpreter is free for answers.
+# A step costs as much as a hundred records even if it brings one. So what comes within a moment of
+# the first message is taken with it, unless enough waits already: at 2 000 messages a second that
+# is a fifth of the processor time, and the interpreter is free for answers.
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
 QUEUE_BYTES: Final = (
@@ -70,7 +71,8 @@ class Inbox:
     """Bounded queue.
 
     Args:
-        capacity: maximum number of messages; one more for each further callback thread that puts at the same instant.
+        capacity: maximum number of messages; one more for each further callback thread that puts at
+            the same instant.
         counts: where drops are counted, under `overload`.
         limits: rate limits per vehicle.
     """
@@ -109,8 +111,8 @@ class Inbox:
         self._queue.put(message)
 
     def drain(self, wait_s: float) -> list[Message]:
-        """Return waiting messages, as many as a step takes; wait up to `wait_s` for the first, then a moment for
-        more."""
+        """Return waiting messages, as many as a step takes; wait up to `wait_s` for the first, then
+        a moment for more."""
         out: list[Message] = []
         size = 0
         try:
@@ -132,7 +134,9 @@ class Inbox:
 
 
 class AcceptedBatches(NamedTuple):
-    """Accepted batches of one kind, and their rows for the archive (without `late` and `weight`)."""
+    """Accepted batches of one kind, and their rows for the archive (without `late` and
+    `weight`).
+    """
 
     batches: list[BatchId]
     rows: Rows
@@ -229,10 +233,11 @@ class BatchIntake:
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
-        """Drop streams that are too old to matter, and names of days of which almost nothing arrives any more.
+        """Drop streams that are too old to matter, and names of days of which almost nothing
+        arrives any more.
 
-        Active streams keep their memory: allocated again, they would lie between other objects, and the process would
-        grow by some megabytes each time.
+        Active streams keep their memory: allocated again, they would lie between other objects, and
+        the process would grow by some megabytes each time.
         """
         self._forgot = clock.now
         self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
@@ -293,8 +298,9 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream of a (vehicle, boot, region, day); None without a key, or if the vehicle opens too many.
-        The vehicle then keeps its batch until the disk works again, or the hour is over."""
+        """Return the stream of a (vehicle, boot, region, day); None without a key, or if the
+        vehicle opens too many. The vehicle then keeps its batch until the disk works again, or the
+        hour is over."""
         vehicle, boot, region, _ = name
         try:
             pseudonym = number(self._pseudonyms.of(vehicle, time))
@@ -365,8 +371,8 @@ class BatchIntake:
     def _refuse_unusable(
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
-        """Refuse a batch whose records cannot be used: with a rejection if its head can be read, because it would be
-        sent for ever otherwise; else it is only counted."""
+        """Refuse a batch whose records cannot be used: with a rejection if its head can be read,
+        because it would be sent for ever otherwise; else it is only counted."""
         head = head_of(kind, message.payload, message.encoding)
         named = (
             head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
@@ -392,7 +398,9 @@ class BatchIntake:
 
 
 def _newest(time: IntArray, sizes: IntArray) -> IntArray:
-    """Return the newest time of each batch (k,), as the archive stores it, so that a restart finds the same."""
+    """Return the newest time of each batch (k,), as the archive stores it, so that a restart
+    finds the same.
+    """
     newest = np.maximum.reduceat(time, np.cumsum(sizes) - sizes)
     return np.asarray(newest // US_STEP * US_STEP)
 

@@ -1,13 +1,16 @@
-"""Plausible path of each vehicle: check that it can have been at all the places that it reports. Pure.
+"""Plausible path of each vehicle: check that it can have been at all the places that it reports.
+Pure.
 
-A vehicle's path is a list of at most ANCHORS (time, place), over all its batches, boots and regions. A report must be
-reachable from the anchor before it, and must leave time to reach the anchor after it, at FASTEST. Positions leap when
-they return after a tunnel or a ferry. All leaps of a vehicle take from one budget of LEAP_M, which fills again slowly,
-so that a vehicle cannot leap with every row.
+A vehicle's path is a list of at most ANCHORS (time, place), over all its batches, boots and
+regions. A report must be reachable from the anchor before it, and must leave time to reach the
+anchor after it, at FASTEST. Positions leap when they return after a tunnel or a ferry. All leaps of
+a vehicle take from one budget of LEAP_M, which fills again slowly, so that a vehicle cannot leap
+with every row.
 
-Reports may come in any order, for example a backlog between live reports. When a path is full, one anchor is dropped;
-old anchors are then farther apart than new ones. A later report into such a gap must be near the straight way between
-its ends, because the vehicle's own way in between is no longer known.
+Reports may come in any order, for example a backlog between live reports. When a path is full, one
+anchor is dropped; old anchors are then farther apart than new ones. A later report into such a gap
+must be near the straight way between its ends, because the vehicle's own way in between is no
+longer known.
 """
 
 from __future__ import annotations
@@ -51,7 +54,8 @@ class VehiclePaths:
     def find_implausible(
         self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray
     ) -> BoolArray:
-        """Return the rows (n,) at which their vehicle cannot have been; time [ns], places [deg]. Others extend paths.
+        """Return the rows (n,) at which their vehicle cannot have been; time [ns], places [deg].
+        Others extend paths.
 
         The rows of a vehicle must lie next to each other, in the order of their arrival.
         """
@@ -92,7 +96,9 @@ Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 @compiled
 def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
-    """Compute `VehiclePaths.find_implausible`; `row` (n,) is the vehicle's row in the paths, which are updated."""
+    """Compute `VehiclePaths.find_implausible`; `row` (n,) is the vehicle's row in the paths,
+    which are updated.
+    """
     anchors, places, is_gap, count, leap = paths
     out = np.zeros(len(row), np.bool_)
     for n in range(len(row)):
@@ -142,7 +148,9 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
 
 @compiled
 def _least_needed(anchors: IntArray) -> int:
-    """Return the inner anchor (of (ANCHORS,) times) whose gap is the smallest compared with its age."""
+    """Return the inner anchor (of (ANCHORS,) times) whose gap is the smallest compared with its
+    age.
+    """
     newest = anchors[-1]
     best = 1
     least = np.inf
@@ -156,7 +164,9 @@ def _least_needed(anchors: IntArray) -> int:
 
 @compiled
 def _excess(apart: int, there: Float32Array, here: FloatArray) -> float:
-    """Return the distance between two places (2,) [deg] beyond what FASTEST covers in the time between them [ns]."""
+    """Return the distance between two places (2,) [deg] beyond what FASTEST covers in the time
+    between them [ns].
+    """
     return max(_metres(there, here) - FASTEST * apart / NS, 0.0)
 
 

@@ -1,8 +1,9 @@
 """Rate limit: a token bucket of bytes per vehicle, applied before anything of a message is read.
 
-A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage. Messages beyond it
-are dropped, counted and not acknowledged: the sender keeps them and sends them again. This is not a rejection. The name
-is the last chunk of the key; routers with an access list guarantee that it is the sender's.
+A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage.
+Messages beyond it are dropped, counted and not acknowledged: the sender keeps them and sends them
+again. This is not a rejection. The name is the last chunk of the key; routers with an access list
+guarantee that it is the sender's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from typing import Final
 LEAST_BYTES: Final = 1024
 JSON: Final = "application/json"
 JSON_COST: Final = 10  # times a byte of protobuf: 64 kB take 23 ms of the worker
-# Names that have a bucket of their own. More are sent by nobody but who makes them up: they share one.
+# Names that have a bucket of their own. More are sent by nobody but who makes them up: they share
+# one.
 MOST_NAMES: Final = 100_000
 _OTHERS: Final = ""
 
@@ -49,7 +51,9 @@ class RateLimiter:
         self._swept = -float("inf")
 
     def allows(self, key: str, size: int, encoding: str = "") -> bool:
-        """Return True if a message of `size` bytes on `key` may be processed; otherwise count it."""
+        """Return True if a message of `size` bytes on `key` may be processed; otherwise count
+        it.
+        """
         name = key.rpartition("/")[2]
         if self._known is not None and name not in self._known:
             self._counts["refused.unknown"] += 1

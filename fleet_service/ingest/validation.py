@@ -5,8 +5,8 @@ Three checks in this order, cheap ones first:
     novelty    was this (vehicle, boot, kind, region, seq) accepted before?                      per message
     rows       is every value finite, in range, at its place and in its time?                    all rows at once
 
-One bad row refuses its batch, with row and reason; the refusal settles it. Rules are tables: the reason that a sender
-reads is the text of the rule.
+One bad row refuses its batch, with row and reason; the refusal settles it. Rules are tables: the
+reason that a sender reads is the text of the rule.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
 class Range(NamedTuple):
-    """A column must lie in [least, most]; NaN, which is neither below nor above, means 'absent' where `optional`."""
+    """A column must lie in [least, most]; NaN, which is neither below nor above, means 'absent'
+    where `optional`.
+    """
 
     column: str
     least: float
@@ -84,7 +86,8 @@ class Refusal(NamedTuple):
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check that batches belong to their keys' owners and regions, have valid sequence numbers, and are in time.
+    """Check that batches belong to their keys' owners and regions, have valid sequence numbers, and
+    are in time.
 
     Args:
         kind: of the batches.
@@ -94,7 +97,8 @@ def check_heads(
         clock: service time and bounds.
 
     Returns:
-        (k,) index of the first broken rule into the second value, -1 for a valid one; and the rules.
+        (k,) index of the first broken rule into the second value, -1 for a valid one; and the
+        rules.
     """
     topic = _TOPIC[kind]
     held = heads.first_held
@@ -198,7 +202,9 @@ TOO_LONG: Final = Refusal(
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Return which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each batch (k,)."""
+    """Return which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each
+    batch (k,).
+    """
     if not len(time):
         return np.zeros(len(sizes), bool)
     starts = np.cumsum(sizes) - sizes
@@ -226,7 +232,9 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
 
 
 def _cell_of(columns: Columns) -> IntArray:
-    """Return the cell of the pose; an invalid cell if the pose is not finite (another rule refuses it)."""
+    """Return the cell of the pose; an invalid cell if the pose is not finite (another rule
+    refuses it).
+    """
     return grid.cell_of(
         *(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude"))
     )

@@ -1,14 +1,14 @@
-"""Input of road weather: from Zenoh and from a Parquet file; checked, archived, and then used by the map.
+"""Input of road weather: from Zenoh and from a Parquet file; checked, archived, and then used by
+the map.
 
     weather/NAME-TIME.parquet     reports as received, with the time from which the map used them
 
-Each file is written when reports arrive. `join_daily_files` joins the files of a day, so that a start and a past map
-read as many
-files as there are days. A report that is read twice, because of a power loss in between, is identical and changes
-nothing.
+Each file is written when reports arrive. `join_daily_files` joins the files of a day, so that a
+start and a past map read as many files as there are days. A report that is read twice, because of a
+power loss in between, is identical and changes nothing.
 
-A report acts on observations of which none was fused yet (`acts_from`). It is durable before it acts, so that a replay
-of the archive finds the same weather and gives the same map.
+A report acts on observations of which none was fused yet (`acts_from`). It is durable before it
+acts, so that a replay of the archive finds the same weather and gives the same map.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class WeatherInbox:
         return self._archived(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
-        """Archive the reports of a file that may still act and are not `known`; return them for the map.
+        """Archive the reports of a file that may still act and are not `known`; return them for the
+        map.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.
@@ -151,8 +152,8 @@ def archived_reports(
     known: Collection[str] = (),
     damaged: Damaged = skip_damaged,
 ) -> Reports:
-    """Return every report that a map used, in order of receipt up to a time [ns], from files whose names are not
-    `known`.
+    """Return every report that a map used, in order of receipt up to a time [ns], from files whose
+    names are not `known`.
 
     `damaged` is called with a damaged file: the roads of its reports age without weather.
 
@@ -233,8 +234,8 @@ def _day(path: Path) -> int:
 def read_file(path: Path) -> list[tuple[int, Report]]:
     """Return region and report of every row of a Parquet file.
 
-    It has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or ns), and any of the
-    others. Null or NaN is unknown.
+    It has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or ns),
+    and any of the others. Null or NaN is unknown.
 
     Raises:
         InputError: names the row, the column and the fix.

@@ -10,10 +10,11 @@ Legend
     m, z   m = μ·(1 + b + k) + a, and the reading z = m + σ(m)·e                       (n,)
     e      a standard normal, correlated along a drive                                 (n,)
 
-An excited visit (s ≥ .6) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it is calibrated,
-also where e is correlated with that of the visit before, since each visit's e alone is standard normal (a real agent
-tempers to get there). An unexcited one sends "at least what I used", with a slope above it that is the sender's own and
-stays within half a nat (contract of the log-likelihood). Both are rounded to the wire's bytes.
+An excited visit (s ≥ .6) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it
+is calibrated, also where e is correlated with that of the visit before, since each visit's e alone
+is standard normal (a real agent tempers to get there). An unexcited one sends "at least what I
+used", with a slope above it that is the sender's own and stays within half a nat (contract of the
+log-likelihood). Both are rounded to the wire's bytes.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
-# What all vehicles of a place share, relative; more than half of it is the manoeuvre's. In six end-to-end
-# drives (real estimator) cells of 20 and more excited vehicles erred about the mean of their surface by .059 dry, .046
-# wet and .044 snow (robust standard deviations; plain ones were .088, .088 and .066).
+# What all vehicles of a place share, relative; more than half of it is the manoeuvre's. In six
+# end-to-end drives (real estimator) cells of 20 and more excited vehicles erred about the mean of
+# their surface by .059 dry, .046 wet and .044 snow (robust standard deviations; plain ones were
+# .088, .088 and .066).
 COMMON: Final = 0.05  # hypot(common, by_manoeuvre) of CLEAN
 NOISE_ABSOLUTE: Final = 0.02
 NOISE_AT_LIMIT: Final = 0.05  # relative
@@ -78,7 +80,9 @@ CLEAN: Final = ErrorModel()
 
 @dataclass(frozen=True)
 class Errors:
-    """Own errors of V vehicles: relative, additive, and the slope of their bounds [nat]; each (V,)."""
+    """Own errors of V vehicles: relative, additive, and the slope of their bounds [nat]; each
+    (V,).
+    """
 
     relative: FloatArray
     additive: FloatArray
@@ -98,8 +102,8 @@ class Errors:
 
 
 class Passes(NamedTuple):
-    """What visits (n,) do: vehicle, friction, error shared in the place, share of the grip used, noise, manoeuvre, and
-    whether they are excited."""
+    """What visits (n,) do: vehicle, friction, error shared in the place, share of the grip used,
+    noise, manoeuvre, and whether they are excited."""
 
     vehicle: IntArray
     mu: FloatArray
@@ -112,8 +116,8 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,), and in which manoeuvre (n,);
-    log-likelihood (n, 32)."""
+    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,), and in which
+    manoeuvre (n,); log-likelihood (n, 32)."""
 
     reading: FloatArray
     std: FloatArray
@@ -129,8 +133,8 @@ def shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> Flo
 
 
 def noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
-    """e of visits that follow each other; `along` (n,) is 0 where a drive begins. Student's with `tails` degrees of
-    freedom, of standard deviation one, if these are finite."""
+    """e of visits that follow each other; `along` (n,) is 0 where a drive begins. Student's with
+    `tails` degrees of freedom, of standard deviation one, if these are finite."""
     e = rng.normal(size=len(along))
     heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
     for step in range(1, int(along.max(initial=0)) + 1):
@@ -168,7 +172,9 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
 def likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
-    """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a constant."""
+    """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a
+    constant.
+    """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
 

@@ -1,11 +1,11 @@
 """Attacks on the map: what a few can do that the honest vehicles alone would not have let happen.
 
-The attackers of `random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were honest, and so trusted,
-until the attack begins. `newcomers` are new names. `replayed` goes through the service's admission: old messages
-again, other vehicles' messages on an own key, and old visits under an own name.
-Counted are cells whose alert differs from that of the same drive without the attack at any minute of it: dry or wet
-ones (μ > CLEARLY_DRY) that are raised, icy ones (μ < CLEARLY_ICY) that are suppressed, with ENOUGH honest excited
-vehicles.
+The attackers of `random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
+honest, and so trusted, until the attack begins. `newcomers` are new names. `replayed` goes through
+the service's admission: old messages again, other vehicles' messages on an own key, and old visits
+under an own name. Counted are cells whose alert differs from that of the same drive without the
+attack at any minute of it: dry or wet ones (μ > CLEARLY_DRY) that are raised, icy ones (μ <
+CLEARLY_ICY) that are suppressed, with ENOUGH honest excited vehicles.
 """
 
 from __future__ import annotations
@@ -131,7 +131,9 @@ def victims(drive: AttackedDrive) -> IntArray:
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Hundreds of visits a minute: ice on the driest cell, dry on the iciest; the values vary, so as to look new."""
+    """Hundreds of visits a minute: ice on the driest cell, dry on the iciest; the values vary,
+    so as to look new.
+    """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
     which = rng.integers(0, 2, count)
@@ -142,7 +144,9 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on that of the iciest."""
+    """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on
+    that of the iciest.
+    """
     roads = victims(drive) // LENGTH * LENGTH
     who, which, along = (
         a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH))
@@ -180,7 +184,9 @@ VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
 
 
 def replayed(rng: Generator, drive: AttackedDrive) -> int:
-    """Every message of the town's first minutes again, as it was, on other keys, and under another name."""
+    """Every message of the town's first minutes again, as it was, on other keys, and under
+    another name.
+    """
     sent = messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]
     old = np.flatnonzero(at < 60.0 * BEGIN)
@@ -199,7 +205,9 @@ def replayed(rng: Generator, drive: AttackedDrive) -> int:
 def _alerted(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
-    """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with them the same peers."""
+    """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with
+    them the same peers.
+    """
     out = []
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "keys").mkdir()

@@ -1,4 +1,6 @@
-"""The figures of the campaign with their bars, and how measured values become figures. A missing name is a failure."""
+"""The figures of the campaign with their bars, and how measured values become figures. A missing
+name is a failure.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,9 @@ BARS: Final[dict[str, MapBar]] = {
 
 
 def judged(measured: Mapping[str, float]) -> list[Figure]:
-    """Every figure that has a bar, NaN where it was not measured; then those that are only shown."""
+    """Every figure that has a bar, NaN where it was not measured; then those that are only
+    shown.
+    """
     named = [
         Figure(name, measured.get(name, math.nan), bar.unit, bar.bar, bar.better)
         for name, bar in BARS.items()

@@ -28,7 +28,8 @@ from fleet_service.lab import (
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
-# Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those below.
+# Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those
+# below.
 JUDGING: Final = 20_000
 SEEDS = 10
 QUICK_SEEDS = 1

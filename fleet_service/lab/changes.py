@@ -38,8 +38,8 @@ def changing(rng: Generator, before: float, after: float) -> Town:
 def delays(rng: Generator, before: float, after: float) -> IntArray:
     """Excited passes over each cell of the road, (LENGTH,), until the map has seen the change.
 
-    Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is one excited visit that
-    the map heard of the cell, whether or not it was the right cell.
+    Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is
+    one excited visit that the map heard of the cell, whether or not it was the right cell.
     """
     place = changing(rng, before, after)
     visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
@@ -67,7 +67,9 @@ def _seen(fusion: Fusion, cell: int, ice: bool) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Medians and 95 % quantiles over the cells of all seeds; and the share of cells after each number of passes."""
+    """Medians and 95 % quantiles over the cells of all seeds; and the share of cells after each
+    number of passes.
+    """
     out: dict[str, float] = {}
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):
         found: FloatArray = np.concatenate(

@@ -1,7 +1,8 @@
-"""Visits through the service's own path: rows as the archive has them → `observations_of` → `Fusion.update` → alerts.
+"""Visits through the service's own path: rows as the archive has them → `observations_of` →
+`Fusion.update` → alerts.
 
-Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `SequenceTrackers` drops
-the second ones, as in the service.
+Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice;
+`SequenceTrackers` drops the second ones, as in the service.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own.
+    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of
+    its own.
 
     `cells` are the grid's numbers of the visits' places.
     """
@@ -71,7 +73,9 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """When each delivery comes [s] and which visit it brings, in order of arrival: some late, some twice."""
+    """When each delivery comes [s] and which visit it brings, in order of arrival: some late,
+    some twice.
+    """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(
         rng.random(n) < LATE_SHARE, rng.uniform(0.0, LATE_S, n), 0.0
@@ -100,7 +104,9 @@ def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
 
 @dataclass
 class AlertWatch:
-    """A fusion with its alerts, asked at some minutes: `beliefs` by minute, (cells, 32), `alerted` (minutes, cells)."""
+    """A fusion with its alerts, asked at some minutes: `beliefs` by minute, (cells, 32),
+    `alerted` (minutes, cells).
+    """
 
     fusion: Fusion
     alerts: Alerts

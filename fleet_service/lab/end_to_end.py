@@ -1,7 +1,8 @@
-"""End to end: simulated vehicles with the real estimator, their observations through the fusion, beside the truth.
+"""End to end: simulated vehicles with the real estimator, their observations through the fusion,
+beside the truth.
 
-The vehicles are driven by a command of the deployment, since the service does not know the agent; what it writes is
-read.
+The vehicles are driven by a command of the deployment, since the service does not know the agent;
+what it writes is read.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
 
 class World(NamedTuple):
-    """Where whom the vehicles are driven: a scenario of the simulator, and the share of rough vehicles."""
+    """Where whom the vehicles are driven: a scenario of the simulator, and the share of rough
+    vehicles.
+    """
 
     scenario: str
     rough: float
@@ -51,8 +54,9 @@ LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
 HILLS: Final = World(
     "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
 )  # frictions and hills that nobody tuned on
-# Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without a further name, see
-# `moments`. All cells of a way share one snow, so that fewer ways say little about P(slippery).
+# Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without
+# a further name, see `moments`. All cells of a way share one snow, so that fewer ways say little
+# about P(slippery).
 WAYS: Final = tuple(
     World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
 )
@@ -82,7 +86,9 @@ def command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Coverage of cells with SEVERAL vehicles, error of those among them that are measured, alerts, and the counts."""
+    """Coverage of cells with SEVERAL vehicles, error of those among them that are measured,
+    alerts, and the counts.
+    """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
     columns = read(folder / OBSERVATIONS)
@@ -111,7 +117,9 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
 
 
 def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
-    """Fuse the observations second by second, as a service would, and return the alerts that were raised."""
+    """Fuse the observations second by second, as a service would, and return the alerts that
+    were raised.
+    """
     alerts = Alerts(fusion)
     raised = []
     second = (o.time - o.time.min()) // NS
@@ -126,8 +134,8 @@ def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
 def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     """Alerts on wet and dry road: those with no slippery road near, and those in a cell beside one.
 
-    Slippery is what any vehicle truly found below SURE_GRIP there before the alert. A fix is metres off and a cell ten
-    metres wide: who is warned of the cell beside the ice is warned rightly.
+    Slippery is what any vehicle truly found below SURE_GRIP there before the alert. A fix is metres
+    off and a cell ten metres wide: who is warned of the cell beside the ice is warned rightly.
     """
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu = visits["mu"].to_numpy()
@@ -200,7 +208,9 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Slots that a vehicle truly visited, and their friction at the last such visit's half minute."""
+    """Slots that a vehicle truly visited, and their friction at the last such visit's half
+    minute.
+    """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()
     time = visits["leave_time"].cast(pa.int64()).to_numpy()

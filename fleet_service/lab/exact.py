@@ -1,4 +1,6 @@
-"""What must hold to rounding: the order of arrival, the replay from an archive; and what unexcited visits cannot do."""
+"""What must hold to rounding: the order of arrival, the replay from an archive; and what
+unexcited visits cannot do.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
 def difference(a: Fusion, b: Fusion) -> float:
-    """Largest difference of any probability in any cell of two fusions; 1 where one has a cell that the other lacks."""
+    """Largest difference of any probability in any cell of two fusions; 1 where one has a cell
+    that the other lacks.
+    """
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     if a.size != b.size or (there < 0).any():
         return 1.0
@@ -56,7 +60,9 @@ def order(rng: Generator) -> float:
 
 
 def replay(rng: Generator) -> float:
-    """A service that took messages, some of them late or twice, against one that starts from its archive."""
+    """A service that took messages, some of them late or twice, against one that starts from its
+    archive.
+    """
     visits = drive(rng)
     sent = messages(visits)
     at = visits.seconds[[m.last for m in sent]] + rng.uniform(0.0, 1.5 * LATENESS_S, len(sent))
@@ -73,7 +79,9 @@ def replay(rng: Generator) -> float:
 
 
 def upper_shift(rng: Generator) -> float:
-    """Largest fall of an upper end below the prior's, by any of UNEXCITED numbers of vehicles on any surface."""
+    """Largest fall of an upper end below the prior's, by any of UNEXCITED numbers of vehicles on
+    any surface.
+    """
     prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
     worst = -np.inf
     for vehicles in UNEXCITED:

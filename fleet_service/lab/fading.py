@@ -1,4 +1,6 @@
-"""How long a dry road stays dry on the map: what a planner may assume so long after the last pass. Pure."""
+"""How long a dry road stays dry on the map: what a planner may assume so long after the last
+pass. Pure.
+"""
 
 from __future__ import annotations
 

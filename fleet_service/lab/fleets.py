@@ -1,4 +1,6 @@
-"""Fleets with and without misbehaving vehicles: coverage, error, alerts, and the rules beside them."""
+"""Fleets with and without misbehaving vehicles: coverage, error, alerts, and the rules beside
+them.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,13 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One campaign: share of vehicles that always claim `claim`; from which minute it counts, and how long it is.
+    """One campaign: share of vehicles that always claim `claim`; from which minute it counts, and
+    how long it is.
 
-    Vehicles are judged by what they did before, so where some misbehave coverage and error count from `begin` on: by
-    then every vehicle has some 200 visits, a day of a car's life. The rates of alerts count as soon as each vehicle has
-    EARLIER visits, two minutes after the service knew nobody; `…_settled` are those from `begin` on.
+    Vehicles are judged by what they did before, so where some misbehave coverage and error count
+    from `begin` on: by then every vehicle has some 200 visits, a day of a car's life. The rates of
+    alerts count as soon as each vehicle has EARLIER visits, two minutes after the service knew
+    nobody; `…_settled` are those from `begin` on.
     """
 
     name: str

@@ -1,8 +1,9 @@
 """Fleets that err otherwise than the fusion assumes, and the sharpness of one that does not. Pure.
 
-Each fleet gets to know itself on half of the roads and is judged on the other half, which nobody knew: so that the
-number of excited vehicles of a cell is what the map had to go by. Towns, ways and errors are drawn by judging seeds.
-One fleet errs as no model says: as the real estimator did on whole ways (`resampled`).
+Each fleet gets to know itself on half of the roads and is judged on the other half, which nobody
+knew: so that the number of excited vehicles of a cell is what the map had to go by. Towns, ways and
+errors are drawn by judging seeds. One fleet errs as no model says: as the real estimator did on
+whole ways (`resampled`).
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def one(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Scores of the map, and of the rules, on one town; its reports are drawn from those of `ways`, if there are."""
+    """Scores of the map, and of the rules, on one town; its reports are drawn from those of
+    `ways`, if there are.
+    """
     rng = np.random.default_rng([seed, 11])
     place = town.build(rng, MINUTES, 0.0, model)
     errors = Errors.draw(rng, VEHICLES, model)
@@ -79,7 +82,9 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
-    """The fleet that errs as the real estimator did; nothing where no such visit was excited, or each was."""
+    """The fleet that errs as the real estimator did; nothing where no such visit was excited, or
+    each was.
+    """
     if not ways.excited.any() or ways.excited.all():
         return {}
     return _figures("fusion.resampled", [one(CLEAN, seed, ways) for seed in seeds])

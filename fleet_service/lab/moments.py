@@ -1,7 +1,9 @@
-"""Whole ways with the real estimator, judged while they go on: after one, six and thirty minutes, the worst of all.
+"""Whole ways with the real estimator, judged while they go on: after one, six and thirty minutes,
+the worst of all.
 
-A map that is right after a minute may become too sure of what all vehicles err in alike, and one that is right after
-half an hour may have said too much in the first minute. So each way is asked at MOMENTS, and what counts is the worst.
+A map that is right after a minute may become too sure of what all vehicles err in alike, and one
+that is right after half an hour may have said too much in the first minute. So each way is asked at
+MOMENTS, and what counts is the worst.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ MIDDLE: Final = 0.91  # of the bar on coverage: the worst is the farthest from i
 
 
 class AskedWay(NamedTuple):
-    """Scores of the cells that several vehicles visited until then, and which of them are measured."""
+    """Scores of the cells that several vehicles visited until then, and which of them are
+    measured.
+    """
 
     scores: Scores
     measured: BoolArray
@@ -79,9 +83,11 @@ def moments(folder: Path) -> list[AskedWay]:
 
 
 def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]:
-    """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the spread over them.
+    """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the
+    spread over them.
 
-    Error and coverage are of measured cells: a cell that nobody tested reaches to the grid's end, so that it covers.
+    Error and coverage are of measured cells: a cell that nobody tested reaches to the grid's end,
+    so that it covers.
     """
     out: dict[str, float] = {f"{prefix}.ways": float(len(ways))}
     for k, seconds in enumerate(MOMENTS[: min(map(len, ways))]):

@@ -1,14 +1,16 @@
-"""Errors as the real estimator makes them: what it reported on whole ways, drawn again for the visits of a town. Pure.
+"""Errors as the real estimator makes them: what it reported on whole ways, drawn again for the
+visits of a town. Pure.
 
-The synthetic vehicle of `agent` errs as the fusion assumes, which flatters it. Here each vehicle of a town is one of
-those of the ways, with all that persists in it (offsets, a tilted sensor, tyres), and each of its visits is one that
-this vehicle made on a road nearly as slippery, excited or not as the town's visit is:
+The synthetic vehicle of `agent` errs as the fusion assumes, which flatters it. Here each vehicle of
+a town is one of those of the ways, with all that persists in it (offsets, a tilted sensor, tyres),
+and each of its visits is one that this vehicle made on a road nearly as slippery, excited or not as
+the town's visit is:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w: forces scale with the grip, so value, interval and grip used do, and ℓ(x) becomes ℓ(x/c)
 
-A pass over the border of a surface is drawn as any other. What all vehicles of one place share is not kept, for each
-visit is drawn by itself: of that the whole ways tell.
+A pass over the border of a surface is drawn as any other. What all vehicles of one place share is
+not kept, for each visit is drawn by itself: of that the whole ways tell.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """Where vehicles truly were, (m,): vehicle, first moment [ns], mean friction, largest share of it used."""
+    """Where vehicles truly were, (m,): vehicle, first moment [ns], mean friction, largest share
+    of it used.
+    """
 
     vehicle: IntArray
     enter: IntArray
@@ -42,7 +46,9 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits of whole ways, (k,): vehicle, true friction, whether they were excited, and what was reported of them."""
+    """Visits of whole ways, (k,): vehicle, true friction, whether they were excited, and what
+    was reported of them.
+    """
 
     vehicle: IntArray
     mu: FloatArray
@@ -51,7 +57,9 @@ class DrivenVisits(NamedTuple):
 
 
 def driven(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
-    """Observations of a way, columns as `end_to_end.read` gives them, beside the truth at the middle of each."""
+    """Observations of a way, columns as `end_to_end.read` gives them, beside the truth at the
+    middle of each.
+    """
     vehicle = observations["vehicle"].astype(np.int64)
     middle = (observations["enter_time"] + observations["leave_time"]) // 2
     order = np.lexsort((truth.enter, truth.vehicle))
@@ -87,7 +95,9 @@ def joined(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def drawn(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """The town's visits with reports of `ways`; each of its `vehicles` is one of theirs, if there are so many."""
+    """The town's visits with reports of `ways`; each of its `vehicles` is one of theirs, if
+    there are so many.
+    """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))
     row = np.empty(len(visits), np.int64)
@@ -104,7 +114,9 @@ def drawn(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> 
 
 
 def _near(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """For each friction one of the NEAREST of `rows`, which are in its order; -1 where there are none."""
+    """For each friction one of the NEAREST of `rows`, which are in its order; -1 where there are
+    none.
+    """
     if not len(rows):
         return np.full(len(mu), -1)
     first = np.clip(np.searchsorted(of[rows], mu) - NEAREST // 2, 0, max(len(rows) - NEAREST, 0))

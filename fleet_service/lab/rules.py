@@ -1,7 +1,8 @@
 """The rules that people would use instead, each a mean and a variance per cell. Pure, compiled.
 
-All of them get what an agent of such a system would send: the *posterior* (m, P) of its own filter, which carries what
-it believed in the cell before. Each lets its variance grow between reports as the fusion's own drift does.
+All of them get what an agent of such a system would send: the *posterior* (m, P) of its own filter,
+which carries what it believed in the cell before. Each lets its variance grow between reports as
+the fusion's own drift does.
 
     newest report         the last posterior
     inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information added up
@@ -51,7 +52,9 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior along the road."""
+    """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior
+    along the road.
+    """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
     out = np.empty((len(vehicle), 2))
@@ -118,7 +121,9 @@ def fuse(
 
 
 def medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
-    """Median of the vehicles' last readings within MEDIAN_MIN, and its standard deviation, (cells,) each."""
+    """Median of the vehicles' last readings within MEDIAN_MIN, and its standard deviation,
+    (cells,) each.
+    """
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
     pair = v.place[rows] * (int(v.vehicle.max(initial=0)) + 1) + v.vehicle[rows]

@@ -1,4 +1,6 @@
-"""How good an answer was: coverage, error, interval score, by the number of excited vehicles. Pure."""
+"""How good an answer was: coverage, error, interval score, by the number of excited vehicles.
+Pure.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,9 @@ LEVELS: Final = np.linspace(0.05, 0.95, 19)
 class Scores:
     """Answers next to the truth, (k,).
 
-    `vehicles` are the distinct excited ones that had been there. `slippery` is the answer's P(slippery), and `crps` its
-    continuous ranked probability score; both NaN where an answer is an interval and no distribution.
+    `vehicles` are the distinct excited ones that had been there. `slippery` is the answer's
+    P(slippery), and `crps` its continuous ranked probability score; both NaN where an answer is an
+    interval and no distribution.
     """
 
     vehicles: IntArray
@@ -59,7 +62,9 @@ def joined(scores: list[Scores]) -> Scores:
 
 
 def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
-    """Distinct excited vehicles that reported each cell until then, and since its surface changed, (CELLS,)."""
+    """Distinct excited vehicles that reported each cell until then, and since its surface
+    changed, (CELLS,).
+    """
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
     rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
     there = np.zeros((CELLS, vehicles), bool)
@@ -81,7 +86,9 @@ def of_intervals(
     rank: FloatArray,
     slippery: FloatArray,
 ) -> Scores:
-    """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which the truth is missed."""
+    """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which
+    the truth is missed.
+    """
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
     nothing: FloatArray = np.full(len(truth), np.nan)
@@ -115,10 +122,11 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
 
 
 def crps_of(belief: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the continuous ranked probability score of beliefs (k, 32) that are flat within each bin, (k,).
+    """Return the continuous ranked probability score of beliefs (k, 32) that are flat within each
+    bin, (k,).
 
-    CRPS = ∫ (F(x) - 1[x ≥ truth])² dx; Gneiting and Raftery (2007), eq. 21. The integral is by the trapezoidal rule on
-    a grid of eight points per bin.
+    CRPS = ∫ (F(x) - 1[x ≥ truth])² dx; Gneiting and Raftery (2007), eq. 21. The integral is by the
+    trapezoidal rule on a grid of eight points per bin.
     """
     fine = np.linspace(mugrid.LOWER, mugrid.UPPER, 8 * mugrid.BINS + 1)
     cdf = np.concatenate([np.zeros((len(belief), 1)), np.cumsum(belief, axis=1)], axis=1)
@@ -158,7 +166,9 @@ def coverage(s: Scores) -> float:
 
 
 def safe(s: Scores) -> float:
-    """Share of the truths above the lower end, on which the deceleration that is called safe at 95 % rests."""
+    """Share of the truths above the lower end, on which the deceleration that is called safe at
+    95 % rests.
+    """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
 
@@ -177,7 +187,9 @@ def by_surface(s: Scores) -> dict[str, float]:
 
 
 def calibration(scores: Sequence[Scores]) -> FloatArray:
-    """P(slippery) in BINS of it: answers, mean of what they give, share of truths that were slippery, (BINS, 3)."""
+    """P(slippery) in BINS of it: answers, mean of what they give, share of truths that were
+    slippery, (BINS, 3).
+    """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU
     place = np.clip((given * BINS).astype(np.int64), 0, BINS - 1)
@@ -187,12 +199,14 @@ def calibration(scores: Sequence[Scores]) -> FloatArray:
 
 
 def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
-    """Return how good P(slippery) is over all answers: `brier`, `log`, `ece`, `missed` and `grip_raised`.
+    """Return how good P(slippery) is over all answers: `brier`, `log`, `ece`, `missed` and
+    `grip_raised`.
 
-    `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al., 2015). `missed` is the
-    share of truly slippery cells given less than MISSED, `grip_raised` that of cells with grip (μ > SURE_GRIP) given
-    more than RAISED. The worst bin of a few ways is no criterion: all cells of a way share one snow, and a map that is
-    calibrated passes it in a third of the campaigns.
+    `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al.,
+    2015). `missed` is the share of truly slippery cells given less than MISSED, `grip_raised` that
+    of cells with grip (μ > SURE_GRIP) given more than RAISED. The worst bin of a few ways is no
+    criterion: all cells of a way share one snow, and a map that is calibrated passes it in a third
+    of the campaigns.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])
@@ -209,12 +223,16 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of truths below the interval: road that is more slippery than the map vouches for."""
+    """Return the share of truths below the interval: road that is more slippery than the map
+    vouches for.
+    """
     return _mean(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of truths above the interval: road with more grip than the map thinks possible."""
+    """Return the share of truths above the interval: road with more grip than the map thinks
+    possible.
+    """
     return _mean(s.rank > 1.0 - ALPHA / 2.0)
 
 
@@ -223,5 +241,7 @@ def _mean(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Share of truths below each of LEVELS, which the levels themselves would be if the beliefs were right."""
+    """Share of truths below each of LEVELS, which the levels themselves would be if the beliefs
+    were right.
+    """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

@@ -1,4 +1,5 @@
-"""Situations in which a map deceives itself: bounds by the hundred, an outage, gentle drivers on ice, a wet curve.
+"""Situations in which a map deceives itself: bounds by the hundred, an outage, gentle drivers on
+ice, a wet curve.
 
 Each is as short as it can be; the truth is known by construction. Pure.
 """
@@ -40,7 +41,9 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 
 def bounded(used: float, path: str) -> float:
-    """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by one path of the wire."""
+    """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by
+    one path of the wire.
+    """
     n = BOUNDED
     nan = float("nan")
     cell = np.full(n, CELL[0])
@@ -101,7 +104,9 @@ def lower_excess() -> float:
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Share of an hour's rows that are fused when they come after an outage, while another vehicle drives on."""
+    """Share of an hour's rows that are fused when they come after an outage, while another
+    vehicle drives on.
+    """
     place = town.build(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)
     visits = town.drive(rng, place, errors, 60)
@@ -116,8 +121,9 @@ def backlog_fused(rng: Generator) -> float:
 
 
 def safe_excess(rng: Generator) -> float:
-    """Safe deceleration less the truth's half an hour after black ice came under drivers who use a fifth of the grip,
-    on a road that was dry for an hour; the weather is known to be FREEZING_C, and nothing falls."""
+    """Safe deceleration less the truth's half an hour after black ice came under drivers who use a
+    fifth of the grip, on a road that was dry for an hour; the weather is known to be FREEZING_C,
+    and nothing falls."""
     seconds: FloatArray = np.concatenate(
         [np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0]
     )
@@ -152,7 +158,9 @@ def _weather(temperature: float) -> Reports:
 
 
 def false_alert(rng: Generator) -> bool:
-    """Whether CARS on winter tyres whom nobody knows, who all take a wet curve gently, make an alert of it."""
+    """Whether CARS on winter tyres whom nobody knows, who all take a wet curve gently, make an
+    alert of it.
+    """
     n = CARS
     who = np.arange(CARS)
     share = rng.uniform(*WINTER.share, n)

@@ -1,8 +1,10 @@
-"""Fleets that are not ours: vehicles of another make, with their own error model, that know only the public contract.
+"""Fleets that are not ours: vehicles of another make, with their own error model, that know only
+the public contract.
 
-Each vehicle has a gain error that is common to its value and to the grip that it reports as used. A scheme that learns
-a correction from both at once sees a relation that is no property of the road. Values have noise that their senders
-state. They send full log-likelihoods and none of the optional columns. Pure.
+Each vehicle has a gain error that is common to its value and to the grip that it reports as used. A
+scheme that learns a correction from both at once sees a relation that is no property of the road.
+Values have noise that their senders state. They send full log-likelihoods and none of the optional
+columns. Pure.
 
 Two drives:
 
@@ -65,7 +67,9 @@ COLD_GAP_S: Final = 5.0
 
 
 class ForeignDrive(NamedTuple):
-    """Visits, the friction of each cell at each visit's road, and the cells' numbers on the grid."""
+    """Visits, the friction of each cell at each visit's road, and the cells' numbers on the
+    grid.
+    """
 
     visits: Visits
     cells: IntArray
@@ -102,7 +106,9 @@ def observe(drive: ForeignDrive) -> Observations:
 
 
 def place_fixes(rng: Generator, place: IntArray) -> IntArray:
-    """Return the cells in which visits to the middles of cells (n,) are reported: fixes err by FIX_STD_M."""
+    """Return the cells in which visits to the middles of cells (n,) are reported: fixes err by
+    FIX_STD_M.
+    """
     offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
     found = place + np.floor(offset / CELL_M).astype(np.int64)
     return np.where(found // LENGTH == place // LENGTH, found, place)
@@ -131,7 +137,9 @@ def take(v: Visits, rows: IntArray) -> Visits:
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
-    """Return the map's scores at the end of an honest drive, whether each cell has an alert, and excited visits."""
+    """Return the map's scores at the end of an honest drive, whether each cell has an alert, and
+    excited visits.
+    """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
@@ -176,9 +184,11 @@ def share_of(cells: BoolArray) -> float:
 
 
 def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
-    """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same fleet drives.
+    """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same
+    fleet drives.
 
-    The changing cells come first; the honest fleet's cells, with its visits for as long, come after them.
+    The changing cells come first; the honest fleet's cells, with its visits for as long, come after
+    them.
     """
     town_mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     changing = CHANGE_CELLS * CHANGE_VISITS * 3
@@ -206,7 +216,8 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
 
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
-    """Return the excited passes of the white road before the alert, and of the dry one after it before its end.
+    """Return the excited passes of the white road before the alert, and of the dry one after it
+    before its end.
 
     Both (CHANGE_CELLS,); NEVER where it did not come.
     """
@@ -240,7 +251,9 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
 
 
 def measure_change(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles of the passes by share of excited visits, and how many cells had no alert."""
+    """Return medians and 95 % quantiles of the passes by share of excited visits, and how many
+    cells had no alert.
+    """
     out: dict[str, float] = {}
     for percent in CHANGE_EXCITED:
         found = [
@@ -257,7 +270,9 @@ def measure_change(seeds: range) -> dict[str, float]:
 
 
 def count_cold(rng: Generator) -> int:
-    """Return how many passes over ice a service that knows nobody needs, by a fleet of the lab's own vehicles."""
+    """Return how many passes over ice a service that knows nobody needs, by a fleet of the lab's
+    own vehicles.
+    """
     n = VEHICLES
     who = np.arange(n)
     mu: FloatArray = np.full(n, WHITE)

@@ -1,8 +1,9 @@
 """A town of roads, cell behind cell, their friction in time, and who drives where and when. Pure.
 
-Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer is a property of
-the place: a few cells hear many excited vehicles, most hear hardly any. Where all do the same they share an error.
-Fixes are noisy, so that a visit is sometimes reported of the cell before or behind.
+Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer
+is a property of the place: a few cells hear many excited vehicles, most hear hardly any. Where all
+do the same they share an error. Fixes are noisy, so that a visit is sometimes reported of the cell
+before or behind.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ _WEST = 11.90
 
 
 def cell_numbers(cells: int = CELLS) -> IntArray:
-    """Quadints of the town's cells, (cells,): each road runs east, the roads lie a few cells apart."""
+    """Quadints of the town's cells, (cells,): each road runs east, the roads lie a few cells
+    apart.
+    """
     x, y = grid.deinterleave(grid.cell_of(_NORTH, _WEST))
     k = np.arange(cells)
     return grid.interleave(x + k % LENGTH, y + 3 * (k // LENGTH))
@@ -57,9 +60,9 @@ def cell_numbers(cells: int = CELLS) -> IntArray:
 
 @dataclass(frozen=True)
 class Town:
-    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,), the minute of
-    each cell's change of surface (cells,), infinite without one, the vehicles' common error by manoeuvre (cells, 4),
-    and what most do there (cells,)."""
+    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,),
+    the minute of each cell's change of surface (cells,), infinite without one, the vehicles' common
+    error by manoeuvre (cells, 4), and what most do there (cells,)."""
 
     mu: FloatArray
     excitement: FloatArray
@@ -110,7 +113,9 @@ def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLE
 
 @dataclass(frozen=True)
 class Visits:
-    """Visits in order of time, (n,): seconds since the start, vehicle, place reported, true μ, excited, reports."""
+    """Visits in order of time, (n,): seconds since the start, vehicle, place reported, true μ,
+    excited, reports.
+    """
 
     seconds: FloatArray
     vehicle: IntArray
@@ -128,8 +133,8 @@ def drive(
 ) -> Visits:
     """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
 
-    Until the minute `acquainted` only the first half of the roads are driven, from then on the other half, if it is not
-    nought: then vehicles know each other, and nobody knows the roads.
+    Until the minute `acquainted` only the first half of the roads are driven, from then on the
+    other half, if it is not nought: then vehicles know each other, and nobody knows the roads.
     """
     vehicles = len(errors.slope)
     model = errors.model

@@ -1,4 +1,6 @@
-"""Areas with data: neighbouring tiles together, with their cells, alerts and the nearest place name."""
+"""Areas with data: neighbouring tiles together, with their cells, alerts and the nearest place
+name.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ MOST: Final = 100
 
 
 def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
-    """Return the areas: `name` (empty if none is near), `box`, `latitude`, `longitude`, `cells` and `alerts`.
+    """Return the areas: `name` (empty if none is near), `box`, `latitude`, `longitude`, `cells` and
+    `alerts`.
 
     Args:
         world: the mirrored map.

@@ -72,7 +72,8 @@ def feature(text: str) -> int:
 
 
 def _interval(text: str, now: int) -> tuple[int, int | None]:
-    """Return the begin [ns] of the selected observations, and the moment [ns] of the map (None for now).
+    """Return the begin [ns] of the selected observations, and the moment [ns] of the map (None for
+    now).
 
     RFC 3339: an instant, or an interval of which one side may be open (`..` or nothing).
     """

@@ -1,7 +1,9 @@
-"""Base map below the roads: vector or raster tiles of a file, served here, or raster tiles from an address.
+"""Base map below the roads: vector or raster tiles of a file, served here, or raster tiles from an
+address.
 
-Files are MBTiles 1.3 (github.com/mapbox/mbtiles-spec: a table of SQLite, rows counted from the south) with images or
-with vector tiles, and PMTiles 3 with vector tiles. The layers of vector tiles are those of OpenMapTiles or Protomaps.
+Files are MBTiles 1.3 (github.com/mapbox/mbtiles-spec: a table of SQLite, rows counted from the
+south) with images or with vector tiles, and PMTiles 3 with vector tiles. The layers of vector tiles
+are those of OpenMapTiles or Protomaps.
 """
 
 from __future__ import annotations
@@ -105,7 +107,9 @@ class _Pmtiles:
 
 
 class BaseMap(NamedTuple):
-    """Address of the tiles with {z}, {x} and {y}, its zoom levels, the file, if there is one, and who made the map."""
+    """Address of the tiles with {z}, {x} and {y}, its zoom levels, the file, if there is one,
+    and who made the map.
+    """
 
     address: str
     zooms: tuple[int, int] = ZOOMS

@@ -1,8 +1,9 @@
 """Colours of cells: fewer colours for less certain cells, and none for a mere bound.
 
-Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu if its interval is narrow, two if it
-is middling, one grey if it is wide. A cell that is slippery even at the upper end keeps its colour, however wide, and
-one that is more likely slippery than not is never grey or hollow. The colours are those of `schemas.runtime.palette`.
+Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu if its interval
+is narrow, two if it is middling, one grey if it is wide. A cell that is slippery even at the upper
+end keeps its colour, however wide, and one that is more likely slippery than not is never grey or
+hollow. The colours are those of `schemas.runtime.palette`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from schemas.runtime.palette import (
 )
 from schemas.thresholds import SLIPPERY_MU
 
-NARROW: Final = 0.25  # width of the interval below which four classes are told apart: half of it is less than a class
+# width of the interval below which four classes are told apart: half of it is less than a class
+NARROW: Final = 0.25
 MIDDLING: Final = 0.6  # ... two
 EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # ice | snow | wet | dry (Pacejka 2012, ch. 1)
 KNOWN_SLIPPERY: Final = 0.5  # of P(mu < SLIPPERY_MU), above which a place is never drawn as unknown
@@ -30,7 +32,9 @@ DARK_ALERT: Final = "#ff5c7a"
 
 
 def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) -> str:
-    """Return the colour of a measured mu with its 5 % and 95 % quantiles and its probability of being slippery."""
+    """Return the colour of a measured mu with its 5 % and 95 % quantiles and its probability of
+    being slippery.
+    """
     width = round(upper - lower, 6)  # a step of the records is .005
     if upper < SLIPPERY_MU or width < NARROW:
         return FOUR[sum(mu >= edge for edge in EDGES)]

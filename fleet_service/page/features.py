@@ -1,7 +1,9 @@
-"""Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection: `grip`, the map's cells. Pure.
+"""Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection: `grip`, the
+map's cells. Pure.
 
-A feature is a cell and heading. Its geometry is the quarter of the cell on the side of the heading. A bound has no
-`mu`, and unknown values are null or absent. The time of a feature is that of its newest observation.
+A feature is a cell and heading. Its geometry is the quarter of the cell on the side of the heading.
+A bound has no `mu`, and unknown values are null or absent. The time of a feature is that of its
+newest observation.
 """
 
 from __future__ import annotations
@@ -27,9 +29,12 @@ FEW = 1000
 MOST = 10_000
 TITLE: Final = "Grip of the road, measured by vehicles"
 ABOUT: Final = (
-    "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % quantiles. basis: "
-    "measured, or bound where only a lower bound is known; a bound has no mu. Where nobody was there is no feature: "
-    "that is unknown, not dry. datetime: an instant is the map as it was then; of an interval, the map as it was at "
+    "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % "
+    "quantiles. basis: "
+    "measured, or bound where only a lower bound is known; a bound has no mu. Where nobody was "
+    "there is no feature: "
+    "that is unknown, not dry. datetime: an instant is the map as it was then; of an interval, the "
+    "map as it was at "
     "its end, and of that what was observed since its begin."
 )
 # Columns that are not told: the geometry says them.
@@ -118,8 +123,8 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
 
 
 def schema(base: str) -> dict[str, Any]:
-    """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds knows `mu` is a
-    number."""
+    """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds
+    knows `mu` is a number."""
     columns = {
         f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS
     }

@@ -43,7 +43,8 @@ class Files:
         self._files = {name: _packed(name, text) for name, text in plain.items()}
 
     def texts(self, accepted: str) -> str:
-        """Return the name of the text table in the browser's first available language; English otherwise.
+        """Return the name of the text table in the browser's first available language; English
+        otherwise.
 
         Args:
             accepted: the header `Accept-Language`, the best language first.
@@ -53,7 +54,9 @@ class Files:
         return next((name for name in names if name in self._files), ENGLISH)
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:
-        """Return a file in a form the browser accepts, or "not modified"; None if there is no such file."""
+        """Return a file in a form the browser accepts, or "not modified"; None if there is no
+        such file.
+        """
         file = self._files.get(name)
         if file is None:
             return None

@@ -1,4 +1,6 @@
-"""Metrics of services for the health view, read over HTTP because a reader does not receive them over Zenoh."""
+"""Metrics of services for the health view, read over HTTP because a reader does not receive them
+over Zenoh.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,9 @@ class ServiceHealth:
 
 
 def values(text: str) -> dict[str, dict[str, float]]:
-    """Return the values of an OpenMetrics text by name and label; "" is the label of a single value."""
+    """Return the values of an OpenMetrics text by name and label; "" is the label of a single
+    value.
+    """
     found: dict[str, dict[str, float]] = {}
     for line in text.splitlines():
         match = _LINE.fullmatch(line)

@@ -1,8 +1,8 @@
 """Bundler of the page's ES modules into one script. Pure.
 
-Browsers open six connections per host, so two dozen modules delay the first paint. In the bundle each module is a
-function that is called once, after the modules it imports, and returns its exports. There is no build step: the server
-bundles when it starts.
+Browsers open six connections per host, so two dozen modules delay the first paint. In the bundle
+each module is a function that is called once, after the modules it imports, and returns its
+exports. There is no build step: the server bundles when it starts.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
         main: the module that is run, and that no module imports.
 
     Raises:
-        ValueError: an import or export has another form than `import { a, b } from "./name.js";`, or there is a circle.
+        ValueError: an import or export has another form than `import { a, b } from "./name.js";`,
+            or there is a circle.
         KeyError: a module is missing.
     """
     wanted: defaultdict[str, set[str]] = defaultdict(set)

@@ -1,7 +1,7 @@
 """Past of the map: available moments, a past map, a cell's history.
 
-The last minutes come from memory, earlier moments from the snapshots of a service. Snapshots hold public cells only, so
-this data is as public as the map itself.
+The last minutes come from memory, earlier moments from the snapshots of a service. Snapshots hold
+public cells only, so this data is as public as the map itself.
 """
 
 from __future__ import annotations

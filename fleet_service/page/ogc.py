@@ -77,7 +77,9 @@ class FeatureRoutes:
         return JSONResponse(features.api(_base(request)), media_type=features.OPENAPI)
 
     async def items(self, request: Request) -> Response:
-        """Return features ordered by place, from `after` on; `next` continues there, whatever changes meanwhile."""
+        """Return features ordered by place, from `after` on; `next` continues there, whatever
+        changes meanwhile.
+        """
         question = asked.features(request, time.time_ns())
         if not self._reader.is_served:
             message = "no service answers for the map; that is no empty map\n"
@@ -165,7 +167,9 @@ class FeatureRoutes:
 
 
 def wants_json(request: Request) -> bool:
-    """Return True for a program, which gets the landing page of the interface and not the map for people."""
+    """Return True for a program, which gets the landing page of the interface and not the map
+    for people.
+    """
     form = request.query_params.get("f")
     if form is not None:
         return form == "json"

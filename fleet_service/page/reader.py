@@ -1,5 +1,5 @@
-"""Subscriber of the page, with the rights of a reader: receives tiles and alerts, queries what it missed, and tracks
-served regions.
+"""Subscriber of the page, with the rights of a reader: receives tiles and alerts, queries what it
+missed, and tracks served regions.
 
 It publishes nothing. If the access list hides tokens, it works without them.
 """
@@ -103,7 +103,9 @@ class Reader:
         return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
 
     def regions(self) -> list[dict[str, Any]]:
-        """Return regions with cells: their box, whether a service answers, and since when none does."""
+        """Return regions with cells: their box, whether a service answers, and since when none
+        does.
+        """
         return [
             {
                 "region": grid.quadkey(region, grid.REGION_ZOOM),
@@ -118,7 +120,9 @@ class Reader:
         ]
 
     def _note_fallen(self, services: tokens.PresenceTracker) -> None:
-        """Record regions that lost their service and have no known cell; others are found through their cells."""
+        """Record regions that lost their service and have no known cell; others are found
+        through their cells.
+        """
         here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
@@ -165,7 +169,9 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """Query everything that existed before this page. It subscribed first, so nothing is missed in between."""
+        """Query everything that existed before this page. It subscribed first, so nothing is
+        missed in between.
+        """
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
                 self._world.take_tile(tile, table, time.time())
@@ -215,10 +221,12 @@ class Reader:
         return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
-        """Return True if a service answers for any place: by its token, or by its answers if tokens are hidden.
+        """Return True if a service answers for any place: by its token, or by its answers if tokens
+        are hidden.
 
-        A router matches only services that answer for all of a key expression. A service of the whole world is found by
-        any tile, a service of a region by the known regions, and before any region is known by its answer.
+        A router matches only services that answer for all of a key expression. A service of the
+        whole world is found by any tile, a service of a region by the known regions, and before any
+        region is known by its answer.
         """
         if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True

@@ -1,4 +1,6 @@
-"""Recent moments of the live map, kept in memory: the past of the first hour, before any snapshot exists. Pure."""
+"""Recent moments of the live map, kept in memory: the past of the first hour, before any
+snapshot exists. Pure.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,17 @@ THINNED_S: Final = 60
 
 
 class RecentMoments:
-    """Records of all tiles at moments [s since 1970], oldest first; arrays are shared, never copied."""
+    """Records of all tiles at moments [s since 1970], oldest first; arrays are shared, never
+    copied.
+    """
 
     def __init__(self) -> None:
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
 
     def keep(self, now: float, tiles: Mapping[int, Records]) -> None:
-        """Keep the tiles of a moment, unless the last one is too near or nothing has changed since."""
+        """Keep the tiles of a moment, unless the last one is too near or nothing has changed
+        since.
+        """
         moment = int(now)
         last = next(reversed(self._kept), None)
         if not tiles or (

@@ -1,8 +1,9 @@
-"""Cells of the map as 13-byte records, one block per tile, for the page. When zoomed out, worst first. Pure.
+"""Cells of the map as 13-byte records, one block per tile, for the page. When zoomed out, worst
+first. Pure.
 
-A block is a head of 32 bytes followed by its columns, little-endian, so that a browser can use them without copying:
-`last` (4 bytes per cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`, `basis`, `vehicles`, `unknown` (1 each).
-It ends at a multiple of four bytes.
+A block is a head of 32 bytes followed by its columns, little-endian, so that a browser can use them
+without copying: `last` (4 bytes per cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`,
+`basis`, `vehicles`, `unknown` (1 each). It ends at a multiple of four bytes.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from schemas import grid
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 
-# last: newest observation [s since 1970]; place: cell within the tile · 4 + sector; mu, lower, upper: in MU_STEPS a
-# unit, 255 is 'no number'; slippery: P(mu < .4) in SHARE_STEPS; vehicles: 255 is '255 or more'; unknown: share of what
-# is below a place that was not measured.
+# last: newest observation [s since 1970]; place: cell within the tile · 4 + sector; mu, lower,
+# upper: in MU_STEPS a unit, 255 is 'no number'; slippery: P(mu < .4) in SHARE_STEPS; vehicles: 255
+# is '255 or more'; unknown: share of what is below a place that was not measured.
 RECORD: Final = np.dtype(
     [
         ("last", "<u4"),
@@ -124,10 +125,12 @@ def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
 
 
 def aggregate_worst(records: Records, level: int) -> Records:
-    """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings together.
+    """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings
+    together.
 
-    An ancestor has the minimum of each quantile of the measured cells below it, and so the largest P(slippery): no cell
-    below is more slippery than its ancestor. `unknown` is the share of cells and headings below with bounds only.
+    An ancestor has the minimum of each quantile of the measured cells below it, and so the largest
+    P(slippery): no cell below is more slippery than its ancestor. `unknown` is the share of cells
+    and headings below with bounds only.
     """
     if not len(records):
         return records

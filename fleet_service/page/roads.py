@@ -1,7 +1,8 @@
-"""Roads of the page: lines and place names of a GeoJSON file, or lines learned from the cells that vehicles visited.
+"""Roads of the page: lines and place names of a GeoJSON file, or lines learned from the cells that
+vehicles visited.
 
-The page draws one ribbon per direction along each line. Lines of a file have names; learned lines follow the centres
-of neighbouring cells of one heading, smoothed. Pure but for reading the file.
+The page draws one ribbon per direction along each line. Lines of a file have names; learned lines
+follow the centres of neighbouring cells of one heading, smoothed. Pure but for reading the file.
 """
 
 from __future__ import annotations
@@ -117,7 +118,9 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _chains(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[int, int]]]:
-    """Yield chains of cells in the order of travel: each cell goes on to the nearest one ahead that has no other."""
+    """Yield chains of cells in the order of travel: each cell goes on to the nearest one ahead
+    that has no other.
+    """
     here = set(cells)
     dx, dy = _STEP[heading]
     offsets = sorted(
@@ -147,7 +150,9 @@ def _chains(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[i
 
 
 def _smooth_chain(chain: FloatArray) -> list[list[float]]:
-    """Return longitude and latitude [deg] of a chain of cells (n, 2), each the mean of its neighbours."""
+    """Return longitude and latitude [deg] of a chain of cells (n, 2), each the mean of its
+    neighbours.
+    """
     half = SMOOTHED // 2
     padded = (
         np.concatenate([np.repeat(chain[:1], half, 0), chain, np.repeat(chain[-1:], half, 0)]) + 0.5

@@ -1,6 +1,7 @@
 """Grip along a route: stretches of the same cell and heading in order, measured or not.
 
-An unmeasured part is a stretch of its own without a number. It is neither dry nor slippery, and it is counted.
+An unmeasured part is a stretch of its own without a number. It is neither dry nor slippery, and it
+is counted.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ Points = Sequence[tuple[float, float]]
 
 
 def profile(points: Points, table: pa.Table) -> dict[str, Any]:
-    """Return the stretches along a route of (longitude, latitude) [deg], with the cells that a service returned.
+    """Return the stretches along a route of (longitude, latitude) [deg], with the cells that a
+    service returned.
 
     Returns:
-        `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis and, where measured,
-        mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by metres of sight; `worst`: index of the least
-        lower end, or None.
+        `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis
+        and, where measured, mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by metres
+        of sight; `worst`: index of the least lower end, or None.
 
     Raises:
         InputError: the route is too long or not valid.
@@ -72,7 +74,9 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
 
 
 def safe_speeds(mu_lower: float) -> dict[str, float]:
-    """Return the speed [m/s] from which a car stops with the lower end of grip, by metres of sight."""
+    """Return the speed [m/s] from which a car stops with the lower end of grip, by metres of
+    sight.
+    """
     return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
 
 
@@ -87,7 +91,9 @@ def _described(cell: dict[str, Any]) -> dict[str, Any]:
 
 
 def _samples(points: Points) -> tuple[Any, Any, Any, Any]:
-    """Return longitude and latitude [deg], metres along and heading sector of each step of the route."""
+    """Return longitude and latitude [deg], metres along and heading sector of each step of the
+    route.
+    """
     corners = np.array(points)
     if corners.ndim != 2 or len(corners) < 2:
         raise InputError("route", "needs two points", "click two or more")

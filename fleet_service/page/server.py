@@ -1,4 +1,6 @@
-"""Process of the page: a reader's session in a thread and a web server on loopback, until a signal."""
+"""Process of the page: a reader's session in a thread and a web server on loopback, until a
+signal.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ class PageSettings:
     Attributes:
         connection: how to reach the router.
         host, port: where to listen; port 0 selects a free one.
-        names: host names under which a proxy forwards requests; empty and not on loopback accepts any.
+        names: host names under which a proxy forwards requests; empty and not on loopback accepts
+            any.
         archive: of the service, for the past; None without one.
         metrics: addresses of services' metrics, for the health view.
         overlay: Parquet of cell, sector, mu to draw over the map.
@@ -122,7 +125,8 @@ def update_publication(
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.is_served or (world.alerts_heard == seen and not file.is_due):
-            continue  # where no service speaks nothing ends, and the publication's time says how old it is
+            # where no service speaks nothing ends, and the publication's time says how old it is
+            continue
         seen = world.alerts_heard
         try:
             file.keep_up(world.stretches(), reader.is_heard)

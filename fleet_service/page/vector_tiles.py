@@ -1,8 +1,10 @@
-"""Vector tiles: an encoder of Mapbox Vector Tiles 2.1, and a reader of PMTiles 3. Pure but for the reader's file.
+"""Vector tiles: an encoder of Mapbox Vector Tiles 2.1, and a reader of PMTiles 3. Pure but for the
+reader's file.
 
-The encoder is for small generated maps such as the demo's town; it writes the layers that the page's base map draws.
-The reader serves an operator's own extract, one file, without a server of tiles.
-References: github.com/mapbox/vector-tile-spec/tree/master/2.1, github.com/protomaps/PMTiles/blob/main/spec/v3.
+The encoder is for small generated maps such as the demo's town; it writes the layers that the
+page's base map draws. The reader serves an operator's own extract, one file, without a server of
+tiles. References: github.com/mapbox/vector-tile-spec/tree/master/2.1,
+github.com/protomaps/PMTiles/blob/main/spec/v3.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ _MOST_DIRECTORY: Final = 16 << 20
 
 
 class TileShape(NamedTuple):
-    """Shape of a layer: points, lines or rings in units of the tile (EXTENT across, y down), and its tags."""
+    """Shape of a layer: points, lines or rings in units of the tile (EXTENT across, y down), and
+    its tags.
+    """
 
     kind: int
     parts: Sequence[Sequence[tuple[int, int]]]
@@ -175,7 +179,9 @@ class PmtilesFile:
 
 
 def _entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
-    """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is a leaf directory."""
+    """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is
+    a leaf directory.
+    """
     numbers = _varints(directory)
     count = next(numbers)
     ids = []
@@ -207,7 +213,9 @@ def _varints(data: bytes) -> Iterator[int]:
 
 
 def _hilbert(zoom: int, x: int, y: int) -> int:
-    """Return the number of a tile: those of all smaller zooms, then the place on the Hilbert curve."""
+    """Return the number of a tile: those of all smaller zooms, then the place on the Hilbert
+    curve.
+    """
     found: int = (4**zoom - 1) // 3
     side = 1 << zoom >> 1
     while side:

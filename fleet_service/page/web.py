@@ -146,7 +146,9 @@ class Routes:
         )
 
     async def roads(self, _: Request) -> Response:
-        """Return the lines along which ribbons are drawn: of the operator's file, or learned from the cells."""
+        """Return the lines along which ribbons are drawn: of the operator's file, or learned
+        from the cells.
+        """
         if self._of.roads is not None:
             return JSONResponse(self._of.roads.as_json() | {"learned": False})
         lines = await run_in_threadpool(lambda: learned_lines(*self._of.world.places()))
@@ -181,7 +183,9 @@ class Routes:
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
-        """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed cells too."""
+        """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed
+        cells too.
+        """
         wanted = asked.tiles(request)
         level = asked.level(request)
         at = asked.moment(request)
@@ -316,7 +320,8 @@ class Guarded:
         self._hosts = hosts
         pictures = f"'self' data: {origin(base_map or '')}".rstrip()
         policy = (
-            f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self'; "
+            f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; "
+            "connect-src 'self'; "
             "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
         self._headers = [

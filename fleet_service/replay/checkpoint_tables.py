@@ -1,6 +1,8 @@
-"""Lossless conversion of a fusion to Arrow tables and back, so that a restart needs no complete replay.
+"""Lossless conversion of a fusion to Arrow tables and back, so that a restart needs no complete
+replay.
 
-The caller stores the tables and decides which rows of the log are newer (`received_at`); this module does no I/O.
+The caller stores the tables and decides which rows of the log are newer (`received_at`); this
+module does no I/O.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Return the complete state of a fusion, one table per name; columns of different length are stored as one list
-    each."""
+    """Return the complete state of a fusion, one table per name; columns of different length are
+    stored as one list each."""
     out = {}
     for name, columns in image_of(fusion).items():
         arrays = [_to_list(column) for column in columns.values()]
@@ -36,7 +38,9 @@ def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
 
 
 def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
-    """Return the column that a list holds; a view if Arrow's own conversion would import another library."""
+    """Return the column that a list holds; a view if Arrow's own conversion would import another
+    library.
+    """
     whole = (
         column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
     )  # which copies what is one piece

@@ -1,12 +1,13 @@
-"""Checkpoints: state of a service when everything up to a segment was on disk; a restart replays the rest.
+"""Checkpoints: state of a service when everything up to a segment was on disk; a restart replays
+the rest.
 
     checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that it includes
     checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it includes
 
-A folder appears when it is complete. Compiled code follows the numbers in a checkpoint without checks, so nothing of it
-is used before all digests are verified. A checkpoint with which a service died several times shortly after the start is
-not tried again. The log is the authority: a checkpoint that is missing, damaged or of another version only costs the
-time of a replay.
+A folder appears when it is complete. Compiled code follows the numbers in a checkpoint without
+checks, so nothing of it is used before all digests are verified. A checkpoint with which a service
+died several times shortly after the start is not tried again. The log is the authority: a
+checkpoint that is missing, damaged or of another version only costs the time of a replay.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Replay of an archive: the batches that a service holds and the beliefs of its fusion, now or at a past moment."""
+"""Replay of an archive: the batches that a service holds and the beliefs of its fusion, now or
+at a past moment.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,7 @@ class Begin(NamedTuple):
 def restore_streams(
     root: Path,
     streams: SequenceTrackers,
-    begin: Begin = Begin(),
+    begin: Begin = Begin(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
 ) -> None:
     """Record every archived batch as admitted, file by file.
@@ -106,11 +108,12 @@ def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
 
 
 class Since(NamedTuple):
-    """Selection of a replay: from a position in the log and a day on, received until `until` [ns], near `box` [deg].
+    """Selection of a replay: from a position in the log and a day on, received until `until` [ns],
+    near `box` [deg].
 
-    Cells do not depend on each other once weights are known, so cells well inside a box get the same belief as in a
-    complete replay. Of compacted files that extend beyond the position, the batches in `known` are left out. More rows
-    than `most` are an error.
+    Cells do not depend on each other once weights are known, so cells well inside a box get the
+    same belief as in a complete replay. Of compacted files that extend beyond the position, the
+    batches in `known` are left out. More rows than `most` are an error.
     """
 
     begin: Begin = Begin()
@@ -120,7 +123,9 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """Return the box with twice the margin; zones that touch it have the files with the rows."""
+        """Return the box with twice the margin; zones that touch it have the files with the
+        rows.
+        """
         if self.box is None:
             return None
         west, south, east, north = self.box
@@ -174,7 +179,8 @@ def past_fusion(
     most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
-    """Return the fusion of a service that had received everything until a moment [ns], near a box [deg].
+    """Return the fusion of a service that had received everything until a moment [ns], near a box
+    [deg].
 
     The object that `listener` makes for it is called with the fused observations.
 
@@ -192,7 +198,8 @@ def past_fusion(
 
 
 def first_day(root: Path) -> int | None:
-    """Return the first day that matters to a service: layout.MAP_DAYS before the last day with rows.
+    """Return the first day that matters to a service: layout.MAP_DAYS before the last day with
+    rows.
 
     Older batches are not sent again (ServiceConfig.oldest_s), and they do not show in the map.
     """
@@ -209,7 +216,8 @@ def replay(
     damaged: Damaged = skip_damaged,
     heard: Heard = nobody,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time, with the weights that were used; yield once per epoch.
+    """Replay the archive into `fusion` in order of time, with the weights that were used; yield
+    once per epoch.
 
     One day is read at a time, a large one in parts, so that memory does not grow with the archive.
 
@@ -294,10 +302,11 @@ def _fuse_epochs(
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
-    """Yield the rows of a listing in chunks of about CHUNK_ROWS, each later than the one before and cut between epochs.
+    """Yield the rows of a listing in chunks of about CHUNK_ROWS, each later than the one before and
+    cut between epochs.
 
-    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are numbers. If the number of rows
-    is not bounded, a part is read while the one before is used.
+    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are numbers.
+    If the number of rows is not bounded, a part is read while the one before is used.
 
     Raises:
         InputError: there are more than `most` rows.
@@ -309,8 +318,8 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
 
 
 def _ahead(parts: Iterator[_Held]) -> Iterator[_Held]:
-    """Yield the same parts, each made in a thread while the one before is used: reading is a third of a start's
-    time."""
+    """Yield the same parts, each made in a thread while the one before is used: reading is a third
+    of a start's time."""
     with ThreadPoolExecutor(1, "reads ahead") as thread:
         coming = thread.submit(next, parts, None)
         while (part := coming.result()) is not None:
@@ -408,8 +417,8 @@ class _Held:
 
 
 def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Return times from `low` to `high` [ns], between epochs, with about `most` rows between two if rows are even in
-    time."""
+    """Return times from `low` to `high` [ns], between epochs, with about `most` rows between two if
+    rows are even in time."""
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))
     return [low + int(part) * EPOCH_NS for part in np.linspace(0, epochs, parts + 1)]
@@ -422,7 +431,8 @@ def _with_numbers(table: pa.Table) -> pa.Table:
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
-    """Return the maximum number of rows that `past` would read, by footers alone; counting stops beyond `most`.
+    """Return the maximum number of rows that `past` would read, by footers alone; counting stops
+    beyond `most`.
 
     Raises:
         OSError: the archive cannot be read.
@@ -442,7 +452,9 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
 
 
 def _rows_of(path: Path, box: Box | None = None) -> int:
-    """Return the rows of a file by its footer, of row groups near a box; 0 if it cannot be read or does not exist."""
+    """Return the rows of a file by its footer, of row groups near a box; 0 if it cannot be read
+    or does not exist.
+    """
     try:
         footer = pq.read_metadata(path)
     except (OSError, pa.ArrowInvalid):

@@ -48,8 +48,8 @@ class Restart(NamedTuple):
 
 
 def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
-    """Begin from the archive in a folder; `beside` names additional tables that the service stored with those of
-    `image_of`."""
+    """Begin from the archive in a folder; `beside` names additional tables that the service stored
+    with those of `image_of`."""
     refused = 0
     for path in checkpoints.newest(root):
         try:

@@ -1,8 +1,9 @@
 """Ownership of an archive: lease, bucket replica and fence of former owners.
 
-One service at a time owns an archive. `ownership` locks the folder, waits for the `lease` of the bucket, lets the
-`replica` make folder and bucket equal, and puts a `fence` before it serves. `archive/` knows nothing of this room: the
-segment log calls `BucketReplica.upload_segments` through a callback.
+One service at a time owns an archive. `ownership` locks the folder, waits for the `lease` of the
+bucket, lets the `replica` make folder and bucket equal, and puts a `fence` before it serves.
+`archive/` knows nothing of this room: the segment log calls `BucketReplica.upload_segments` through
+a callback.
 
 **States of one service.**
 
@@ -24,7 +25,8 @@ segment log calls `BucketReplica.upload_segments` through a callback.
 | holding, silent | a higher number exists, or a successor's tokens appear while silent | lost | stop |
 | holding, silent | the service stops or hands over | released | write `released`, for any or for the named standby |
 
-**Invariants.** (1) At most one service is in `holding` with a right to acknowledge. (2) Every acknowledged row is in
-the bucket before the next owner lists it. (3) Objects of a former owner that are not in the fence count for no reader,
-and no sender was told that they were safe. The argument for (1) and (2) is in `lease`, that for (3) in `fence`.
+**Invariants.** (1) At most one service is in `holding` with a right to acknowledge. (2) Every
+acknowledged row is in the bucket before the next owner lists it. (3) Objects of a former owner that
+are not in the fence count for no reader, and no sender was told that they were safe. The argument
+for (1) and (2) is in `lease`, that for (3) in `fence`.
 """

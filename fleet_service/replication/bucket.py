@@ -1,6 +1,8 @@
-"""Object storage by obstore: S3 and compatible, GCS, Azure. Every request ends, and no error shows a credential.
+"""Object storage by obstore: S3 and compatible, GCS, Azure. Every request ends, and no error shows
+a credential.
 
-An object is either complete or absent, and durable when its put has returned. A put that timed out may have succeeded.
+An object is either complete or absent, and durable when its put has returned. A put that timed out
+may have succeeded.
 """
 
 from __future__ import annotations
@@ -96,7 +98,8 @@ class ObjectBucket:
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
-        """Put an object that must be new or hold these very bytes already, because a put that timed out had succeeded.
+        """Put an object that must be new or hold these very bytes already, because a put that timed
+        out had succeeded.
 
         Raises:
             CopyError: as for `put`, or the object has other content.
@@ -194,7 +197,7 @@ class ObjectBucket:
 
 
 def reason(error: BaseException) -> str:
-    """Return the first words of an error, without headers, response body and duration, so that the same problem gives
-    the same line."""
+    """Return the first words of an error, without headers, response body and duration, so that the
+    same problem gives the same line."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return _TOOK.sub("", line.partition("<")[0]).strip()[:_TEXT]

@@ -3,10 +3,11 @@
     fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest counts
     ARCHIVE/term            the epoch of the service that has the folder
 
-An object counts if it has the term's epoch or a later one, if the fence lists it, or if its name has no epoch. The list
-is made after no former owner can acknowledge any more, and before anything is acknowledged in the new term. A service
-that was frozen and wakes may upload more. Such objects have an older epoch and are not on the list. They were never
-acknowledged, their senders send them again, and they do not count for any later reader of the bucket.
+An object counts if it has the term's epoch or a later one, if the fence lists it, or if its name
+has no epoch. The list is made after no former owner can acknowledge any more, and before anything
+is acknowledged in the new term. A service that was frozen and wakes may upload more. Such objects
+have an older epoch and are not on the list. They were never acknowledged, their senders send them
+again, and they do not count for any later reader of the bucket.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Fence(NamedTuple):
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Write the fence; each turn has a name of its own, so that a delayed upload never replaces a later one.
+    """Write the fence; each turn has a name of its own, so that a delayed upload never replaces a
+    later one.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.

@@ -3,27 +3,30 @@
     lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the highest number holds
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
-A service takes over by creating the next number, which only one can do. It renews by writing its own number again with
-the next turn, and then checking that no higher number exists. Clocks are not compared.
+A service takes over by creating the next number, which only one can do. It renews by writing its
+own number again with the next turn, and then checking that no higher number exists. Clocks are not
+compared.
 
-Why nothing acknowledged is lost. Let A hold, and let B create the next number at T. A acknowledges only what is in the
-bucket already, and only within `lease_s / 2` after it *began* a valid renewal. A valid renewal saw no higher number, so
-it began before T. B takes over when it has seen the same turn for `lease_s` (or for HINT of it, when A's token fell):
-then A's last renewal began before B saw it first, and A's time was over before T. If the turn has changed after T, a
-renewal landed in between, and B waits for `lease_s / 2` more. Only then B lists the bucket: everything that A
-acknowledged is there. An acknowledgement that A's network delivers later is still true. If A was frozen and uploads
-after the listing, its files have an older epoch and are not in B's fence (`archive.terms`): they do not count, and A
-acknowledged none of them. A deletes only after it uploaded the replacement and saw no higher number, so B finds the
-replacement.
+Why nothing acknowledged is lost. Let A hold, and let B create the next number at T. A acknowledges
+only what is in the bucket already, and only within `lease_s / 2` after it *began* a valid renewal.
+A valid renewal saw no higher number, so it began before T. B takes over when it has seen the same
+turn for `lease_s` (or for HINT of it, when A's token fell): then A's last renewal began before B
+saw it first, and A's time was over before T. If the turn has changed after T, a renewal landed in
+between, and B waits for `lease_s / 2` more. Only then B lists the bucket: everything that A
+acknowledged is there. An acknowledgement that A's network delivers later is still true. If A was
+frozen and uploads after the listing, its files have an older epoch and are not in B's fence
+(`archive.terms`): they do not count, and A acknowledged none of them. A deletes only after it
+uploaded the replacement and saw no higher number, so B finds the replacement.
 
-Why nothing is doubled. The files that count are one set, which B reads completely before it admits anything. A batch
-that A archived and did not acknowledge is known to B and acknowledged again. Rows of A outside this set are sent again
-and admitted once. A's folder is synchronised with the bucket before A serves again.
+Why nothing is doubled. The files that count are one set, which B reads completely before it admits
+anything. A batch that A archived and did not acknowledge is known to B and acknowledged again. Rows
+of A outside this set are sent again and admitted once. A's folder is synchronised with the bucket
+before A serves again.
 
 A machine that was suspended finds its lease expired (`elapsed_seconds`).
 
-Not covered: a machine whose elapsed-time clock runs at less than half the speed of another's, or stops while it is
-migrated between hosts, and a bucket without read-after-write consistency.
+Not covered: a machine whose elapsed-time clock runs at less than half the speed of another's, or
+stops while it is migrated between hosts, and a bucket without read-after-write consistency.
 """
 
 from __future__ import annotations
@@ -49,7 +52,8 @@ log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
 HOLDER: Final = "holder.json"  # of an archive: who it is, over restarts
 TURNS: Final = 6  # in the time of a lease
-HINT: Final = 0.6  # of it, after which one whose token fell is followed: more than the half in which it acknowledges
+# of it, after which one whose token fell is followed: more than the half in which it acknowledges
+HINT: Final = 0.6
 # between two times that a standby gets what is new, so that little is left when it must
 AHEAD_S: Final = 10.0
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
@@ -91,7 +95,9 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Questions of a waiting service: whether it is reachable, and whether the holder's token is active."""
+    """Questions of a waiting service: whether it is reachable, and whether the holder's token is
+    active.
+    """
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
     stands: Callable[[str], bool]  # whether a service's token stands
@@ -103,7 +109,8 @@ class Lease:
     """Lease of one archive's copy; `wait` for it, `keep` it, `release` it.
 
     Args:
-        holder: identity of this folder, see `holder_of`; this process has it locked, so no other start of it runs.
+        holder: identity of this folder, see `holder_of`; this process has it locked, so no other
+            start of it runs.
         bucket: of the copy.
         service: its name.
         lease_s: time after which a lease that is not renewed may be taken.
@@ -112,7 +119,8 @@ class Lease:
         lost: True if another service has it.
         service: its name.
         serves: returns True if the service works; one that reaches no router must be replaced.
-        succeeds: True if another folder had it before: this folder may hold files that do not count.
+        succeeds: True if another folder had it before: this folder may hold files that do not
+            count.
     """
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
@@ -130,7 +138,9 @@ class Lease:
 
     @property
     def term(self) -> Term:
-        """Return the lease number (1 for the first holder) and the epoch used in this holder's file names."""
+        """Return the lease number (1 for the first holder) and the epoch used in this holder's
+        file names.
+        """
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 
     @property
@@ -140,7 +150,9 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0 or less: not now."""
+        """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0
+        or less: not now.
+        """
         return (
             0.0
             if self.lost or self._mine is None
@@ -153,7 +165,8 @@ class Lease:
         return self.left_s > 0.0
 
     def assert_not_superseded(self) -> None:
-        """Check that no other service has taken over. A later successor then finds everything uploaded until now.
+        """Check that no other service has taken over. A later successor then finds everything
+        uploaded until now.
 
         Raises:
             CopyError: another service has taken over, or the bucket does not answer.
@@ -230,13 +243,15 @@ class Lease:
         return False
 
     def keep(self) -> None:
-        """Renew it from now on in a thread while `serves` is true; otherwise it expires, and another service takes
-        it."""
+        """Renew it from now on in a thread while `serves` is true; otherwise it expires, and
+        another service takes it."""
         self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
         self._thread.start()
 
     def release(self, to: str = "") -> None:
-        """Release it if it is still held, for a named service or for any; nothing is acknowledged afterwards."""
+        """Release it if it is still held, for a named service or for any; nothing is
+        acknowledged afterwards.
+        """
         self._stop.set()
         if self._thread is not None:
             self._thread.join(self._lease_s)
@@ -317,7 +332,8 @@ def elapsed_seconds() -> float:
 
 
 def holder_of(root: Path, url: str) -> tuple[str, bool]:
-    """Return the identity of a folder, and True if it existed before; a copied or moved folder gets a new one.
+    """Return the identity of a folder, and True if it existed before; a copied or moved folder gets
+    a new one.
 
     Raises:
         OSError: the folder cannot be read or written.
@@ -338,8 +354,8 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
 
 
 def forget_holder(root: Path) -> None:
-    """Remove the identity of a folder that is written without a lease: it holds data that no bucket has, so it must not
-    be synchronised with a bucket.
+    """Remove the identity of a folder that is written without a lease: it holds data that no bucket
+    has, so it must not be synchronised with a bucket.
 
     Raises:
         OSError: the identity cannot be removed.

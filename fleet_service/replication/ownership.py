@@ -1,4 +1,6 @@
-"""Exclusive ownership of a running service: the folder by a lock, and the bucket copy, if any, by a lease."""
+"""Exclusive ownership of a running service: the folder by a lock, and the bucket copy, if any,
+by a lease.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ class Ownership:
 
     @property
     def left_s(self) -> float:
-        """Return how long it may acknowledge without renewing the lease [s]; infinite without a lease."""
+        """Return how long it may acknowledge without renewing the lease [s]; infinite without a
+        lease.
+        """
         return math.inf if self.lease is None else self.lease.left_s
 
     @property
@@ -120,12 +124,12 @@ def acquire(
         root: of the archive.
         stop: ends the wait.
         say: called with a line whenever the reason for waiting changes.
-        signs: of a standby: whether it would be reachable, whether a service's token is active, and a function called
-            at
-            each check.
+        signs: of a standby: whether it would be reachable, whether a service's token is active, and
+            a function called at each check.
 
     Raises:
-        InputError: another service holds folder or copy, or the copy cannot be used with these settings.
+        InputError: another service holds folder or copy, or the copy cannot be used with these
+            settings.
         OSError: the folder cannot be read or written.
     """
     url = config.archive.second
@@ -185,7 +189,10 @@ def _leased(
             lease = lease.retry()
     except CopyError as error:
         _leave(lease, copy)
-        fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
+        fix = (
+            "see that it is reached, and endpoint, region and credentials; start again, nothing "
+            "is lost"
+        )
         raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
     except BaseException:
         _leave(lease, copy)
@@ -211,8 +218,8 @@ def _sync_folder(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> bool:
-    """Synchronise the folder with the copy; False if stopped, or if another service has the lease. A standby retries
-    while the bucket is away."""
+    """Synchronise the folder with the copy; False if stopped, or if another service has the lease.
+    A standby retries while the bucket is away."""
     logged = ""
     while not stop.is_set():
         try:
@@ -239,8 +246,8 @@ class _BusyError(Exception):
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:
-    """Wait until no compaction of the folder's former service is running: it may have read rows that do not count any
-    more."""
+    """Wait until no compaction of the folder's former service is running: it may have read rows
+    that do not count any more."""
     try:
         return compaction.lock_compacted(root)
     except InputError as error:

@@ -1,9 +1,10 @@
 """Bucket replica of an archive: the same files under the same names.
 
 Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it
-(`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any instant the copy holds
-every row at least once, like the folder. A start (`begin`) downloads what only the bucket has (everything onto an empty
-disk), and uploads what only the folder has. Only objects recorded in the journal are deleted.
+(`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any
+instant the copy holds every row at least once, like the folder. A start (`begin`) downloads what
+only the bucket has (everything onto an empty disk), and uploads what only the folder has. Only
+objects recorded in the journal are deleted.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from schemas.runtime.durable import open_durably
 
 LOG: Final = "inbox/"
 KEYS: Final = "keys/"
-# In this order they are looked through: compaction adds to the later ones before it takes from the log, and retention
-# rolls up before it takes from the observations, so that what has gone from one is found in the next.
+# In this order they are looked through: compaction adds to the later ones before it takes from the
+# log, and retention rolls up before it takes from the observations, so that what has gone from one
+# is found in the next.
 FOLDERS: Final = (
     "inbox",
     "observations",
@@ -99,14 +101,17 @@ class BucketReplica:
 
         Args:
             may: returns True if the lease is certainly held.
-            alone: checks in the bucket that no later lease exists; CopyError if one exists or the check fails.
+            alone: checks in the bucket that no later lease exists; CopyError if one exists or the
+                check fails.
         """
         self._may = may
         self._alone = alone
 
     @property
     def away_s(self) -> float:
-        """Return for how long the bucket has not accepted data that an acknowledgement needs [s]; 0 if it does."""
+        """Return for how long the bucket has not accepted data that an acknowledgement needs
+        [s]; 0 if it does.
+        """
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
@@ -119,8 +124,8 @@ class BucketReplica:
         return f"the copy at {self._url} does not take segments, {waits}: {self._error}"
 
     def begin(self, service: str) -> int:
-        """Synchronise folder and bucket in both directions; return the number of downloaded files. Nothing else may use
-        the archive.
+        """Synchronise folder and bucket in both directions; return the number of downloaded files.
+        Nothing else may use the archive.
 
         Raises:
             InputError: the bucket cannot be reached, or belongs to another service.
@@ -129,20 +134,23 @@ class BucketReplica:
         try:
             return self.join(service)
         except CopyError as error:
-            fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
+            fix = (
+                "see that it is reached, and endpoint, region and credentials; start again, "
+                "nothing is lost"
+            )
             raise InputError(
                 "archive.copy", f"{self._url} cannot be used ({error})", fix
             ) from error
 
     def join(self, service: str | None, term: Term | None = None, *, succeeds: bool = False) -> int:
-        """Synchronise like `begin`, under a lease's `term`: later uploads of a former holder do not count.
+        """Synchronise like `begin`, under a lease's `term`: later uploads of a former holder do not
+        count.
 
         Args:
             service: its name; None for a standby, which follows the owner of the bucket.
             term: of the lease; None without one.
-            succeeds: True if another machine had the lease before: data that only this folder has was never
-                acknowledged and
-                is removed.
+            succeeds: True if another machine had the lease before: data that only this folder has
+                was never acknowledged and is removed.
 
         Raises:
             InputError: the bucket belongs to another service.
@@ -166,7 +174,8 @@ class BucketReplica:
         return max(largest_epoch(self._slow.sizes()), largest_epoch(self._files(FOLDERS)))
 
     def prefetch(self) -> None:
-        """Download for a standby, in advance, what a later `join` would, while another service owns the bucket.
+        """Download for a standby, in advance, what a later `join` would, while another service owns
+        the bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete; compaction may remove files meanwhile.
@@ -174,8 +183,8 @@ class BucketReplica:
         self._fetch(self._counting(self._slow.sizes()))
 
     def _raise_fence(self, term: Term) -> None:
-        """Write a fence for this term: later objects count only if they have its epoch. Remove objects that do not
-        count."""
+        """Write a fence for this term: later objects count only if they have its epoch. Remove
+        objects that do not count."""
         names = [
             name
             for name in self._files(FOLDERS)
@@ -214,9 +223,8 @@ class BucketReplica:
         """Upload written segments and the keys; all are in the bucket when this returns.
 
         Raises:
-            CopyError: some are not; the next call continues and uploads nothing twice. After a failure there is a
-                pause,
-                which grows with each further failure.
+            CopyError: some are not; the next call continues and uploads nothing twice. After a
+                failure there is a pause, which grows with each further failure.
         """
         if time.monotonic() < self._not_before:
             raise CopyError(f"is tried again: {self._error}")
@@ -242,7 +250,8 @@ class BucketReplica:
         self._since = None
 
     def sync(self) -> int:
-        """Upload new and rewritten files, then delete removed ones; return the number of changed objects.
+        """Upload new and rewritten files, then delete removed ones; return the number of changed
+        objects.
 
         Only `upload_segments` uploads the log.
 
@@ -297,7 +306,9 @@ class BucketReplica:
                     self._term, self._fence._replace(names=self._fence.names.union(strays))
                 )
             if removed:
-                self._insist()  # then whoever comes next finds all that was put until now, and misses none of what goes
+                # then whoever comes next finds all that was put until now, and misses none of what
+                # goes
+                self._insist()
             for name in removed:
                 self._slow.delete(name)
                 self._copied.remove(name)
@@ -328,8 +339,8 @@ class BucketReplica:
         self._copied.add(name, stamp)
 
     def _put_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file that must be new. A key that a former service uploaded after it lost its lease belongs to rows
-        that do not count, and is replaced."""
+        """Upload a file that must be new. A key that a former service uploaded after it lost its
+        lease belongs to rows that do not count, and is replaced."""
         if self._alone is None or name.startswith(LOG) or bucket.make(name, content):
             bucket.put_new(name, content)
         else:
@@ -396,7 +407,9 @@ class BucketReplica:
         return self._root / f"{name}{BAD}"
 
     def _files(self, folders: Iterable[str]) -> dict[str, Stamp]:
-        """Return names and stamps of the files that belong into the copy, in the order of the folders."""
+        """Return names and stamps of the files that belong into the copy, in the order of the
+        folders.
+        """
         found: dict[str, Stamp] = {}
         for folder in folders:
             for path in sorted((self._root / folder).rglob("*")):
@@ -409,7 +422,9 @@ class BucketReplica:
 
 
 def _ours(name: str) -> bool:
-    """Return True for the name of a file that belongs into the copy; drafts and files set aside do not."""
+    """Return True for the name of a file that belongs into the copy; drafts and files set aside
+    do not.
+    """
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
     return (

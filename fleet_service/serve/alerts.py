@@ -1,5 +1,5 @@
-"""Low-grip alerts: raised when at least two vehicles support a firm belief, cleared with hysteresis and a reason.
-Pure."""
+"""Low-grip alerts: raised when at least two vehicles support a firm belief, cleared with hysteresis
+and a reason. Pure."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early
 FADE_BELOW: Final = 0.5
 # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
 LEAST_SOURCES: Final = 2
-# ... and one more for each opposite source that is not older than they are by this: a road changes, so that earlier
-# visits do not contradict it. With one minute instead of ten, three trusted vehicles that flood a dry cell raised an
-# alert in two of six tuning towns; with ten in none.
+# ... and one more for each opposite source that is not older than they are by this: a road changes,
+# so that earlier visits do not contradict it. With one minute instead of ten, three trusted
+# vehicles that flood a dry cell raised an alert in two of six tuning towns; with ten in none.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
 CLEAR_SOURCES: Final = (4, 5)  # ... that grip needs to end an alert: at least and at most
@@ -41,7 +41,8 @@ class Alerts:
 
     Args:
         fusion: owner of the cells.
-        idle_roads: limit on alerts where nobody but the witnesses drives; None for no limit, in simulations.
+        idle_roads: limit on alerts where nobody but the witnesses drives; None for no limit, in
+            simulations.
     """
 
     def __init__(self, fusion: Fusion, idle_roads: IdleRoads | None = None) -> None:
@@ -70,8 +71,8 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update slots after the fusion renumbered them; `place` is the new number of each. No slot under alert is
-        removed."""
+        """Update slots after the fusion renumbered them; `place` is the new number of each. No slot
+        under alert is removed."""
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
@@ -97,7 +98,9 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return False on an idle road if its witnesses have supported alerts in too many other places lately."""
+        """Return False on an idle road if its witnesses have supported alerts in too many other
+        places lately.
+        """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
             return True
@@ -107,10 +110,11 @@ class Alerts:
         )
 
     def _have_witnesses(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
-        """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,) [ns].
+        """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,)
+        [ns].
 
-        The least number of them, and one more for each opposite source that is newer than the second newest of them
-        less FRESH_NS, up to the most.
+        The least number of them, and one more for each opposite source that is newer than the
+        second newest of them less FRESH_NS, up to the most.
         """
         found = self._fusion.sources(slots, side, time - SOURCE_NS)
         against = self._fusion.sources(slots, GRIP if side == ICE else ICE, time - SOURCE_NS)
@@ -120,7 +124,9 @@ class Alerts:
         return np.asarray((found > 0).sum(axis=1) >= needed)
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the alerts that expire by `now` [ns]: less likely than not, and not confirmed for QUIET_NS."""
+        """Return the alerts that expire by `now` [ns]: less likely than not, and not confirmed
+        for QUIET_NS.
+        """
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten

@@ -86,7 +86,9 @@ def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
 
 
 def _joined(rows: Iterable[dict[str, Any]]) -> str:
-    """Encode rows as JSON one by one; a single call for thousands would hold the interpreter lock too long."""
+    """Encode rows as JSON one by one; a single call for thousands would hold the interpreter
+    lock too long.
+    """
     return ", ".join(json.dumps(row, allow_nan=False) for row in rows)
 
 
@@ -96,7 +98,9 @@ def arrow_stream(cells: pa.RecordBatch) -> bytes:
 
 
 def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
-    """Return rows with times as ISO 8601 text and single-precision numbers without surplus digits."""
+    """Return rows with times as ISO 8601 text and single-precision numbers without surplus
+    digits.
+    """
     columns: dict[str, list[Any]] = {}
     for f in table.schema:
         if pa.types.is_timestamp(f.type):

@@ -1,9 +1,10 @@
 """Limit on alerts that two vehicles raise alone on roads where nobody else drives. Pure.
 
-Two enrolled vehicles that agree can report ice anywhere, on a path that is plausible. On a road with other traffic the
-others contradict them. On a road that no third vehicle ever reported nobody does. Each vehicle may therefore support
-such alerts in at most MOST_AREAS areas of AREA_M within AREA_NS. Farther along, their paths are not distinct enough
-from one vehicle's, and a third vehicle is needed; until then the map shows the ice, without an alert.
+Two enrolled vehicles that agree can report ice anywhere, on a path that is plausible. On a road
+with other traffic the others contradict them. On a road that no third vehicle ever reported nobody
+does. Each vehicle may therefore support such alerts in at most MOST_AREAS areas of AREA_M within
+AREA_NS. Farther along, their paths are not distinct enough from one vehicle's, and a third vehicle
+is needed; until then the map shows the ice, without an alert.
 """
 
 from __future__ import annotations

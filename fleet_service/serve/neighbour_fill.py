@@ -1,9 +1,10 @@
 """Imputation of unvisited cells from visited neighbours: wider, and marked as borrowed. Pure.
 
-A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the imputed belief is the
-prior. Along a route the order of cells is known. There a cell borrows from the nearest visited cells before and behind
-it, up to REACH cells away, and the share of the prior grows with the distance. If both sides are visited, each counts
-by its share. Different surfaces on the two sides therefore give a wide belief and not a mean surface.
+A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
+imputed belief is the prior. Along a route the order of cells is known. There a cell borrows from
+the nearest visited cells before and behind it, up to REACH cells away, and the share of the prior
+grows with the distance. If both sides are visited, each counts by its share. Different surfaces on
+the two sides therefore give a wide belief and not a mean surface.
 """
 
 from __future__ import annotations
@@ -19,19 +20,20 @@ from schemas.numeric import FloatArray, IntArray
 
 PRIOR_SHARE: Final = 0.5
 REACH: Final = 10  # cells, some 130 m
-# What is left of a neighbour's share for each further cell: on drawn towns a surface is some five to ten cells long.
+# What is left of a neighbour's share for each further cell: on drawn towns a surface is some five
+# to ten cells long.
 KEPT: Final = 0.8
 
 
 def impute(
     fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int
 ) -> CellView:
-    """Return the unvisited cells of a tile next to its visited `slots`, same sector; along a route, the cells of its
-    keys.
+    """Return the unvisited cells of a tile next to its visited `slots`, same sector; along a route,
+    the cells of its keys.
 
-    The belief is half the prior and half the mean of the visited neighbours, less of them at greater distance.
-    `vehicles` is the minimum of theirs, so that an imputed value is never more public than its sources. Times are the
-    newest and oldest of theirs.
+    The belief is half the prior and half the mean of the visited neighbours, less of them at
+    greater distance. `vehicles` is the minimum of theirs, so that an imputed value is never more
+    public than its sources. Times are the newest and oldest of theirs.
     """
     live = fusion.live
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
@@ -79,8 +81,8 @@ def impute(
 
 
 def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return unvisited keys of a route in a tile, the slots of the nearest visited ones before and behind, and their
-    shares.
+    """Return unvisited keys of a route in a tile, the slots of the nearest visited ones before and
+    behind, and their shares.
 
     A key appears once for each side within REACH; adjacent keys are handled as neighbours.
     """

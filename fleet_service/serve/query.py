@@ -103,8 +103,9 @@ def _view_tile(
 def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     """Select the cells with enough vehicles that touch the box.
 
-    Usually that is a complete tile, or a contiguous part of it. Every step that releases the interpreter lock may wait
-    for it ten times as long as the step takes, so cells are compared one by one only if necessary.
+    Usually that is a complete tile, or a contiguous part of it. Every step that releases the
+    interpreter lock may wait for it ten times as long as the step takes, so cells are compared one
+    by one only if necessary.
     """
     columns = shown.columns
     run = slice(0, len(shown.cells))

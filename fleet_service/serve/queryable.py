@@ -1,13 +1,14 @@
-"""Scheduling of queries: cheap ones are answered in Zenoh's thread, expensive ones in a thread of their own, tile by
-tile.
+"""Scheduling of queries: cheap ones are answered in Zenoh's thread, expensive ones in a thread of
+their own, tile by tile.
 
-Zenoh queries are anonymous, so per-client limits are impossible. Queries are scheduled by estimated cost instead. The
-next tile always belongs to the query that would have ended first on an idle service (`_Heavy.rank`). A small query
-therefore overtakes a large earlier one, and a stream of small ones cannot starve a large one. If too many wait, the
-most expensive one is told to come again. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated
-as expensive ones, smallest first. After each tile of an expensive answer the thread rests as long as the tile took. A
-query beyond the size limit is an error with a hint. One past map is rebuilt at a time, in a separate process; other
-such queries are told to come again.
+Zenoh queries are anonymous, so per-client limits are impossible. Queries are scheduled by estimated
+cost instead. The next tile always belongs to the query that would have ended first on an idle
+service (`_Heavy.rank`). A small query therefore overtakes a large earlier one, and a stream of
+small ones cannot starve a large one. If too many wait, the most expensive one is told to come
+again. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated as expensive
+ones, smallest first. After each tile of an expensive answer the thread rests as long as the tile
+took. A query beyond the size limit is an error with a hint. One past map is rebuilt at a time, in a
+separate process; other such queries are told to come again.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ class Answering(NamedTuple):
 
     Attributes:
         size: returns the upper bound of an answer's cells and tiles.
-        answer: yields tile and payload of every reply to a query, for the tiles that a predicate accepts, and the only
-            one if the query's key names a tile.
+        answer: yields tile and payload of every reply to a query, for the tiles that a predicate
+            accepts, and the only one if the query's key names a tile.
     """
 
     size: Callable[[MapQuery, Callable[[int], bool], int | None], AnswerSize]
@@ -108,7 +109,8 @@ class MapQueryable:
 
     Args:
         answering: counts and makes answers.
-        counts: takes `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and `answer_failures`.
+        counts: takes `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and
+            `answer_failures`.
     """
 
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
@@ -261,8 +263,8 @@ class MapQueryable:
 
 
 def _wanted(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
-    """Return a predicate for tiles whose key matches the query's, and the only such tile if the query's key names
-    it."""
+    """Return a predicate for tiles whose key matches the query's, and the only such tile if the
+    query's key names it."""
     expression = request.key_expr
     only = _tile(str(expression))
     return (

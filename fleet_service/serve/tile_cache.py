@@ -1,7 +1,7 @@
 """Cache of tiles for readers: made on request or for publication, and reused while they are fresh.
 
-A tile is at most SHOWN_NS old and holds everything that was acknowledged or alerted before the query. Most queries
-under load then cost a look-up.
+A tile is at most SHOWN_NS old and holds everything that was acknowledged or alerted before the
+query. Most queries under load then cost a look-up.
 """
 
 from __future__ import annotations
@@ -42,10 +42,11 @@ class ShownTile(NamedTuple):
     Attributes:
         cells: in the schema of the map.
         columns: SELECTED_BY as arrays (k,).
-        payload: all cells as an Arrow stream that shares memory with `cells`, from south to north; empty if the cells
-            have another order and are used once.
+        payload: all cells as an Arrow stream that shares memory with `cells`, from south to north;
+            empty if the cells have another order and are used once.
         least: minimum number of vehicles of its cells.
-        common: west, south, east and north that all cells touch, if they are ordered from south to north.
+        common: west, south, east and north that all cells touch, if they are ordered from south to
+            north.
         made: time of creation [ns].
         change: last change of the map that it contains.
     """
@@ -85,7 +86,9 @@ class TileCache:
         self._acknowledged = 0  # change up to which all must be seen
 
     def acknowledge(self) -> None:
-        """Record that everything in the map was acknowledged or alerted: no older tile is shown from now on."""
+        """Record that everything in the map was acknowledged or alerted: no older tile is shown
+        from now on.
+        """
         self._acknowledged = self.state.change
 
     def shown(self, tile: int, now: int) -> ShownTile:
@@ -109,7 +112,9 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of slots as readers see them: coarse if more than one vehicle makes a cell public."""
+        """Return the cells of slots as readers see them: coarse if more than one vehicle makes a
+        cell public.
+        """
         cells = view(self.state.fusion, slots, now)
         return coarsen(cells) if self._least > 1 else cells
 

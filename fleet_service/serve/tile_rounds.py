@@ -1,9 +1,10 @@
-"""Publication of changed tiles in rounds, a few tiles per turn of the worker, so that acknowledgements never wait.
+"""Publication of changed tiles in rounds, a few tiles per turn of the worker, so that
+acknowledgements never wait.
 
-A round takes all tiles that changed since the last one. It begins at the moments of a time grid. A moment at which the
-last round is not complete is skipped and counted, and its changes go to the next round. A tile is therefore published
-once a second if there is time, and in turn otherwise. The grid's offset is private: the instant of a publication does
-not reveal when a vehicle passed.
+A round takes all tiles that changed since the last one. It begins at the moments of a time grid. A
+moment at which the last round is not complete is skipped and counted, and its changes go to the
+next round. A tile is therefore published once a second if there is time, and in turn otherwise. The
+grid's offset is private: the instant of a publication does not reveal when a vehicle passed.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class TileRounds:
         return len(self._left)
 
     def begin(self) -> bool:
-        """Begin a round if its moment has come; return True if it has, even if the previous round continues instead."""
+        """Begin a round if its moment has come; return True if it has, even if the previous
+        round continues instead.
+        """
         passed = int((self._clock() - self._due) // self._every_s) + 1
         if passed <= 0:
             return False

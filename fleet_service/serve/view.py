@@ -18,8 +18,9 @@ LOWER = 0.05
 UPPER = 0.95
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
-# A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved
-# the interval, or when it is more likely slippery than not; else all that is known is a lower bound.
+# A cell is `measured` when a value brought its upper end down by more than numerics and forgetting
+# move it, or halved the interval, or when it is more likely slippery than not; else all that is
+# known is a lower bound.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
 KNOWN_SLIPPERY: Final = 0.5
@@ -51,7 +52,9 @@ class CellView(NamedTuple):
 
 
 def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
-    """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may continue."""
+    """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may
+    continue.
+    """
     live = fusion.live
     key = live.key[slots]
     return CellView(
@@ -68,7 +71,9 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
 
 
 def coarsen(cells: CellView) -> CellView:
-    """Return the cells as readers see them with privacy on: no single passage shows in a time or a count."""
+    """Return the cells as readers see them with privacy on: no single passage shows in a time or
+    a count.
+    """
     steps = COUNT_STEPS
     counts = [
         steps[np.maximum(np.searchsorted(steps, column, "right") - 1, 0)]
@@ -91,8 +96,8 @@ def is_measured(
 ) -> BoolArray:
     """Return True for beliefs that say more than a lower bound, (k,).
 
-    A belief that calls the road slippery always does, wherever it came from: values of the other headings lower it
-    too, and ice that is known must never be shown as unknown.
+    A belief that calls the road slippery always does, wherever it came from: values of the other
+    headings lower it too, and ice that is known must never be shown as unknown.
 
     Args:
         lower, upper: ends of the interval, (k,).

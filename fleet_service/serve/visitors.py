@@ -1,7 +1,7 @@
 """Number of distinct vehicles in a cell recently: a lower bound, in sixteen bytes per cell. Pure.
 
-The data of k vehicles hides each of them only while there are k. If a cell stayed public for ever, a single car at
-night would be visible in it.
+The data of k vehicles hides each of them only while there are k. If a cell stayed public for ever,
+a single car at night would be visible in it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update slots after the fusion renumbered them; `place` is the new number, -1 for removed ones."""
+        """Update slots after the fusion renumbered them; `place` is the new number, -1 for
+        removed ones.
+        """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
         longer[: min(len(place), len(self._bits))] = self._bits[: len(place)]

@@ -1,9 +1,11 @@
-"""Live hand-over of a region: the active service stops in good order, and its lease goes to a named standby.
+"""Live hand-over of a region: the active service stops in good order, and its lease goes to a named
+standby.
 
 ask                                      the service
 get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
 watches the tokens                       checkpoint, copied; then as at any stop: flush, acknowledge, undeclare
-                                         lease given free for NAME, which takes it, restores, declares
+                                         lease given free for NAME, which takes it, restores,
+                                         declares
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Announcement of served regions, and exclusion of a second service: queries would reach only one of two."""
+"""Announcement of served regions, and exclusion of a second service: queries would reach only
+one of two.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ def claim_regions(
         name: of the service.
         regions: key expressions.
         stop: ends the wait for another service's token.
-        former: names of earlier holders of this service's lease; their remaining tokens are about to go.
+        former: names of earlier holders of this service's lease; their remaining tokens are about
+            to go.
 
     Raises:
         InputError: another service has one of the regions.
@@ -49,8 +52,8 @@ def claim_regions(
 
 @contextmanager
 def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
-    """Announce that regions are served while the block runs. The queryables must answer before and after the block: an
-    empty answer of a served region means that nothing is known there."""
+    """Announce that regions are served while the block runs. The queryables must answer before and
+    after the block: an empty answer of a served region means that nothing is known there."""
     with _standing(_declared(session, mine, SERVES)):
         yield
 
@@ -68,8 +71,9 @@ def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 def watch_successors(
     session: zenoh.Session, mine: frozenset[ServiceToken]
 ) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True if another service took these regions since the block began. A service that is
-    cut off from its bucket learns so that it was replaced, and stops serving outdated data."""
+    """Yield a function that returns True if another service took these regions since the block
+    began. A service that is cut off from its bucket learns so that it was replaced, and stops
+    serving outdated data."""
     with tokens.track_tokens(session) as there:
         before = there.active
         yield lambda: bool(rival_tokens(mine, there.active - before))
@@ -78,7 +82,9 @@ def watch_successors(
 def rival_tokens(
     mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
-    """Return the tokens of other services for the same regions, except those of `former` services."""
+    """Return the tokens of other services for the same regions, except those of `former`
+    services.
+    """
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
@@ -124,8 +130,8 @@ def _declared(
 def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Yield the signs of a standby: whether it reaches a router, whether a service's token is active, and `alive`. None
-    if it is no standby or was stopped before it reached a router."""
+    """Yield the signs of a standby: whether it reaches a router, whether a service's token is
+    active, and `alive`. None if it is no standby or was stopped before it reached a router."""
     session = (
         zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
     )

@@ -1,2 +1,2 @@
-"""Machinery that both packages use: compiler, records, fast batch decoding, sessions, metrics, process set-up,
-figures."""
+"""Machinery that both packages use: compiler, records, fast batch decoding, sessions, metrics,
+process set-up, figures."""

@@ -1,9 +1,11 @@
-"""Decode many payloads into one set of columns. Python code runs per message and per column, never per record.
+"""Decode many payloads into one set of columns. Python code runs per message and per column, never
+per record.
 
-A compiled scanner (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages. Then the values of
-all messages are read column by column. A message that the scanner does not understand, for example JSON, is decoded by
-the protobuf library and encoded again in the plain form. So there is one path from bytes to columns. An error in one
-message is reported for that message and does not affect the others.
+A compiled scanner (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages.
+Then the values of all messages are read column by column. A message that the scanner does not
+understand, for example JSON, is decoded by the protobuf library and encoded again in the plain
+form. So there is one path from bytes to columns. An error in one message is reported for that
+message and does not affect the others.
 """
 
 from __future__ import annotations
@@ -113,7 +115,9 @@ class _Fields(NamedTuple):
         return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 
     def columns(self) -> tuple[IntArray, Columns, BoolArray]:
-        """Return sizes, columns (missing values filled, integers widened), and which records have a likelihood."""
+        """Return sizes, columns (missing values filled, integers widened), and which records
+        have a likelihood.
+        """
         out: Columns = {}
         n = int(self.sizes.sum())
         likelihood = np.zeros(n, bool)

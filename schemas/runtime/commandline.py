@@ -1,7 +1,7 @@
 """Frame of both command lines: error handling, negative numbers, version, completion, quiet mode.
 
-Exit codes: 0 done, 1 done and something failed or was left, 2 misuse or bad input, 3 not plausible (edge-agent), 130
-ended by Ctrl-C.
+Exit codes: 0 done, 1 done and something failed or was left, 2 misuse or bad input, 3 not plausible
+(edge-agent), 130 ended by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class OneLineParser(argparse.ArgumentParser):
 def parser_of(
     prog: str, description: str, commands: Iterable[Command], *chosen: str | None
 ) -> argparse.ArgumentParser:
-    """Return a parser with all commands by name and the options of the chosen ones; other modules are not imported."""
+    """Return a parser with all commands by name and the options of the chosen ones; other
+    modules are not imported.
+    """
     parser = OneLineParser(prog=prog, description=description)
     parser.add_argument("--version", action=VersionAction)
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -58,7 +60,9 @@ def parser_of(
 
 
 def join_negative_numbers(argv: Sequence[str]) -> list[str]:
-    """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`, because argparse takes a leading minus for an option."""
+    """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`, because argparse takes a leading minus
+    for an option.
+    """
     out: list[str] = []
     for word in argv:
         if _NEGATIVE.match(word) and out and re.fullmatch(r"--[a-z-]+", out[-1]):

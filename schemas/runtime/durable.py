@@ -24,12 +24,13 @@ def draft_of(path: Path) -> Path:
 def open_durably(
     path: Path, mode: int | None = None, *, named: bool = True
 ) -> Iterator[BufferedWriter]:
-    """Open a file that appears under its name, complete and durable, when the block ends. If the block fails, nothing
-    changes.
+    """Open a file that appears under its name, complete and durable, when the block ends. If the
+    block fails, nothing changes.
 
     Args:
         path: of the file; an existing one is replaced.
-        mode: permissions, which the draft has from its first byte on; the default permissions if None.
+        mode: permissions, which the draft has from its first byte on; the default permissions if
+            None.
         named: True to make the name durable too; otherwise the caller syncs the folder.
 
     Raises:
@@ -57,8 +58,8 @@ def open_durably(
 def own_drafts(folder: Path) -> Iterator[Path]:
     """Create a folder within `folder` for drafts that are renamed when they are complete.
 
-    Two attempts at one file, on one or two machines, write different drafts. `sweep_drafts` removes what a killed
-    attempt leaves.
+    Two attempts at one file, on one or two machines, write different drafts. `sweep_drafts` removes
+    what a killed attempt leaves.
     """
     with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
         yield Path(drafts)

@@ -54,11 +54,11 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
 
 
 def commit(source: Path) -> str:
-    """Return the commit of the repository that a source file belongs to; `-dirty` is appended if a tracked file was
-    changed.
+    """Return the commit of the repository that a source file belongs to; `-dirty` is appended if a
+    tracked file was changed.
 
-    The repository of the working directory may be a different one. An installed copy may lie inside a repository that
-    does not track it; the result is then "unknown".
+    The repository of the working directory may be a different one. An installed copy may lie inside
+    a repository that does not track it; the result is then "unknown".
     """
     git = ["git", "-C", str(source.parent)]
     describe = [*git, "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty"]

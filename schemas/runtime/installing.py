@@ -1,4 +1,6 @@
-"""Commands that install an extra of this distribution, from where it was installed itself: it is on no index."""
+"""Commands that install an extra of this distribution, from where it was installed itself: it is
+on no index.
+"""
 
 from __future__ import annotations
 

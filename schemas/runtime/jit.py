@@ -41,34 +41,38 @@ R = TypeVar("R")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not an exception).
+    """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not
+    an exception).
 
-    Without fast-math and threads the result of a row does not depend on the number of rows. Banks of N = 1 and of N =
-    thousands are therefore bit-equal. If the cache's disk is full, a kernel is compiled at each start.
+    Without fast-math and threads the result of a row does not depend on the number of rows. Banks
+    of N = 1 and of N = thousands are therefore bit-equal. If the cache's disk is full, a kernel is
+    compiled at each start.
     """
     return _compile(function)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` into each of its callers; for a few lines of arithmetic in a loop, where a call costs more.
+    """Compile `function` into each of its callers; for a few lines of arithmetic in a loop, where a
+    call costs more.
 
-    The optimiser can then vectorise over the four wheels. Pass numbers and tuples to such functions: values of an array
-    must be read again after every write to another array.
+    The optimiser can then vectorise over the four wheels. Pass numbers and tuples to such
+    functions: values of an array must be read again after every write to another array.
     """
     return _compile(function, forceinline=True)
 
 
 def nogil(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` and release the interpreter lock while it runs; for long kernels that touch only their
-    arguments."""
+    """Compile `function` and release the interpreter lock while it runs; for long kernels that
+    touch only their arguments."""
     return _compile(function, nogil=True)
 
 
 def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile like `nogil`, without counting references to arrays, which costs two locked additions per array and call.
+    """Compile like `nogil`, without counting references to arrays, which costs two locked additions
+    per array and call.
 
-    Only for functions that neither create nor return arrays, so that the caller owns everything they touch. Functions
-    that they call must be `refcount_free` too.
+    Only for functions that neither create nor return arrays, so that the caller owns everything
+    they touch. Functions that they call must be `refcount_free` too.
     """
     return _compile(function, nogil=True, references=False)
 
@@ -99,13 +103,14 @@ def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: AN
     return types.void(array, types.int64, types.int64), generate
 
 
-# `prefetch(array, row, line)` in compiled code: let a LINE of `array[row]` come meanwhile. For arrays of
-# one or two dimensions; a hint, so that `row` may lie outside.
+# `prefetch(array, row, line)` in compiled code: let a LINE of `array[row]` come meanwhile. For
+# arrays of one or two dimensions; a hint, so that `row` may lie outside.
 prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return the machine code of a compiled function that was called before, without numba's argument check (0.3 us).
+    """Return the machine code of a compiled function that was called before, without numba's
+    argument check (0.3 us).
 
     Every argument must have the same type as in that call. Types are not checked again.
     """
@@ -134,7 +139,9 @@ class _Cache(FunctionCache):
     """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
 
     def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
-        """Identify a closure by the names that it closes over, because numba's pickle of it differs per process."""
+        """Identify a closure by the names that it closes over, because numba's pickle of it
+        differs per process.
+        """
         cells = self._py_func.__closure__
         if cells is None:
             return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
@@ -152,10 +159,12 @@ class _Cache(FunctionCache):
 
 @functools.cache
 def kernel_cache(package: str) -> str:
-    """Return the folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
+    """Return the folder of a package's compiled kernels, in the user's cache, named by a digest of
+    the sources.
 
-    Numba's own cache checks only the file of a kernel, not the files of its callees and constants. It would continue
-    with outdated code after a change there. Old folders may be deleted at any time.
+    Numba's own cache checks only the file of a kernel, not the files of its callees and constants.
+    It would continue with outdated code after a change there. Old folders may be deleted at any
+    time.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)
@@ -167,10 +176,11 @@ def kernel_cache(package: str) -> str:
 
 @functools.cache
 def cache_root() -> Path | None:
-    """Return the folder for compiled kernels: the user's cache, or else a folder of the user among the temporary files.
+    """Return the folder for compiled kernels: the user's cache, or else a folder of the user among
+    the temporary files.
 
-    None if neither can be written (a service account without a home, a read-only container). Kernels are then compiled
-    at each start.
+    None if neither can be written (a service account without a home, a read-only container).
+    Kernels are then compiled at each start.
     """
     for folder in _roots():
         with suppress(OSError):

@@ -1,4 +1,6 @@
-"""Lazy public names of a package: each is imported at first use, so that importing the package is fast."""
+"""Lazy public names of a package: each is imported at first use, so that importing the package
+is fast.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Links of a session: which router it is connected to now, over which transport, and how often that changed.
+"""Links of a session: which router it is connected to now, over which transport, and how often that
+changed.
 
-Zenoh reports each transport and link that opens or closes. The watch keeps the present state and counts, so that its
-owner learns of a loss when it happens and not from missing answers.
+Zenoh reports each transport and link that opens or closes. The watch keeps the present state and
+counts, so that its owner learns of a loss when it happens and not from missing answers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on loopback by default.
+"""Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on loopback by
+default.
 
 Values are read when they are requested; nothing is counted only for display.
 """
@@ -23,7 +24,9 @@ READ_S: Final = 5.0  # a silent client is cut off
 
 
 class Metric(NamedTuple):
-    """Family of values; a counter only grows. `label` names the dimension; "" for a single value."""
+    """Family of values; a counter only grows. `label` names the dimension; "" for a single
+    value.
+    """
 
     name: str
     kind: Literal["counter", "gauge"]
@@ -45,7 +48,8 @@ Troubles = Callable[[], Sequence[str]]
 def serve_metrics(
     host: str, port: int | None, read: Read, troubles: Troubles
 ) -> Iterator[str | None]:
-    """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a free port.
+    """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a
+    free port.
 
     Args:
         host, port: where to listen.

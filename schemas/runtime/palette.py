@@ -1,10 +1,12 @@
-"""Colours of all plots and pages, distinguishable with three kinds of colour blindness and in greyscale.
+"""Colours of all plots and pages, distinguishable with three kinds of colour blindness and in
+greyscale.
 
-The live page, HTML reports, images and QGIS share them. `FOUR` are the classes of a well known grip, `TWO` those of a
-roughly known one, `LITTLE` is no class. In the order ice, snow, rather slippery, wet, rather not, good grip the
-lightness rises on light ground and falls on dark ground, for every kind of sight and on grey paper: what is dangerous
-stands out most. `GRIP` runs through `FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green,
-because a safe colour would be a promise. `tests/test_palette.py` computes order and distances.
+The live page, HTML reports, images and QGIS share them. `FOUR` are the classes of a well known
+grip, `TWO` those of a roughly known one, `LITTLE` is no class. In the order ice, snow, rather
+slippery, wet, rather not, good grip the lightness rises on light ground and falls on dark ground,
+for every kind of sight and on grey paper: what is dangerous stands out most. `GRIP` runs through
+`FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green, because a safe
+colour would be a promise. `tests/test_palette.py` computes order and distances.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ class LineStyle(NamedTuple):
 
 
 TRUTH: Final = LineStyle("#000000")
-# One colour an estimator, in every plot: Okabe and Ito (2008), with a red brown for black, which is the truth's.
+# One colour an estimator, in every plot: Okabe and Ito (2008), with a red brown for black, which is
+# the truth's.
 ESTIMATORS: Final = {
     "aco-fckf": LineStyle("#0072b2"),
     "fckf": LineStyle("#56b4e9", "--"),

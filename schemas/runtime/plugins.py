@@ -1,4 +1,5 @@
-"""Plug-ins of other distributions: entry points by group and name. They never replace a built-in name.
+"""Plug-ins of other distributions: entry points by group and name. They never replace a built-in
+name.
 
     [project.entry-points."gripmap.estimators"]
     mine = "my_package.estimators:bank"

@@ -35,15 +35,17 @@ class LogLine(str):
 
 
 def limit_memory(*without: str) -> None:
-    """Prevent libraries from using memory and threads that a long-lived process does not need; call it first.
+    """Prevent libraries from using memory and threads that a long-lived process does not need; call
+    it first.
 
     Args:
         without: modules that the libraries can do without; importing them is blocked.
 
-    Arrow imports pandas, if installed, to recognise data frames: half a second and 30 MB. The linear algebra library of
-    numpy starts one thread per core, and these threads busy-wait; on our small products this doubles the processor
-    time. The allocator keeps large freed arrays, and small objects stay among them: about 0.1 GB. Arrow's own allocator
-    keeps memory for each thread that ever used it.
+    Arrow imports pandas, if installed, to recognise data frames: half a second and 30 MB. The
+    linear algebra library of numpy starts one thread per core, and these threads busy-wait; on our
+    small products this doubles the processor time. The allocator keeps large freed arrays, and
+    small objects stay among them: about 0.1 GB. Arrow's own allocator keeps memory for each thread
+    that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
@@ -72,8 +74,9 @@ def force_exit(code: int) -> NoReturn:
 def exit_fast(code: int) -> NoReturn:
     """Exit without interpreter teardown.
 
-    Unloading hundreds of LLVM modules takes about five seconds, and a Zenoh callback during teardown aborts the
-    process. As at a normal exit, non-daemon threads are joined and exit handlers run.
+    Unloading hundreds of LLVM modules takes about five seconds, and a Zenoh callback during
+    teardown aborts the process. As at a normal exit, non-daemon threads are joined and exit
+    handlers run.
     """
     threading._shutdown()  # type: ignore[attr-defined] # no public way
     atexit._run_exitfuncs()
@@ -90,16 +93,16 @@ class _Without(MetaPathFinder):
 
 
 def print_line(line: str, stream: TextIO) -> None:
-    """Print a line at once and as a whole, also with several threads. Errors of the stream (full disk, closed pipe) are
-    ignored."""
+    """Print a line at once and as a whole, also with several threads. Errors of the stream (full
+    disk, closed pipe) are ignored."""
     with suppress(OSError):
         stream.write(f"{line}\n")  # in one piece: `print` writes the end of a line by itself
         stream.flush()
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
-    """Return a function that prints log lines; in JSON each has time, process and `who`, and the first word is the
-    event."""
+    """Return a function that prints log lines; in JSON each has time, process and `who`, and the
+    first word is the event."""
 
     def text(line: str) -> None:
         print_line(line, stream)

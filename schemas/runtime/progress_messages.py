@@ -1,7 +1,8 @@
 """Progress messages of a command: on stderr, never on stdout, and none in quiet mode.
 
-On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a long operation is
-reported once as a line. An imported library reports nothing: only the command lines call `enable_messages`.
+On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a
+long operation is reported once as a line. An imported library reports nothing: only the command
+lines call `enable_messages`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ from schemas.runtime.process import print_line
 
 PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
 TICK_S: Final = 1.0
-COMPILING: Final = "compiling kernels that this machine does not have yet: seconds to a minute, kept for the next start"
+COMPILING: Final = (
+    "compiling kernels that this machine does not have yet: seconds to a minute, "
+    "kept for the next start"
+)
 
 
 class _State:

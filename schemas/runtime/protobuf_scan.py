@@ -1,9 +1,11 @@
-"""Scanner that finds the fields in the bytes of many protobuf batches, compiled and without an object per message.
+"""Scanner that finds the fields in the bytes of many protobuf batches, compiled and without an
+object per message.
 
-The protobuf library stays the authority. The scanner understands only messages as our own encoder, or any plain encoder
-of the .proto, writes them: each field once, columns packed, numbers in range, plain ASCII names, columns of equal
-length. It marks all others as not understood, and `batch_decoder` lets the library decode and encode them. Source:
-protobuf's encoding reference (tags, varints, packed fields).
+The protobuf library stays the authority. The scanner understands only messages as our own encoder,
+or any plain encoder of the .proto, writes them: each field once, columns packed, numbers in range,
+plain ASCII names, columns of equal length. It marks all others as not understood, and
+`batch_decoder` lets the library decode and encode them. Source: protobuf's encoding reference
+(tags, varints, packed fields).
 """
 
 from __future__ import annotations
@@ -60,8 +62,8 @@ class ScannedFields(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Layout of a kind of message as arrays: role of each field number; width, elements per record and need of each
-    column."""
+    """Layout of a kind of message as arrays: role of each field number; width, elements per record
+    and need of each column."""
 
     roles: IntArray
     widths: IntArray
@@ -70,7 +72,9 @@ class _Layout(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, the result."""
+    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, the
+    result.
+    """
 
     data: ByteArray
     layout: _Layout
@@ -100,7 +104,8 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
         kind: of the messages.
         data: all bytes.
         ends: end of each message, (k,).
-        strict: True to leave names that are not ASCII to the library; False if the library wrote the bytes.
+        strict: True to leave names that are not ASCII to the library; False if the library wrote
+            the bytes.
     """
     layout = _layout(kind)
     k = len(ends)
@@ -121,8 +126,8 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
 def gather(
     data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]
 ) -> None:
-    """Copy a column of all messages, one after the other, into an array (n, …) that is filled with the default
-    value."""
+    """Copy a column of all messages, one after the other, into an array (n, …) that is filled with
+    the default value."""
     width = int(_layout(kind).widths[column])
     each = int(_layout(kind).per_record[column])
     begins = walked.begins[:, column]
@@ -158,7 +163,9 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Fill the result for all messages; `first` is the column whose length is the number of records."""
+    """Fill the result for all messages; `first` is the column whose length is the number of
+    records.
+    """
     data = scan.data
     layout = scan.layout
     out = scan.out
@@ -193,7 +200,9 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
 
 @refcount_free
 def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
-    """Record one field of message k; return its end, or -1 if it is not as our encoder writes it."""
+    """Record one field of message k; return its end, or -1 if it is not as our encoder writes
+    it.
+    """
     data = scan.data
     out = scan.out
     if role == 0:  # boot

@@ -1,11 +1,13 @@
-"""Records of named fields as a NumPy structured array: the state that a compiled kernel carries per vehicle.
+"""Records of named fields as a NumPy structured array: the state that a compiled kernel carries per
+vehicle.
 
 The annotations of a class are the fields: float, int, bool, a NumPy number, another such class, or
-Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns the type and `records`
-the array. A kernel sees a row as an object with these names.
+Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns the
+type and `records` the array. A kernel sees a row as an object with these names.
 
-Why not a tuple of arrays: each array in it costs 0.1 to 0.3 us per call, and a record array costs as much as one of
-them. The data of one vehicle is contiguous, and sizes are constants, so short loops are unrolled.
+Why not a tuple of arrays: each array in it costs 0.1 to 0.3 us per call, and a record array costs
+as much as one of them. The data of one vehicle is contiguous, and sizes are constants, so short
+loops are unrolled.
 """
 
 from __future__ import annotations
@@ -63,7 +65,9 @@ class Records(Protocol[R_co]):
 
 @cache
 def record_type(kind: type) -> np.dtype[np.void]:
-    """Return the structured type whose fields are the annotations of `kind`, those of its bases first."""
+    """Return the structured type whose fields are the annotations of `kind`, those of its bases
+    first.
+    """
     fields = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         held, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)

@@ -1,7 +1,7 @@
 """Spark session and distribution of tasks over a cluster.
 
-A task runs independently, and again if its machine fails. It therefore writes each file under a name that depends on
-the task alone, by renaming a draft that no other attempt uses.
+A task runs independently, and again if its machine fails. It therefore writes each file under a
+name that depends on the task alone, by renaming a draft that no other attempt uses.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ SETTINGS: Final = {
 
 
 def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without types
-    """Return the Spark session of this process: of the cluster that spark-submit or Spark's settings name, or of this
-    machine.
+    """Return the Spark session of this process: of the cluster that spark-submit or Spark's
+    settings name, or of this machine.
 
     Raises:
         InputError: Spark or Java is missing.
@@ -61,13 +61,14 @@ def spread(
 ) -> list[_Outcome]:
     """Run all tasks, each as one Spark task; return outcomes in the order of the tasks.
 
-    A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt is ignored, so an
-    outcome counts once.
+    A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt
+    is ignored, so an outcome counts once.
 
     Args:
         session: of Spark.
         tasks: picklable.
-        work: processes one task; a function of a module that is installed on all machines, or a partial of one.
+        work: processes one task; a function of a module that is installed on all machines, or a
+            partial of one.
 
     Raises:
         InputError: raised by a task; such a task is not repeated.

@@ -17,7 +17,9 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
-    """Return the tokens that are active now and visible to this session; or those below another root."""
+    """Return the tokens that are active now and visible to this session; or those below another
+    root.
+    """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
         if reply.ok is not None:
@@ -54,8 +56,9 @@ class PresenceTracker:
             return set(self._fell)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
-        """Query the active tokens. A router's answer may lack a token that it is just sending to the same session's
-        subscription (1 of 60 answers); the subscription then delivers it before the answer ends."""
+        """Query the active tokens. A router's answer may lack a token that it is just sending to
+        the same session's subscription (1 of 60 answers); the subscription then delivers it before
+        the answer ends."""
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
@@ -78,7 +81,8 @@ def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
                 parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT
             )
 
-    # at once, on the thread that receives: what fell is known before the answer to any later question is
+    # at once, on the thread that receives: what fell is known before the answer to any later
+    # question is
     subscriber = session.liveliness().declare_subscriber(
         _ALL, zenoh.handlers.Callback(hear, indirect=False)
     )

@@ -18,13 +18,16 @@ _at_work = threading.Event()
 
 
 def notify_alive() -> None:
-    """Notify the service manager that the process is ready and working; do nothing without a service manager."""
+    """Notify the service manager that the process is ready and working; do nothing without a
+    service manager.
+    """
     _at_work.set()
     _tell()
 
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
-    """Notify the service manager that a process is ready and waiting, until `notify_alive` is called.
+    """Notify the service manager that a process is ready and waiting, until `notify_alive` is
+    called.
 
     A thread sends the signals, because a waiting process may be busy for long.
 

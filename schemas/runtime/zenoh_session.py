@@ -1,8 +1,9 @@
 """Zenoh session of the contract: a client of routers, without scouting, gossip and shared memory.
 
-Reasons: scouting finds strangers and costs half a second at start; shared memory drops samples silently when a receiver
-stalls; the lease states how long a silent peer is kept. An endpoint that does not answer is given up after
-`open_timeout`, so that TLS, listed after QUIC, is tried soon where UDP is blocked.
+Reasons: scouting finds strangers and costs half a second at start; shared memory drops samples
+silently when a receiver stalls; the lease states how long a silent peer is kept. An endpoint that
+does not answer is given up after `open_timeout`, so that TLS, listed after QUIC, is tried soon
+where UDP is blocked.
 """
 
 from __future__ import annotations
@@ -43,16 +44,17 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Return the Zenoh configuration: the defaults above, the endpoints, then the pass-through section.
+    """Return the Zenoh configuration: the defaults above, the endpoints, then the pass-through
+    section.
 
     Args:
         settings: of the configuration file.
-        name: of the session; replaces `{name}` in the section, so that one file serves many vehicles with a certificate
-            each.
+        name: of the session; replaces `{name}` in the section, so that one file serves many
+            vehicles with a certificate each.
 
     Raises:
-        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a time limit keeps the
-            session from its second endpoint.
+        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a time
+            limit keeps the session from its second endpoint.
     """
     if len(settings.connect) > 1 and settings.config.get(_TIMEOUT, 0) != 0:
         problem = "with a limit Zenoh tries the first endpoint only"
@@ -97,8 +99,9 @@ def open_session(
 ) -> zenoh.Session | None:
     """Open a session; wait for the router until one answers or `stop` is set (then return None).
 
-    A session that lost its router reconnects by itself. The reason for waiting is logged once. Where nothing answers in
-    time, the next try allows twice as long, so that a slow network is not taken for a blocked one for ever.
+    A session that lost its router reconnects by itself. The reason for waiting is logged once.
+    Where nothing answers in time, the next try allows twice as long, so that a slow network is not
+    taken for a blocked one for ever.
     """
     stop = stop or threading.Event()
     logged = set[str]()

@@ -1,4 +1,6 @@
-"""The messages of the contract as bytes: batches, acknowledgements, alerts; tiles: `schemas.wire.tile`."""
+"""The messages of the contract as bytes: batches, acknowledgements, alerts; tiles:
+`schemas.wire.tile`.
+"""
 
 from schemas.wire.batches import decode
 from schemas.wire.codec import (

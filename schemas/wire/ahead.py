@@ -44,8 +44,10 @@ class GripWarning:
             return f"warning over: {self.reason}; id {self.id}"
         where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
         return (
-            f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least {self.mu_lower:.2f}), "
-            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; id {self.id}"
+            f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least "
+            f"{self.mu_lower:.2f}), "
+            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; "
+            f"id {self.id}"
         )
 
 
@@ -66,9 +68,11 @@ class Runs(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way on.
+    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way
+    on.
 
-    `here` is the friction where it is, by its own measurements and the map: median, 5 and 95 %; NaN where none is told.
+    `here` is the friction where it is, by its own measurements and the map: median, 5 and 95 %; NaN
+    where none is told.
     """
 
     vehicle: str

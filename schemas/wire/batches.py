@@ -1,7 +1,8 @@
-"""One batch from its bytes, and what every decoder shares: heads, checks, and the columns that a sender may leave out.
+"""One batch from its bytes, and what every decoder shares: heads, checks, and the columns that a
+sender may leave out.
 
-A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the leaving time from the
-entering one. Many batches at once, at speed: `schemas.runtime.batch_decoder`.
+A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the
+leaving time from the entering one. Many batches at once, at speed: `schemas.runtime.batch_decoder`.
 """
 
 from __future__ import annotations
@@ -87,7 +88,8 @@ class Decoded(NamedTuple):
         indices: which messages these are, (k,).
         heads: of each.
         sizes: records of each, (k,).
-        columns: every column of the kind's table, all records one after the other, (n,); `log_likelihood` is (n, 32).
+        columns: every column of the kind's table, all records one after the other, (n,);
+            `log_likelihood` is (n, 32).
         with_likelihood: whether a record came with one, (n,).
         errors: index and reason of each message that is no batch.
     """
@@ -130,7 +132,9 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """The head of a batch whose records cannot be used; None where not even that can be read, as of another format."""
+    """The head of a batch whose records cannot be used; None where not even that can be read, as
+    of another format.
+    """
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
     except WireError:
@@ -143,7 +147,8 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     """Read one batch; the inverse of `encode` for every column that was sent.
 
     Raises:
-        WireError: too large, not the message, no needed column, unequal columns, a number that does not fit.
+        WireError: too large, not the message, no needed column, unequal columns, a number that does
+            not fit.
     """
     message = message_of(kind, payload, encoding)
     n = len(getattr(message, NEEDED[kind][0]))
@@ -207,7 +212,9 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Derive what follows from the pose; drop messages of which a number does not fit, or that have no place."""
+    """Derive what follows from the pose; drop messages of which a number does not fit, or that
+    have no place.
+    """
     kind = sent.kind
     columns = found.columns
     bad: dict[int, WireError] = {}
@@ -251,7 +258,9 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
 
 
 def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
-    """Fill what a sender of observations may leave out. `unplaced`: rows without a cell, at a finite position."""
+    """Fill what a sender of observations may leave out. `unplaced`: rows without a cell, at a
+    finite position.
+    """
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])
     if unplaced.any():

@@ -1,7 +1,7 @@
 """Batches, acknowledgements and alerts as bytes. Reading batches: `schemas.wire.batches`.
 
-A batch travels as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON mapping of the same
-message (`application/json`), so that a person can publish with one line.
+A batch travels as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON
+mapping of the same message (`application/json`), so that a person can publish with one line.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ MESSAGES: Final[dict[Kind, type[Any]]] = {
     Kind.OBSERVATION: pb.ObservationBatch,
     Kind.STATE: pb.StateBatch,
 }
-NEEDED: Final = {  # columns without which a batch is none; the first one's length is the number of records
+# columns without which a batch is none; the first one's length is the number of records
+NEEDED: Final = {
     Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
     Kind.STATE: ("time", "latitude", "longitude"),
 }
@@ -78,7 +79,9 @@ WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 
 @cache
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
-    """Name and numpy type of every column of a batch; times are int64 ns, the likelihood is uint8 (n, 32)."""
+    """Name and numpy type of every column of a batch; times are int64 ns, the likelihood is
+    uint8 (n, 32).
+    """
     special: dict[Any, type] = {tables.NS: np.int64, tables.LIKELIHOOD: np.uint8}
     return {
         f.name: np.dtype(special.get(f.type) or f.type.to_pandas_dtype()) for f in _FIELDS[kind]
@@ -89,7 +92,8 @@ def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
 class Batch:
     """One to fifty records of one vehicle in one region.
 
-    `columns` holds every column of the kind's table, shape (n,); `log_likelihood` is (n, 32), or (n, 0) where absent.
+    `columns` holds every column of the kind's table, shape (n,); `log_likelihood` is (n, 32), or
+    (n, 0) where absent.
     """
 
     kind: Kind
@@ -111,7 +115,8 @@ def encode(batch: Batch) -> bytes:
     """Protobuf bytes of a batch.
 
     Raises:
-        WireError: columns of unequal length, too many records, or a column that the kind does not have.
+        WireError: columns of unequal length, too many records, or a column that the kind does not
+            have.
     """
     n = batch.rows
     types = column_types(batch.kind)
@@ -169,9 +174,11 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
 
 
 class StreamAck(NamedTuple):
-    """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of the refused ones.
+    """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of
+    the refused ones.
 
-    `late` are those of the durable that came when the map had gone on; `time` is the service's clock [ns], 0 if untold.
+    `late` are those of the durable that came when the map had gone on; `time` is the service's
+    clock [ns], 0 if untold.
     """
 
     boot: int
@@ -227,7 +234,9 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
 
 @dataclass(frozen=True)
 class Alert:
-    """A cell became slippery (`raised`), or ceased to be, and why; see the message of the same name."""
+    """A cell became slippery (`raised`), or ceased to be, and why; see the message of the same
+    name.
+    """
 
     cell: int
     sector: int

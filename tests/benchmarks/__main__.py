@@ -1,6 +1,8 @@
-"""`make bench`: what each part costs, each against a limit or a peer measured in the same run where there is one.
+"""`make bench`: what each part costs, each against a limit or a peer measured in the same run where
+there is one.
 
-Writes `.bench/figures.json` and prints the table. `python -m tests.benchmarks NAME ...` runs some parts only.
+Writes `.bench/figures.json` and prints the table. `python -m tests.benchmarks NAME ...` runs some
+parts only.
 """
 
 from __future__ import annotations

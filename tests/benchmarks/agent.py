@@ -1,4 +1,6 @@
-"""The edge agent as processes: how soon it answers, what a vehicle costs, how many a core carries, how jobs scale."""
+"""The edge agent as processes: how soon it answers, what a vehicle costs, how many a core
+carries, how jobs scale.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ LOG_S = 60.0
 
 
 def agent() -> list[Figure]:
-    """The edge agent's processes: start, a vehicle's share of a core, vehicles on a core, replay with two jobs."""
+    """The edge agent's processes: start, a vehicle's share of a core, vehicles on a core, replay
+    with two jobs.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with stage(folder / "stage") as there:
@@ -111,7 +115,8 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
 def watched(pid: int) -> tuple[float, resource.struct_rusage]:
     """Peak resident memory [MB] of a process, looked at until it ends, and what it used.
 
-    The peak that the system tells at the end counts from the fork on, when the memory was still that of its parent.
+    The peak that the system tells at the end counts from the fork on, when the memory was still
+    that of its parent.
     """
     peak = 0.0
     gone = 0
@@ -129,7 +134,9 @@ def watched(pid: int) -> tuple[float, resource.struct_rusage]:
 
 
 def live(folder: Path, endpoint: str) -> list[Figure]:
-    """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not count."""
+    """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not
+    count.
+    """
     log, vehicle = drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (
         "run",
@@ -152,8 +159,8 @@ def live(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def fleet(folder: Path, endpoint: str) -> list[Figure]:
-    """Measure how many vehicles a core carries in real time: plant, estimator, publishing; from the CPU of a whole
-    fleet."""
+    """Measure how many vehicles a core carries in real time: plant, estimator, publishing; from the
+    CPU of a whole fleet."""
     words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
     used(folder, endpoint, *words, str(WARM_S))
     short, _ = used(folder, endpoint, *words, str(START_S))
@@ -170,7 +177,9 @@ def fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def replay(folder: Path) -> list[Figure]:
-    """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet included."""
+    """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet
+    included.
+    """
     logs = [drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])
     vehicle = load_vehicle(logs[0][1])

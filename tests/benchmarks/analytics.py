@@ -1,7 +1,8 @@
-"""`make analytics-bench`: archive and analytics on ten million synthetic observations, every bar of theirs in one file.
+"""`make analytics-bench`: archive and analytics on ten million synthetic observations, every bar of
+theirs in one file.
 
-Writes `.analytics/figures.json` and prints the table; `--rows` tries it with fewer. Durations are wall time on two
-threads, medians of ROUNDS; rows per second of the compaction are per CPU second.
+Writes `.analytics/figures.json` and prints the table; `--rows` tries it with fewer. Durations are
+wall time on two threads, medians of ROUNDS; rows per second of the compaction are per CPU second.
 """
 
 from __future__ import annotations
@@ -159,7 +160,9 @@ def small(root: Path) -> dict[int, pa.Table]:
 
 
 def agreement(root: Path, readings: Path) -> list[Figure]:
-    """Files that a validator refuses, readers that fail, questions that engines answer differently."""
+    """Files that a validator refuses, readers that fail, questions that engines answer
+    differently.
+    """
     invalid = sum(bool(_refused(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
     readers = READERS | ({"spark": by_spark} if find_spec("pyspark") else {})

@@ -1,4 +1,6 @@
-"""`make batch-bench`: what batch work makes of an archive and of drives, beside them; writes .batch/figures.json."""
+"""`make batch-bench`: what batch work makes of an archive and of drives, beside them; writes
+.batch/figures.json.
+"""
 
 from __future__ import annotations
 

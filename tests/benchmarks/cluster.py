@@ -1,6 +1,8 @@
-"""Cost of a second copy: acknowledgements of a service with a bucket copy and of one without, in turn.
+"""Cost of a second copy: acknowledgements of a service with a bucket copy and of one without, in
+turn.
 
-The copy is a real S3 server on this machine, a process of its own; a bucket over a network adds its way there.
+The copy is a real S3 server on this machine, a process of its own; a bucket over a network adds its
+way there.
 """
 
 from __future__ import annotations

@@ -90,7 +90,9 @@ def batches(o: Observations) -> Iterator[Observations]:
 
 
 def per_observation_s(cells: int, per_s: int = 5_000) -> float:
-    """Processor seconds per observation in a fusion of so many cells: median over ROUNDS minutes."""
+    """Processor seconds per observation in a fusion of so many cells: median over ROUNDS
+    minutes.
+    """
     fusion, rng = filled(cells, 1, 600.0)
     spent = []
     for minute in range(ROUNDS + 3):  # until the window is full
@@ -103,7 +105,9 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 
 def table_vs_dict() -> float:
-    """Time of a look-up in 10⁶ keys by numba's typed dictionary over that by the store's table, in turns of BATCH."""
+    """Time of a look-up in 10⁶ keys by numba's typed dictionary over that by the store's table,
+    in turns of BATCH.
+    """
     keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
     turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))
     store = Store()
@@ -138,7 +142,9 @@ def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 numba's ow
 
 
 def resident() -> None:
-    """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a day."""
+    """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a
+    day.
+    """
     import fleet_service.app.service  # noqa: F401 what a service has loaded
     from fleet_service.serve.map_state import MapState
 
@@ -151,7 +157,9 @@ def resident() -> None:
 
 
 def fusion() -> list[Figure]:
-    """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and their memory."""
+    """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and
+    their memory.
+    """
     few = per_observation_s(10_000)
     many = per_observation_s(CELLS)
     command = [sys.executable, "-c", RESIDENT]

@@ -1,8 +1,10 @@
-"""Growth of a stream's cost with its rate: the engine's processor time from 10³ to 10⁵ observations a second.
+"""Growth of a stream's cost with its rate: the engine's processor time from 10³ to 10⁵ observations
+a second.
 
-Ten observations to a message, one message a second of each vehicle: more rate is more vehicles, as in life. A second of
-the stream is taken in turns, then comes what a second brings: segment, acknowledgements, tiles. The stream's clock is
-made up, so that a rate which the machine could not keep is measured as well. Without the network.
+Ten observations to a message, one message a second of each vehicle: more rate is more vehicles, as
+in life. A second of the stream is taken in turns, then comes what a second brings: segment,
+acknowledgements, tiles. The stream's clock is made up, so that a rate which the machine could not
+keep is measured as well. Without the network.
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ def growth() -> list[Figure]:
 
 
 def second_s(rate: int, seconds: int) -> float:
-    """Processor time [s] of a second of the stream, after a warm-up; half way an epoch ends and is settled."""
+    """Processor time [s] of a second of the stream, after a warm-up; half way an epoch ends and
+    is settled.
+    """
     vehicles = rate // ROWS
     spent = 0.0
     begin = time.time_ns() // EPOCH_NS * EPOCH_NS - (WARM_S + seconds // 2) * SECOND

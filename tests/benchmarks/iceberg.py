@@ -1,4 +1,6 @@
-"""Rows of an archive beside those of its Iceberg tables; `make batch-bench` counts how many differ."""
+"""Rows of an archive beside those of its Iceberg tables; `make batch-bench` counts how many
+differ.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Rows, with all their columns, that are in the compacted files or in the tables and not in both as often."""
+    """Rows, with all their columns, that are in the compacted files or in the tables and not in
+    both as often.
+    """
     different = 0
     for kind in Kind:
         files = [
@@ -51,7 +55,9 @@ def _counted(table: pa.Table) -> Counter[str]:
 
 
 def measured(folder: Path) -> float:
-    """Rows that differ over four rounds of compaction and registration, and after a day has gone by retention."""
+    """Rows that differ over four rounds of compaction and registration, and after a day has gone
+    by retention.
+    """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"
     place = iceberg.Place(uri, iceberg.NAMESPACE, root.as_uri())

@@ -1,8 +1,10 @@
-"""Ingest: bytes → decoded, admitted, fused, in a synced Parquet segment, acknowledged; without the network.
+"""Ingest: bytes → decoded, admitted, fused, in a synced Parquet segment, acknowledged; without the
+network.
 
-Every round sends fresh batches of many vehicles to a new archive. The limit beside it is a subscriber that does nothing
-but decode the same messages, with protobuf's own module, into one array a column.
-CPU time beside wall time, because other work on the machine slows the one and not the other.
+Every round sends fresh batches of many vehicles to a new archive. The limit beside it is a
+subscriber that does nothing but decode the same messages, with protobuf's own module, into one
+array a column. CPU time beside wall time, because other work on the machine slows the one and not
+the other.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ def ingest() -> list[Figure]:
 
 
 def rates(records: int) -> tuple[tuple[float, float], float, float]:
-    """Observations per second and per CPU second; per CPU second of decoding alone, the module's and ours.
+    """Observations per second and per CPU second; per CPU second of decoding alone, the module's
+    and ours.
 
     Medians after a warm-up.
     """
@@ -147,7 +150,8 @@ def _take(sent: list[Message], records: int) -> tuple[float, float]:
     ):
         turn = turn_of(sent)
         gc.collect()
-        gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for
+        # as the service does when it starts: the messages of a benchmark are no garbage to look for
+        gc.freeze()
         wall = time.perf_counter()
         cpu = time.process_time()
         for at in range(0, len(sent), turn):

@@ -1,4 +1,6 @@
-"""The limits for an estimator, compiled when the benchmark runs: kernel.c for one, kernel_simd.c for a bank of them."""
+"""The limits for an estimator, compiled when the benchmark runs: kernel.c for one, kernel_simd.c
+for a bank of them.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,9 @@ def setting_row(memberships: Memberships) -> FloatArray:
 
 
 def first_memory(first: FloatArray, speed: float) -> FloatArray:
-    """Filters (N, doubles) at their first readings (N, 11) and speed [m/s], as both kernels' structs hold them."""
+    """Filters (N, doubles) at their first readings (N, 11) and speed [m/s], as both kernels'
+    structs hold them.
+    """
     setting = Setting()
     (count, inputs) = first.shape
     turned = FACTOR + ROWS + inputs
@@ -101,7 +105,9 @@ class Limit:
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample; speed [m/s]."""
+        """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample;
+        speed [m/s].
+        """
         self._library = library("kernel.c", "-fopenmp")
         self._parameters = np.ascontiguousarray(parameters)
         self._setting = setting_row(memberships)
@@ -150,7 +156,9 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Means (T, N/lanes, 6, lanes) after each of the readings `side_by_side`, `gone` [s] apart."""
+        """Means (T, N/lanes, 6, lanes) after each of the readings `side_by_side`, `gone` [s]
+        apart.
+        """
         samples, blocks, _, lanes = readings.shape
         out = aligned(samples, blocks, STATES, lanes)
         self._library.drive(

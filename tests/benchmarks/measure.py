@@ -24,7 +24,9 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def paired(
     ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
 ) -> tuple[float, float]:
-    """Median durations [s] of two works in turn, after a warm-up of each, so that both see the same machine."""
+    """Median durations [s] of two works in turn, after a warm-up of each, so that both see the
+    same machine.
+    """
     ours(), other()
     spent: tuple[list[float], list[float]] = ([], [])
     for _ in range(rounds):

@@ -1,7 +1,9 @@
-"""`make page-bench`: the live page measured, beside MapLibre with the same cells as GeoJSON in the same browser.
+"""`make page-bench`: the live page measured, beside MapLibre with the same cells as GeoJSON in the
+same browser.
 
-Writes `.page/figures.json` and prints the table. Times are of this machine and its software renderer: they are worth
-something beside each other only. Wants Chromium, and npm for MapLibre and axe-core; what is missing fails its row.
+Writes `.page/figures.json` and prints the table. Times are of this machine and its software
+renderer: they are worth something beside each other only. Wants Chromium, and npm for MapLibre and
+axe-core; what is missing fails its row.
 """
 
 from __future__ import annotations
@@ -58,7 +60,8 @@ VIEWPORT: Final = {"width": 1600, "height": 1100}
 ROUNDS: Final = 3
 ALL: Final = (*FOUR, *TWO, LITTLE, GROUND)
 
-# A picture counts from the moment at which all cells were painted; performance.now() begins with the navigation.
+# A picture counts from the moment at which all cells were painted; performance.now() begins with
+# the navigation.
 _WATCH: Final = """
   globalThis.shown = null; globalThis.numbers = [];
   document.addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
@@ -69,8 +72,8 @@ _WATCH: Final = """
     }
   }).observe(document.body, { attributeFilter: ["data-drawn"] }));
 """.replace("CELLS", str(CELLS))
-# Moved at each frame of the browser, as a hand does; what was painted counts. To wait for each picture before the next
-# move would leave every second frame without one.
+# Moved at each frame of the browser, as a hand does; what was painted counts. To wait for each
+# picture before the next move would leave every second frame without one.
 _MOVES: Final = """async () => {
   const began = performance.now(), before = painted();
   for (let k = 0; performance.now() - began < 3000; k++) {
@@ -128,7 +131,9 @@ def opened(address: str) -> Iterator[Opened]:
 
 
 def drawn(on: Stage) -> dict[str, float]:
-    """First picture and frames, ours and MapLibre's in turn; what the page asked of others, and said in errors."""
+    """First picture and frames, ours and MapLibre's in turn; what the page asked of others, and
+    said in errors.
+    """
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
     errors = list[str]()
@@ -167,7 +172,9 @@ def drawn(on: Stage) -> dict[str, float]:
 
 @contextmanager
 def maplibre(on: Stage) -> Iterator[str | None]:
-    """The address of MapLibre with the town as GeoJSON, from a server of this process; None where npm has none."""
+    """The address of MapLibre with the town as GeoJSON, from a server of this process; None
+    where npm has none.
+    """
     files = [npm.file_of("maplibre-gl", path) for path in npm.PACKAGES["maplibre-gl"].files]
     if not all(files):
         print("  no MapLibre: npm did not fetch it", file=sys.stderr)
@@ -199,7 +206,9 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 
 
 def pushed_ms(on: Stage) -> float:
-    """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed cells a second."""
+    """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed
+    cells a second.
+    """
     with opened(seen_town(on.address, on.town)) as seen:
         tiles = list(on.town.tiles)
         put = dict[int, float]()
@@ -247,7 +256,9 @@ def bytes_per_cell(on: Stage) -> float:
 
 
 async def _watched(on: Stage, count: int) -> float:
-    """95 % of the times [s] from a put to each of so many watchers; infinite where one heard less than all."""
+    """95 % of the times [s] from a put to each of so many watchers; infinite where one heard
+    less than all.
+    """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
     local = on.town.local(on.town.marker)
@@ -289,8 +300,8 @@ def _get(address: str) -> bytes:
 
 
 def watchers(on: Stage) -> float:
-    """Return how many watchers get 95 % of the pushes within a second, the page on one core; 0 if fewer than the least
-    tried."""
+    """Return how many watchers get 95 % of the pushes within a second, the page on one core; 0 if
+    fewer than the least tried."""
     pinned(on.process, 0)
     for count in WATCHERS:
         late = asyncio.run(_watched(on, count))

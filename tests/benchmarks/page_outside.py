@@ -84,9 +84,11 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Publications that are not valid, and situations whose alert was over and that were not ended, of STEPS steps.
+    """Publications that are not valid, and situations whose alert was over and that were not ended,
+    of STEPS steps.
 
-    Alerts of cells on a road come and go at random. NaN where the schema is not there, or hardly anything ended.
+    Alerts of cells on a road come and go at random. NaN where the schema is not there, or hardly
+    anything ended.
     """
     rng = np.random.default_rng(SEED)
     stretches = Stretches()
@@ -139,10 +141,12 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
 
 
 def driven() -> dict[str, float]:
-    """A service, the page and six cars on ice that melts: what the page's publication and its features say.
+    """A service, the page and six cars on ice that melts: what the page's publication and its
+    features say.
 
-    `leaked`: cells of situations that the map does not call measured; `unended`: situations that a pull finds open when
-    their alert is over; `readers_failed`: of GDAL, geopandas and, where it is there, ogrinfo.
+    `leaked`: cells of situations that the map does not call measured; `unended`: situations that a
+    pull finds open when their alert is over; `readers_failed`: of GDAL, geopandas and, where it is
+    there, ogrinfo.
     """
     street.PARTS["melted"] = street.PARTS["ice"]._replace(mu=0.85)
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")

@@ -1,4 +1,6 @@
-"""A town of twenty thousand cells in front of the page: a router, who answers for it as a service does, the page."""
+"""A town of twenty thousand cells in front of the page: a router, who answers for it as a
+service does, the page.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local(self, tile: int) -> int:
-        """Place of a tile's marker, within it: the first cell, whose count of vehicles is a put's number."""
+        """Place of a tile's marker, within it: the first cell, whose count of vehicles is a
+        put's number.
+        """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
     def _columns(self, cells: IntArray) -> dict[str, Any]:

@@ -33,7 +33,9 @@ QUERIES = 15
 
 
 def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
-    """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a restart."""
+    """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a
+    restart.
+    """
     synthetic.write(root, WORLD)
     compact(root)
     synthetic.write(root, SyntheticFleet(20_000, 1, seed=1))  # rows that are not compacted yet

@@ -1,4 +1,6 @@
-"""The same process and measurement as kernel.c in numpy, for the filters that people would take from a library."""
+"""The same process and measurement as kernel.c in numpy, for the filters that people would take
+from a library.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""`make roads-bench`: how often the join of cells to links is right, against SUMO's traffic in the centre of Helsinki.
+"""`make roads-bench`: how often the join of cells to links is right, against SUMO's traffic in the
+centre of Helsinki.
 
 Each fix has an error of NOISE_M on either axis. Writes `.roads/figures.json` and prints the table.
 """
@@ -28,7 +29,9 @@ SECONDS = 600
 
 
 class Traffic(NamedTuple):
-    """Fixes of moving vehicles, each (n,): [deg], yaw [rad from east], and the way that they were on."""
+    """Fixes of moving vehicles, each (n,): [deg], yaw [rad from east], and the way that they
+    were on.
+    """
 
     latitude: FloatArray
     longitude: FloatArray

@@ -1,4 +1,5 @@
-"""Running service under load: queries compared with a bare queryable, and alerts from publication to subscriber.
+"""Running service under load: queries compared with a bare queryable, and alerts from publication
+to subscriber.
 
 Router, service, load, bare queryable and client are processes of their own, as in life.
 """
@@ -167,9 +168,11 @@ def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
 
 
 def alert_delays_ms(session: zenoh.Session) -> list[float]:
-    """From the second vehicle's publish to the alert of its cell at a subscriber, each far from all others.
+    """From the second vehicle's publish to the alert of its cell at a subscriber, each far from all
+    others.
 
-    Alerts of neighbours, and those that are repeated for who was away, are not the one that is waited for.
+    Alerts of neighbours, and those that are repeated for who was away, are not the one that is
+    waited for.
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
@@ -196,7 +199,8 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
 
 
 def ack_delays_s(session: zenoh.Session) -> list[float]:
-    """From a vehicle's publish to its acknowledgement, of batches at times that have nothing to do with the service's.
+    """From a vehicle's publish to its acknowledgement, of batches at times that have nothing to do
+    with the service's.
 
     Raises:
         TimeoutError: one was not acknowledged.
@@ -228,7 +232,9 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
 
 
 def service() -> list[Figure]:
-    """Queries, alerts and acknowledgements under 20 000 observations/s, beside a queryable that does nothing."""
+    """Queries, alerts and acknowledgements under 20 000 observations/s, beside a queryable that
+    does nothing.
+    """
     tile = keys.map_key(_TILE)
     west, south, east, north = (
         float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))

@@ -1,7 +1,8 @@
-"""Two services with a region each beside one with both: a burst until the last of it is acknowledged.
+"""Two services with a region each beside one with both: a burst until the last of it is
+acknowledged.
 
-Twice: the engines alone, a process each, on messages that lie ready; and whole services over Zenoh, where the router
-and the sender need a share of the same cores, which a fleet's would not.
+Twice: the engines alone, a process each, on messages that lie ready; and whole services over Zenoh,
+where the router and the sender need a share of the same cores, which a fleet's would not.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """A burst into one service, and into two that share its regions: engines alone, and whole over Zenoh."""
+    """A burst into one service, and into two that share its regions: engines alone, and whole
+    over Zenoh.
+    """
     sent = [_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
     whole = [statistics.median(services_s(sent, split)) for split in (1, 2)]
@@ -88,7 +91,9 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
 
 
 def _round(running: Sequence[subprocess.Popen[str]]) -> float:
-    """Tell all to go on, and wait until all have said that they did; the first round is their start."""
+    """Tell all to go on, and wait until all have said that they did; the first round is their
+    start.
+    """
     began = time.perf_counter()
     for process in running:
         assert process.stdin is not None

@@ -1,4 +1,6 @@
-"""Drives and zones that Spark spreads, beside the same ones done here; `make batch-bench` counts what differs."""
+"""Drives and zones that Spark spreads, beside the same ones done here; `make batch-bench` counts
+what differs.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ SEEDS: Final = (101, 102, 103, 104)
 WORLD: Final = SyntheticFleet(rows=40_000, days=1, vehicles=60, roads=8, length=60, icy=4, seed=101)
 ESTIMATOR: Final = "aco-fckf"
 DRIVE_S: Final = 120.0
-COPIES: Final = 6  # of each drive: some ten seconds of work on one core, beside which Spark's own tenths are little
+# of each drive: some ten seconds of work on one core, beside which Spark's own tenths are little
+COPIES: Final = 6
 ROUNDS: Final = 3
 
 
@@ -46,7 +49,9 @@ def drives(folder: Path) -> list[Path]:
 
 
 def replay_difference(logs: Sequence[Path], folder: Path) -> float:
-    """Files of estimates that are not, byte for byte, those of this machine, though each task was killed once."""
+    """Files of estimates that are not, byte for byte, those of this machine, though each task
+    was killed once.
+    """
     here = folder / "here"
     there = folder / "there"
     tries = folder / "tries"
@@ -63,7 +68,9 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
 
 
 def rebuild_difference(folder: Path) -> float:
-    """The largest difference of a number of two rebuilt maps, one here and one on Spark with each task killed once."""
+    """The largest difference of a number of two rebuilt maps, one here and one on Spark with
+    each task killed once.
+    """
     archive, here, there, tries = (folder / name for name in ("archive", "here", "there", "tries"))
     fill(archive, WORLD)
     here.mkdir()
@@ -85,7 +92,9 @@ def rebuild_difference(folder: Path) -> float:
 
 
 def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
-    """Drives per second on two local cores over those on one: median of rounds in turn, with workers that are warm."""
+    """Drives per second on two local cores over those on one: median of rounds in turn, with
+    workers that are warm.
+    """
     tasks = [
         Task(log, log.with_suffix(".json"), folder / f"{log.stem}-{copy}.parquet")
         for copy in range(COPIES)

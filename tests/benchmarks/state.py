@@ -1,7 +1,8 @@
 """A million cells: a checkpoint while ingest goes on, and a restart from it with what came since.
 
-The checkpoint is what a restart begins from; it is asked for as the service's upkeep does, beside a worker that takes
-messages all the time. The restart is a process of its own: imports, checkpoint, rows since, kernels, session, ready.
+The checkpoint is what a restart begins from; it is asked for as the service's upkeep does, beside a
+worker that takes messages all the time. The restart is a process of its own: imports, checkpoint,
+rows since, kernels, session, ready.
 """
 
 from __future__ import annotations
@@ -49,7 +50,10 @@ def state() -> list[Figure]:
             took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
             cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
-    told = f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} ms at the most"
+    told = (
+        f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} "
+        "ms at the most"
+    )
     return [
         Figure("bench.state.snapshot_s", took, told, 1),
         Figure(
@@ -62,7 +66,8 @@ def state() -> list[Figure]:
 
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
-    """From the question to the checkpoint on disk, and the longest turn of the worker meanwhile [s].
+    """From the question to the checkpoint on disk, and the longest turn of the worker meanwhile
+    [s].
 
     All of `sent` is taken, half of it after the checkpoint.
     """

@@ -1,4 +1,6 @@
-"""A step of a six-state filter over four tyres against C, and against what people would write or take instead."""
+"""A step of a six-state filter over four tyres against C, and against what people would write or
+take instead.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +123,9 @@ def step() -> list[Figure]:
 
 
 def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
-    """Seconds of a call with one sample, which is at hand; median over rounds of CALLS, of which the first warms up."""
+    """Seconds of a call with one sample, which is at hand; median over rounds of CALLS, of which
+    the first warms up.
+    """
     spent = []
     for begin in range(0, SAMPLES, CALLS):
         samples = [(t[k : k + 1], signals[k : k + 1]) for k in range(begin, begin + CALLS)]
@@ -133,7 +137,9 @@ def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
 
 
 def bank() -> list[Figure]:
-    """Many vehicles on two threads, against C on as many, and what more of them do to the cost of one."""
+    """Many vehicles on two threads, against C on as many, and what more of them do to the cost
+    of one.
+    """
     drive = Drive()
     speed = same_filter(drive)
     found = []
@@ -170,7 +176,8 @@ def bank() -> list[Figure]:
 
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
-    """Duration of the bank over that of C with the vehicles side by side in vectors, one thread each.
+    """Duration of the bank over that of C with the vehicles side by side in vectors, one thread
+    each.
 
     Every vehicle has noise of its own, so that no lane may stand for another.
 

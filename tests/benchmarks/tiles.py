@@ -1,7 +1,8 @@
-"""Thin traffic over many tiles: how long an acknowledgement takes beside them, and a tile behind who asks for all.
+"""Thin traffic over many tiles: how long an acknowledgement takes beside them, and a tile behind
+who asks for all.
 
-1 600 vehicles, each in a row of five tiles of its own, go back and forth and send a visit each 1.07 s. Router, service,
-vehicles and readers are processes of their own.
+1 600 vehicles, each in a row of five tiles of its own, go back and forth and send a visit each 1.07
+s. Router, service, vehicles and readers are processes of their own.
 """
 
 from __future__ import annotations
@@ -102,7 +103,9 @@ class Acks:
 
 
 def drive(endpoint: str) -> None:
-    """Send until the time is over, wait for what is not acknowledged, and say how long each took."""
+    """Send until the time is over, wait for what is not acknowledged, and say how long each
+    took.
+    """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     acks = Acks(session)
@@ -157,7 +160,9 @@ def read(endpoint: str) -> None:
 
 
 def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
-    """Return the times [ms] of queries for one tile while READERS query everything, until each has an answer."""
+    """Return the times [ms] of queries for one tile while READERS query everything, until each
+    has an answer.
+    """
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
     got: list[list[int]] = [[] for _ in readers]
@@ -189,7 +194,9 @@ def _count(reader: subprocess.Popen[str], got: list[int]) -> None:
 
 
 def tiles() -> list[Figure]:
-    """1 500 visits/s over 8 000 tiles: acknowledgements, tiles put, and a small question behind large ones."""
+    """1 500 visits/s over 8 000 tiles: acknowledgements, tiles put, and a small question behind
+    large ones.
+    """
     puts: dict[str, int] = {}
 
     def hear(sample: zenoh.Sample) -> None:

@@ -1,10 +1,12 @@
-"""The manifests of deploy/kubernetes: built by kustomize, held against Kubernetes' schemas, and their pods started.
+"""The manifests of deploy/kubernetes: built by kustomize, held against Kubernetes' schemas, and
+their pods started.
 
     python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid, kube.commands_failed
 
-A pod is its containers as processes with command, environment and mounts of the manifest; each path of a mount lies
-below a folder of that pod, and names of pods and their ports are those of this machine. Nothing is applied to a
-cluster: what only a cluster has (volumes' kinds, policies, load balancers) is looked at in the text.
+A pod is its containers as processes with command, environment and mounts of the manifest; each path
+of a mount lies below a folder of that pod, and names of pods and their ports are those of this
+machine. Nothing is applied to a cluster: what only a cluster has (volumes' kinds, policies, load
+balancers) is looked at in the text.
 """
 
 from __future__ import annotations
@@ -240,7 +242,9 @@ class Cluster:
 
     @contextmanager
     def running(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
-        """Every pod started; each probe answers before the block begins, and each leaves well after it."""
+        """Every pod started; each probe answers before the block begins, and each leaves well
+        after it.
+        """
         kept = cache_root()
         image = self.root / "image-cache"
         image.mkdir()
@@ -304,7 +308,9 @@ class Cluster:
                 return
 
     def fetch(self, pod: Pod, path: str) -> str:
-        """A page of a pod's metrics server; empty while a standby that takes over closes its own for the service's."""
+        """A page of a pod's metrics server; empty while a standby that takes over closes its own
+        for the service's.
+        """
         (container,) = pod.containers
         address = f"http://127.0.0.1:{pod.port(container, 'metrics')}{path}"
         try:
@@ -369,7 +375,8 @@ def main() -> int:
                 started += len(running.pods)
             failed += [f"{overlay}: {line}" for line in running.failed]
             print(
-                f"{overlay}: {len(found)} objects, {len(running.pods)} pods in {time.monotonic() - began:.0f} s"
+                f"{overlay}: {len(found)} objects, {len(running.pods)} pods in "
+                f"{time.monotonic() - began:.0f} s"
             )
     for line in (*wrong, *failed):
         print(line)

@@ -156,7 +156,9 @@ def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path)
 def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Count two warned passes and one unwarned pass since the first alert; earlier ones do not count."""
+    """Count two warned passes and one unwarned pass since the first alert; earlier ones do not
+    count.
+    """
     driven = visits(
         ("sim-001", 1.0, 7, 0.9, 0.5),
         ("sim-002", 11.0, 7, 0.2, 1.0),
@@ -174,7 +176,8 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     ]
     assert (
         grip.line()
-        == "Over the new ice, once it was known: 1 of 2 warned drivers lost grip, 1 of 1 who were not warned."
+        == "Over the new ice, once it was known: 1 of 2 warned drivers lost grip, 1 of 1 who were "
+        "not warned."
     )
     nobody = compare.lost_grip(driven, [], 10 * S, 0.5)
     assert not len(nobody.lost), "nobody knew of it"

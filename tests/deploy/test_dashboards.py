@@ -1,4 +1,6 @@
-"""The board and the rules ask for metrics that a service or an agent really shows, and the handbook knows each rule."""
+"""The board and the rules ask for metrics that a service or an agent really shows, and the
+handbook knows each rule.
+"""
 
 from __future__ import annotations
 

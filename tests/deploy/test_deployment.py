@@ -1,6 +1,8 @@
-"""The shipped units, compose file and configurations: checked by their own tools, and started as they are written.
+"""The shipped units, compose file and configurations: checked by their own tools, and started as
+they are written.
 
-Only folders and ports are others than in a deployment: the files' text is taken as it is but for these.
+Only folders and ports are others than in a deployment: the files' text is taken as it is but for
+these.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The manifests for Kubernetes are what its schemas allow, each reference leads somewhere, and the pods' commands run.
+"""The manifests for Kubernetes are what its schemas allow, each reference leads somewhere, and the
+pods' commands run.
 
 What is started stands in `tests.deploy.kubernetes`. Nothing is applied to a cluster.
 """
@@ -85,7 +86,9 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_network_policies_reach_routers_but_never_services(overlay: str) -> None:
-    """As a cluster applies them: what a pod may do is what any policy that selects it lets it do."""
+    """As a cluster applies them: what a pod may do is what any policy that selects it lets it
+    do.
+    """
     objects = built(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]
     (router,) = (
@@ -106,7 +109,9 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_container_is_shut_in_and_bounded(overlay: str) -> None:
-    """The restricted profile of the pod security standards, which the namespace enforces, and more."""
+    """The restricted profile of the pod security standards, which the namespace enforces, and
+    more.
+    """
     for template in templates(built(overlay)):
         pod = template["spec"]
         assert pod["securityContext"]["runAsNonRoot"] is True

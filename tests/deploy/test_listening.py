@@ -1,4 +1,6 @@
-"""The town that listens: what it hears it does not say again, and its figures mean what they say."""
+"""The town that listens: what it hears it does not say again, and its figures mean what they
+say.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Drives over the ground, made-up estimates and logs for tests of the rim: what it reads, nothing of a filter."""
+"""Drives over the ground, made-up estimates and logs for tests of the rim: what it reads,
+nothing of a filter.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,9 @@ def estimates(
 def ground(
     east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1
 ) -> Block:
-    """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every few samples."""
+    """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every
+    few samples.
+    """
     shape = east.shape
     t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
     signals = np.full((*shape, len(CHANNELS)), np.nan)
@@ -128,7 +132,9 @@ def part(block: Block, rows: slice) -> Block:
 
 
 def a_log(samples: int) -> dict[str, Any]:
-    """Columns of a log at 100 Hz with every channel, of random numbers; rolling straight ahead would look like this."""
+    """Columns of a log at 100 Hz with every channel, of random numbers; rolling straight ahead
+    would look like this.
+    """
     rng = np.random.default_rng(4)
     columns: dict[str, Any] = {name: rng.normal(0.0, 0.1, samples) for name in CHANNELS}
     columns |= {
@@ -139,7 +145,9 @@ def a_log(samples: int) -> dict[str, Any]:
 
 
 def _written(**changes: object) -> Callable[[Path], object]:
-    """Writes a log of five samples with some columns replaced, or left out where the change is None."""
+    """Writes a log of five samples with some columns replaced, or left out where the change is
+    None.
+    """
 
     def write(path: Path) -> None:
         columns = {

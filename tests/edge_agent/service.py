@@ -1,4 +1,6 @@
-"""A router on a free port and a small service that keeps batches and acknowledges them, over real Zenoh sessions."""
+"""A router on a free port and a small service that keeps batches and acknowledges them, over
+real Zenoh sessions.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ class Router:
 
 @dataclass
 class Service:
-    """Keeps what it is sent; acknowledges it when `answer` is set; `refuse(batch)` gives a reason to reject."""
+    """Keeps what it is sent; acknowledges it when `answer` is set; `refuse(batch)` gives a
+    reason to reject.
+    """
 
     router: Router
     answer: bool = True

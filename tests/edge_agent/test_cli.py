@@ -163,7 +163,10 @@ def test_replay_publishes_at_the_time_of_the_drive_and_waits(
     assert np.datetime64(int(enter.max()), "ns") < np.datetime64("2026-01-31T07:00:08")
 
 
-IMPATIENT = "import sys; from edge_agent.cli import main, replay; replay.DRAIN_S = .5; sys.exit(main(sys.argv[1:]))"
+IMPATIENT = (
+    "import sys; from edge_agent.cli import main, replay; replay.DRAIN_S = .5; "
+    "sys.exit(main(sys.argv[1:]))"
+)
 
 
 @pytest.mark.parametrize("well", [True, False])
@@ -495,7 +498,10 @@ def test_every_command_explains_itself(name: str, capsys: Output) -> None:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    script = "import sys; from edge_agent.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    script = (
+        "import sys; from edge_agent.cli import main\ntry: main(['--help'])\nexcept "
+        "SystemExit: pass\n"
+    )
     heavy = (
         "print([m for m in ('numba', 'numpy', 'pyarrow', 'zenoh', 'pydantic') if m in sys.modules])"
     )

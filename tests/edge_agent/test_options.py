@@ -64,7 +64,8 @@ SIMULATE = {
     },
     "--no-torque": [*SIMULATED, "--no-torque"],
 }
-# run, fleet, tune: option -> the words that are added to those of USUAL; `{0}` and `{1}` are two drives
+# run, fleet, tune: option -> the words that are added to those of USUAL; `{0}` and `{1}` are two
+# drives
 USUAL = {
     "run": ["run"],
     "fleet": ["fleet", "--vehicles", "3"],
@@ -105,7 +106,8 @@ CHANGED: dict[tuple[str, str], list[str]] = {
 }
 REPLAYED = "test_replay_depends_on_log_vehicle_estimator_and_configuration"
 SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
-# what the other options of the commands do is told by the tests named here, in whose modules they are given
+# what the other options of the commands do is told by the tests named here, in whose modules they
+# are given
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
@@ -199,7 +201,8 @@ OBSERVED = {
     "trip_end_s": 3.0,
     "tyre_season": 2,
 }
-# none by default; tested with the corrections (inputs/test_adopt.py) and with the prior (schemas/test_vehicle_axles.py)
+# none by default; tested with the corrections (inputs/test_adopt.py) and with the prior
+# (schemas/test_vehicle_axles.py)
 OPTIONAL = {
     "wheel_radius_front",
     "wheel_radius_rear",
@@ -278,8 +281,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """Record what a live command passes to the loop: vehicles, names, signals, settings, estimator, duration; and its
-    files."""
+    """Record what a live command passes to the loop: vehicles, names, signals, settings, estimator,
+    duration; and its files."""
     seen: list[object] = []
 
     def note(
@@ -453,7 +456,9 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     estimator: str, name: str
 ) -> None:
-    """One fifth more of it; `name` is what a vehicle publishes under, and 002 drives every wheel by its own motor."""
+    """One fifth more of it; `name` is what a vehicle publishes under, and 002 drives every wheel
+    by its own motor.
+    """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()
     broken[150:, 11:15] = np.nan  # without torque, the drive's split matters

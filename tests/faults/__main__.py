@@ -1,4 +1,6 @@
-"""`python -m tests.faults [--quick] [--only NAME …] [--out DIR] [--seed N]`: run the campaigns, print the table."""
+"""`python -m tests.faults [--quick] [--only NAME …] [--out DIR] [--seed N]`: run the campaigns,
+print the table.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,11 @@
-"""An archive that has grown old: how long a service takes to be ready on it, and what a question about the past costs.
+"""An archive that has grown old: how long a service takes to be ready on it, and what a question
+about the past costs.
 
-20 million observations and 40 million states of six days, made once and kept in `age-archive` beside the campaigns'
-folders. A service begins from Parquet alone, takes a checkpoint, and begins from that and the little that came since.
-Each is measured in a process of its own, by the most memory that it ever had. At last one day of it is begun from
-alone, and with the other days as if they were months old: what no longer matters costs nothing.
+20 million observations and 40 million states of six days, made once and kept in `age-archive`
+beside the campaigns' folders. A service begins from Parquet alone, takes a checkpoint, and begins
+from that and the little that came since. Each is measured in a process of its own, by the most
+memory that it ever had. At last one day of it is begun from alone, and with the other days as if
+they were months old: what no longer matters costs nothing.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty million observations and twice as many states, and a tenth and a third of them; in a quick run, eighty
-    thousand."""
+    """Twenty million observations and twice as many states, and a tenth and a third of them; in a
+    quick run, eighty thousand."""
     millions = site.of(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)
     smaller = [_smaller(site, millions * share) for share in shares]
@@ -122,7 +124,9 @@ def _made(site: Site, root: Path, observations: int) -> Path:
 
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
-    """An archive of the same files: of the last day, and, `old` times MAP_DAYS before it, of the others if not 0."""
+    """An archive of the same files: of the last day, and, `old` times MAP_DAYS before it, of the
+    others if not 0.
+    """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})
     for folder in root.glob("*/date=*"):
@@ -135,7 +139,9 @@ def _last_day(root: Path, to: Path, old: int) -> Path:
 
 
 def _states(root: Path, rows: int) -> None:
-    """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the observations."""
+    """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the
+    observations.
+    """
     writer = Writer(root, "shard-1")
     rng = np.random.default_rng(1)
     at = 0

@@ -1,7 +1,8 @@
-"""`python -m tests.faults.age_process WHAT ARCHIVE`: a process as the service begins it, measured by itself.
+"""`python -m tests.faults.age_process WHAT ARCHIVE`: a process as the service begins it, measured
+by itself.
 
-`ready`: begin from the archive; `checkpoint`: and take one; `past`: answer the question on stdin. Says seconds and the
-most megabytes that it ever had.
+`ready`: begin from the archive; `checkpoint`: and take one; `past`: answer the question on stdin.
+Says seconds and the most megabytes that it ever had.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""Watcher behind a router that is restarted: it receives every standing alert soon after the session is back.
+"""Watcher behind a router that is restarted: it receives every standing alert soon after the
+session is back.
 
-Two routers, the service behind the one, a watcher behind the other. That one is killed, alerts are raised, and it comes
-back; what was raised meanwhile the watcher must hear, and it hears nothing while it is away.
+Two routers, the service behind the one, a watcher behind the other. That one is killed, alerts are
+raised, and it comes back; what was raised meanwhile the watcher must hear, and it hears nothing
+while it is away.
 """
 
 from __future__ import annotations
@@ -66,7 +68,8 @@ def run(site: Site) -> list[Figure]:
             watched.undeclare()
         beside.kill()
     site.say(
-        f"{len(waits)} alerts heard again, the last after {max(waits, default=0.0):.1f} s; {missing} missing"
+        f"{len(waits)} alerts heard again, the last after {max(waits, default=0.0):.1f} s; "
+        f"{missing} missing"
     )
     return [
         figure("faults.alerts.missing_after_reconnect", missing),
@@ -76,7 +79,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _beside(there: Stage) -> Part:
-    """A second router, which the first one's clients are not connected to; its port stays over restarts."""
+    """A second router, which the first one's clients are not connected to; its port stays over
+    restarts.
+    """
     config = Path(there.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
     settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))

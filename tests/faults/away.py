@@ -1,9 +1,11 @@
-"""The service gone for an hour while routers stand and cars drive on; then back, with room for so much a second.
+"""The service gone for an hour while routers stand and cars drive on; then back, with room for so
+much a second.
 
-The cars' outboxes and the service's engine are the real ones; network and time are made up, so that an hour takes a
-minute. A service takes what its queue holds and drops the rest, and acknowledges what is on disk twice a second. Each
-car has its share of what a service of a thousand cars takes: 20 batches of a second, and 20 places of the queue. Every
-second it comes to a cell where nobody was: all of them must be on the map in the end, the old ones as old news.
+The cars' outboxes and the service's engine are the real ones; network and time are made up, so that
+an hour takes a minute. A service takes what its queue holds and drops the rest, and acknowledges
+what is on disk twice a second. Each car has its share of what a service of a thousand cars takes:
+20 batches of a second, and 20 places of the queue. Every second it comes to a cell where nobody
+was: all of them must be on the map in the end, the old ones as old news.
 """
 
 from __future__ import annotations
@@ -70,7 +72,9 @@ def _message(one: StoredBatch) -> Message:
 
 
 def _draft(car: int, now: float) -> tuple[Draft, int]:
-    """Return the reports of a car for half a second, and their cell; each car has a road of its own."""
+    """Return the reports of a car for half a second, and their cell; each car has a road of its
+    own.
+    """
     latitude = PLACE[0] + 2 * CELL_DEG * car
     longitude = PLACE[1] + CELL_DEG * int(now)
     cell = int(grid.cell_of(latitude, longitude))
@@ -152,7 +156,8 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
     begun = next((at for at, n in enumerate(taken) if n > cars), 0)  # the first cars have noticed
     drain = sum(taken[begun:]) / max(len(taken) - begun, 1) / (TAKEN_PER_S * STEP_S * cars)
     site.say(
-        f"{backlog} batches waited; {while_away} messages while away; drained in {len(taken) * STEP_S:.0f} s"
+        f"{backlog} batches waited; {while_away} messages while away; drained in "
+        f"{len(taken) * STEP_S:.0f} s"
     )
     return [
         figure("faults.away.bytes_ratio", service.sent / made),

@@ -1,7 +1,9 @@
-"""One bit changed in a file, of every kind that service and agent keep: it is noticed, or it changes nothing.
+"""One bit changed in a file, of every kind that service and agent keep: it is noticed, or it
+changes nothing.
 
-Each time a copy of an archive is damaged and a service begins from it; its map and its rows are compared with those of
-the whole archive, and what differs must have been counted. Spools likewise: what an agent sends is what was stored.
+Each time a copy of an archive is damaged and a service begins from it; its map and its rows are
+compared with those of the whole archive, and what differs must have been counted. Spools likewise:
+what an agent sends is what was stored.
 """
 
 from __future__ import annotations

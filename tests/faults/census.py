@@ -44,13 +44,17 @@ class Census:
 
 
 class Told(NamedTuple):
-    """Content of the journals: records and time [s] of every stored batch, time of every settled one."""
+    """Content of the journals: records and time [s] of every stored batch, time of every settled
+    one.
+    """
 
     stored: dict[Name, tuple[int, float]]
     settled: dict[Name, float]
 
     def longest_wait(self, since: float) -> float:
-        """Seconds from `since` until the last batch stored before it was settled; infinite if one never was."""
+        """Seconds from `since` until the last batch stored before it was settled; infinite if
+        one never was.
+        """
         waits = [
             self.settled.get(name, float("inf")) - since
             for name, (_, at) in self.stored.items()
@@ -97,7 +101,9 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Rows that are there again for who knows nothing of us, and reads the compacted files as they lie."""
+    """Rows that are there again for who knows nothing of us, and reads the compacted files as
+    they lie.
+    """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]
     return sum(t.num_rows for t in whole) - (
@@ -106,7 +112,9 @@ def _doubled_outside(archive: Path) -> int:
 
 
 def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, int], int, int]:
-    """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there again; all rows."""
+    """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there
+    again; all rows.
+    """
     tables = list(reading.read(archive, Kind.OBSERVATION, ROW))
     if not tables:
         return {}, 0, 0

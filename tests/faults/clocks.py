@@ -1,7 +1,9 @@
-"""A service's clock a year ahead or back for a minute, while it runs or at its start; vehicles go on, and sit on ice.
+"""A service's clock a year ahead or back for a minute, while it runs or at its start; vehicles go
+on, and sit on ice.
 
-The clock is the service's own, on made-up clocks of the machine; messages, engine, archive, checkpoint, retention and
-restart are real. Each case: vehicles find ice, the clock jumps, they go on and send some batches again; then a restart.
+The clock is the service's own, on made-up clocks of the machine; messages, engine, archive,
+checkpoint, retention and restart are real. Each case: vehicles find ice, the clock jumps, they go
+on and send some batches again; then a restart.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def jumped(self, clock: SteadyClock) -> bool:
-        """Return True if a service's clock is far from the true time, or reports that the system clock is."""
+        """Return True if a service's clock is far from the true time, or reports that the system
+        clock is.
+        """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
 
@@ -99,7 +103,9 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
     seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
-        """All report each second, and send what they sent before once more; then the service does its jobs."""
+        """All report each second, and send what they sent before once more; then the service
+        does its jobs.
+        """
         nonlocal seq
         for _ in range(steps):
             machine.true += NS
@@ -170,7 +176,9 @@ def _message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _rows(root: Path) -> Counter[tuple[int, int]]:
-    """Return how often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
+    """Return how often each batch's row is in the archive; a vehicle has another pseudonym in
+    another month.
+    """
     tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)
     return Counter(

@@ -1,7 +1,9 @@
-"""`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: services that follow each other, again and
-again, under load: killed, frozen, cut off, amid a compaction, amid of copying, with two that wait, and one that wakes.
+"""`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: services that follow
+each other, again and again, under load: killed, frozen, cut off, amid a compaction, amid of
+copying, with two that wait, and one that wakes.
 
-At the end each machine, and one that begins with an empty disk, is to hold all that was acknowledged, once.
+At the end each machine, and one that begins with an empty disk, is to hold all that was
+acknowledged, once.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ VEHICLES = 6
 RATE = 25.0
 EVERY: Final = 8  # failovers; in the middle and at the end of them the region is handed over
 HOLD_S: Final = (1.0, 5.0)  # in which all goes well, between two failovers
-# Often, so that the few seconds in which a service lives have some of each; a snapshot costs a second.
+# Often, so that the few seconds in which a service lives have some of each; a snapshot costs a
+# second.
 PERIODS: Final[dict[str, object]] = {
     "compact_s": 5.0,
     "checkpoint_s": 4.0,
@@ -129,7 +132,8 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
             happened += [found] if found else []
             told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
             site.say(
-                f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that nobody serves"
+                f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that "
+                "nobody serves"
             )
             if number % EVERY == EVERY // 2 - 1:
                 machines.ready(1)

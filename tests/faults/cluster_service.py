@@ -1,5 +1,6 @@
-"""`python -m tests.faults.cluster_service …`: `fleet-service`, which says when it compacts and when it copies, and does
-both often, so that a campaign can meet it amid of them. A line that begins and none that ends is one that was met."""
+"""`python -m tests.faults.cluster_service …`: `fleet-service`, which says when it compacts and when
+it copies, and does both often, so that a campaign can meet it amid of them. A line that begins and
+none that ends is one that was met."""
 
 from __future__ import annotations
 

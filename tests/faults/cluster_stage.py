@@ -1,7 +1,8 @@
-"""The machines of the cluster campaign: services of one region that follow each other, and how each of them goes.
+"""The machines of the cluster campaign: services of one region that follow each other, and how each
+of them goes.
 
-Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and somebody who asks for
-the map all the time.
+Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and
+somebody who asks for the map all the time.
 """
 
 from __future__ import annotations
@@ -121,7 +122,8 @@ def loads(folder: Path, endpoint: str, processes: int, vehicles: int, rate: floa
 
 
 class Asking:
-    """Somebody who asks for a box, all the time: what is known of it is told, or that nobody serves it.
+    """Somebody who asks for a box, all the time: what is known of it is told, or that nobody serves
+    it.
 
     Attributes:
         whole: answers with all that was known at the beginning.
@@ -170,7 +172,8 @@ class Asking:
             if not whole and not missing:
                 self.silent += 1
                 self._say(
-                    f"{len(self._known - found)} of {len(self._known)} cells are missing, and nothing is said"
+                    f"{len(self._known - found)} of {len(self._known)} cells are missing, and "
+                    "nothing is said"
                 )
 
 
@@ -213,7 +216,9 @@ def _amid(what: str) -> Go:
 
 
 def _mended(host: Host, random_: random.Random) -> None:
-    """A link comes back at some time, or not before the service has seen by itself that it was followed."""
+    """A link comes back at some time, or not before the service has seen by itself that it was
+    followed.
+    """
     if random_.random() < 0.5 or host.to_router.is_cut:
         time.sleep(random_.uniform(0.0, 3.0))
         host.to_bucket.mend()
@@ -242,7 +247,9 @@ WAYS: Final = {
 
 
 class Failover(NamedTuple):
-    """Result: the failure as it happened, and the time [s] until a vehicle was acknowledged again."""
+    """Result: the failure as it happened, and the time [s] until a vehicle was acknowledged
+    again.
+    """
 
     way: str
     seconds: float
@@ -328,7 +335,9 @@ class Machines:
         return self._journals.pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
-        """Measure a hand-over without load: the largest difference between both states, as in their checkpoints."""
+        """Measure a hand-over without load: the largest difference between both states, as in
+        their checkpoints.
+        """
         for part in parts:
             part.send(signal.SIGSTOP)
         time.sleep(SETTLED_S)
@@ -367,7 +376,9 @@ def _was_amid(host: Host, what: str) -> bool:
 
 
 def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
-    """Return the largest difference of numbers with a fraction; infinite if anything else differs."""
+    """Return the largest difference of numbers with a fraction; infinite if anything else
+    differs.
+    """
     worst = 0.0
     if one.keys() != other.keys():
         return float("inf")

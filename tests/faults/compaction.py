@@ -1,6 +1,7 @@
 """kill -9 during compaction, again and again, while a log is written to and a reader reads.
 
-`python -m tests.faults.compaction ARCHIVE` compacts for ever, in small rounds; the campaign kills it at random moments.
+`python -m tests.faults.compaction ARCHIVE` compacts for ever, in small rounds; the campaign kills
+it at random moments.
 """
 
 from __future__ import annotations
@@ -83,7 +84,9 @@ class Reading:
 
 
 def outside(root: Path) -> Iterable[pa.Table]:
-    """Return the rows that a foreign tool reads: the compacted files alone, as listed at one moment."""
+    """Return the rows that a foreign tool reads: the compacted files alone, as listed at one
+    moment.
+    """
     for path in list(layout.compacted_files(root, Kind.OBSERVATION)):
         yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
 

@@ -1,10 +1,10 @@
 """A disk that forgets: while it is in use, power can go at any operation of the code under test.
 
-The files are real and lie in a folder; what the code does with them goes through here (`os.fsync`, `os.rename`,
-`os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`, `shutil.rmtree`). After power loss only what was synced is
-sure: the bytes of a file at its last fsync, and the names in a folder at its own. Of everything later any part may have
-reached the disk: of the bytes a prefix, with or without rubbish behind, and of the changes of names any that keep the
-order of each name.
+The files are real and lie in a folder; what the code does with them goes through here (`os.fsync`,
+`os.rename`, `os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`, `shutil.rmtree`). After
+power loss only what was synced is sure: the bytes of a file at its last fsync, and the names in a
+folder at its own. Of everything later any part may have reached the disk: of the bytes a prefix,
+with or without rubbish behind, and of the changes of names any that keep the order of each name.
 """
 
 from __future__ import annotations
@@ -140,7 +140,9 @@ class CrashDisk:
         return rename
 
     def _moved(self, source: str, target: str) -> None:
-        """A folder gets another name: what is durable in it is so under whichever of the two survives."""
+        """A folder gets another name: what is durable in it is so under whichever of the two
+        survives.
+        """
         for path in [path for path in self._names if f"{path}/".startswith(f"{source}/")]:
             self._names[target + path.removeprefix(source)] = self._names[path].copy()
         for path in [path for path in self._later if f"{path}/".startswith(f"{source}/")]:

@@ -1,5 +1,5 @@
-"""A few lives of one archive on a disk that forgets: each but the last ends by a power loss at a random operation, and
-the next one finds what the disk kept."""
+"""A few lives of one archive on a disk that forgets: each but the last ends by a power loss at a
+random operation, and the next one finds what the disk kept."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Histories on a disk that forgets: power lost at any operation, torn writes, a full disk.
 
-Of the log and its compaction here, thousands; of the agent's outbox in `crash_spool`; of a whole service with its keys,
-checkpoints, weather, retention and forgetting in `crash_service`.
+Of the log and its compaction here, thousands; of the agent's outbox in `crash_spool`; of a whole
+service with its keys, checkpoints, weather, retention and forgetting in `crash_service`.
 
-A history of the log is a few lives of one archive. In each, batches are let in, segments written, compacted; then the
-power goes at a random operation, and the next life finds what the disk kept. What was acknowledged must be there, each
-row once, and a batch may only count as held if it is. In the last life everything that was not acknowledged is sent
-again.
+A history of the log is a few lives of one archive. In each, batches are let in, segments written,
+compacted; then the power goes at a random operation, and the next life finds what the disk kept.
+What was acknowledged must be there, each row once, and a batch may only count as held if it is. In
+the last life everything that was not acknowledged is sent again.
 """
 
 from __future__ import annotations
@@ -197,7 +197,9 @@ def _memory() -> str | None:
 
 
 def run(site: Site) -> list[Figure]:
-    """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of all."""
+    """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of
+    all.
+    """
     logs = site.of(5000, 100)
     outboxes = site.of(500, 10)
     services = site.of(600, 10)

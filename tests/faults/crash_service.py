@@ -1,11 +1,12 @@
-"""Histories of a whole service on a disk that forgets: keys, log, compaction, roll-ups, checkpoints, snapshots,
-weather, retention and forgetting.
+"""Histories of a whole service on a disk that forgets: keys, log, compaction, roll-ups,
+checkpoints, snapshots, weather, retention and forgetting.
 
-A history is a few lives of one archive, days apart. In each the engine takes batches and weather, and what its upkeep
-does is done in any order; between two lives somebody may have a vehicle's month forgotten, or the whole month. The
-power goes at a random operation. What the next life finds must hold what was acknowledged, each row once, and all
-weather that acted; it must know a batch again if and only if it holds it; the map from a checkpoint and the log is the
-map from the log alone; no compacted file is damaged; and what was forgotten does not come back.
+A history is a few lives of one archive, days apart. In each the engine takes batches and weather,
+and what its upkeep does is done in any order; between two lives somebody may have a vehicle's month
+forgotten, or the whole month. The power goes at a random operation. What the next life finds must
+hold what was acknowledged, each row once, and all weather that acted; it must know a batch again if
+and only if it holds it; the map from a checkpoint and the log is the map from the log alone; no
+compacted file is damaged; and what was forgotten does not come back.
 """
 
 from __future__ import annotations
@@ -261,7 +262,9 @@ class ServiceHistory(Lives[Sent]):
         return found
 
     def _lost(self, rows: Counter[int], last: bool) -> list[str]:
-        """Acknowledged, and neither there nor given up; in the last life everything that may come was sent again."""
+        """Acknowledged, and neither there nor given up; in the last life everything that may
+        come was sent again.
+        """
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
         ]

@@ -1,9 +1,11 @@
-"""A real small file system that is full: a service and an agent's outbox on it, load going on, then room again.
+"""A real small file system that is full: a service and an agent's outbox on it, load going on, then
+room again.
 
-Where this process may mount, it is a tmpfs of some megabytes; elsewhere every call by which log, upkeep and outbox make
-or move a file fails with ENOSPC. While it is full nothing may be acknowledged that is not there, jobs go on in turn,
-and with room again everything is acknowledged and nothing hangs. At last it is full with days that retention removes,
-and whose roll-ups are to be made before: what was set aside is room enough for that.
+Where this process may mount, it is a tmpfs of some megabytes; elsewhere every call by which log,
+upkeep and outbox make or move a file fails with ENOSPC. While it is full nothing may be
+acknowledged that is not there, jobs go on in turn, and with room again everything is acknowledged
+and nothing hangs. At last it is full with days that retention removes, and whose roll-ups are to be
+made before: what was set aside is room enough for that.
 """
 
 from __future__ import annotations
@@ -181,7 +183,9 @@ def _until_settled(engine: Engine) -> int:
 
 
 def _until_done(engine: Engine) -> int:
-    """Wait until each job has gone well once, with room again; returns what was acknowledged meanwhile."""
+    """Wait until each job has gone well once, with room again; returns what was acknowledged
+    meanwhile.
+    """
     got = 0
     deadline = time.monotonic() + STUCK_S
     while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:

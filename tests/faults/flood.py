@@ -1,7 +1,9 @@
-"""One vehicle sends as fast as it can, and the others go on: how long they wait, and what it does to the map.
+"""One vehicle sends as fast as it can, and the others go on: how long they wait, and what it does
+to the map.
 
-What it sends is true, so that it should count as one vehicle that sent it once a second. The map with the flood is held
-against one that an engine without a network makes of the same honest batches and that.
+What it sends is true, so that it should count as one vehicle that sent it once a second. The map
+with the flood is held against one that an engine without a network makes of the same honest batches
+and that.
 """
 
 from __future__ import annotations
@@ -220,7 +222,9 @@ def _map(running: Network) -> pa.Table:
 
 
 def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -> pa.Table:
-    """The map of the same honest visits, and of the flooder at one visit a second, round the road once at least."""
+    """The map of the same honest visits, and of the flooder at one visit a second, round the
+    road once at least.
+    """
     sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
     began = min(int(one.columns["leave_time"][0]) for one in sent)
     rounds = max(int(seconds), CELLS)
@@ -238,7 +242,9 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
 
 
 def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one is missing."""
+    """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one
+    is missing.
+    """
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [
         {row["cell"]: (row["mu_lower"], row["mu_upper"]) for row in table.to_pylist()}

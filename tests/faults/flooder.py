@@ -1,6 +1,8 @@
-"""`python -m tests.faults.flooder`: one enrolled vehicle that sends good observations as fast as it can.
+"""`python -m tests.faults.flooder`: one enrolled vehicle that sends good observations as fast as it
+can.
 
-Reads one line of JSON: settings, name, cells (cell, latitude, longitude), mu, seconds. Prints how many messages it put.
+Reads one line of JSON: settings, name, cells (cell, latitude, longitude), mu, seconds. Prints how
+many messages it put.
 """
 
 from __future__ import annotations

@@ -1,11 +1,14 @@
-"""The frame of the fault campaigns: a plain list of them, run one after the other, each in a folder of its own.
+"""The frame of the fault campaigns: a plain list of them, run one after the other, each in a folder
+of its own.
 
-A campaign is a function from a `Site` to figures. One with a bar is made by `bars.figure(name, value)`; what only tells
-how hard it was (kills, rates) is a `Figure` without a bar. To add one: write `tests/faults/NAME.py` with
-`def run(site: Site) -> list[Figure]`, and name it in `campaigns.py` with the figures that it owes.
+A campaign is a function from a `Site` to figures. One with a bar is made by `bars.figure(name,
+value)`; what only tells how hard it was (kills, rates) is a `Figure` without a bar. To add one:
+write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and name it in
+`campaigns.py` with the figures that it owes.
 
-`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A figure that is owed and not given fails.
-A campaign that raises ends the run with its traceback: what it measured is not known.
+`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A figure that is owed and
+not given fails. A campaign that raises ends the run with its traceback: what it measured is not
+known.
 """
 
 from __future__ import annotations
@@ -63,7 +66,9 @@ class Campaign(NamedTuple):
 def conduct(
     campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int
 ) -> list[Figure]:
-    """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns all figures."""
+    """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns
+    all figures.
+    """
     found: list[Figure] = []
     out.mkdir(parents=True, exist_ok=True)
     for campaign in campaigns:
@@ -74,9 +79,11 @@ def conduct(
 
 
 def leave(run: Callable[[], int]) -> NoReturn:
-    """Run campaigns and end the process with their exit code; with RAISED and a traceback at once if one raises.
+    """Run campaigns and end the process with their exit code; with RAISED and a traceback at once
+    if one raises.
 
-    A session that is still open holds the interpreter's end up for minutes, and processes that were started would stay.
+    A session that is still open holds the interpreter's end up for minutes, and processes that were
+    started would stay.
     """
     try:
         code = run()

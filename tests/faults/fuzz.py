@@ -1,7 +1,8 @@
-"""Malformed messages and queries among honest ones, through the whole engine: admission, fusion, archive, answers.
+"""Malformed messages and queries among honest ones, through the whole engine: admission, fusion,
+archive, answers.
 
-The oracle knows nothing of the service's own rules: it looks at the archive, where every value must be finite or absent
-and within what the units allow, and where every honest row must lie once.
+The oracle knows nothing of the service's own rules: it looks at the archive, where every value must
+be finite or absent and within what the units allow, and where every honest row must lie once.
 """
 
 from __future__ import annotations
@@ -104,7 +105,8 @@ def run(site: Site) -> list[Figure]:
             pasts = pasts - past
         if not turn % 200:
             site.say(
-                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted"
+                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} "
+                "rows admitted"
             )
     counts = dict(engine.counts)
     engine.close()
@@ -150,7 +152,9 @@ def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
 def _ask(
     site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 ) -> tuple[int, int, int]:
-    """Return whether a query crashed, was answered, and rebuilt a past map; none does without `past`."""
+    """Return whether a query crashed, was answered, and rebuilt a past map; none does without
+    `past`.
+    """
     rebuilt = 0
     try:
         wanted = query.parse(asked)

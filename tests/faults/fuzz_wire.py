@@ -1,8 +1,10 @@
-"""Malformed messages, weather, questions and acknowledgements through a real router, into a service and vehicles.
+"""Malformed messages, weather, questions and acknowledgements through a real router, into a service
+and vehicles.
 
-What `fuzz` hands to the engine in its own process goes the whole way here: Zenoh's threads, the bounded queue, what a
-vehicle may send, the queryables, the worker's turns. Vehicles report amid it through the agent's publisher and outbox.
-No acknowledgement that is put here can be read: a forged one is what certificates are for (`security`).
+What `fuzz` hands to the engine in its own process goes the whole way here: Zenoh's threads, the
+bounded queue, what a vehicle may send, the queryables, the worker's turns. Vehicles report amid it
+through the agent's publisher and outbox. No acknowledgement that is put here can be read: a forged
+one is what certificates are for (`security`).
 """
 
 from __future__ import annotations
@@ -119,7 +121,9 @@ def _unreadable_ack(r: random.Random) -> bytes:
 
 
 def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int:
-    """Put it; 0 where it is Zenoh that refuses the key. A longer encoding is the end of the sender's own session."""
+    """Put it; 0 where it is Zenoh that refuses the key. A longer encoding is the end of the
+    sender's own session.
+    """
     if len(encoding) > LONGEST_ENCODING:
         return 0
     try:
@@ -132,7 +136,9 @@ def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int
 
 
 def _ask(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
-    """Ask something malformed, with something malformed in hand; how many answers came, errors not counted."""
+    """Ask something malformed, with something malformed in hand; how many answers came, errors
+    not counted.
+    """
     parameters = ";".join(f"{name}={value}" for name, value in mutants.query().items())
     payload = r.choice((None, b"", r.randbytes(300), mutants.message().payload))
     try:

@@ -1,9 +1,10 @@
-"""The ground of the attacks: two routers with TLS and access list, a running service, honest parties, listeners.
+"""The ground of the attacks: two routers with TLS and access list, a running service, honest
+parties, listeners.
 
-Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a marker which is put
-after an attack has gone through, and is heard, shows that nothing of the attack is still to come. What has reached the
-service waits there for its worker, which takes it in order: only a later batch that is acknowledged shows that it was
-judged and counted.
+Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a
+marker which is put after an attack has gone through, and is heard, shows that nothing of the attack
+is still to come. What has reached the service waits there for its worker, which takes it in order:
+only a later batch that is acknowledged shows that it was judged and counted.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ class Listener:
 
 
 class Ground:
-    """Environment of an attack; the rogue is enrolled as a vehicle and connected to the second router."""
+    """Environment of an attack; the rogue is enrolled as a vehicle and connected to the second
+    router.
+    """
 
     def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
         self.network = network
@@ -78,7 +81,9 @@ class Ground:
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
-        """Put a good batch of one observation until the service has it on disk, as a outbox does."""
+        """Put a good batch of one observation until the service has it on disk, as a outbox
+        does.
+        """
         self._seq += 1
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
         session = session or self.honest.session
@@ -94,8 +99,8 @@ class Ground:
     def _durable(self, sent: wire.Batch) -> bool:
         """Return True if this very batch was acknowledged.
 
-        What else lies on the key counts for nothing: the acknowledgement of a batch before that was sent twice, or one
-        that an attack forged.
+        What else lies on the key counts for nothing: the acknowledgement of a batch before that was
+        sent twice, or one that an attack forged.
         """
         for place, _, payload in list(self.monitor.heard):
             if place == keys.ack_key(sent.vehicle):
@@ -116,7 +121,9 @@ class Ground:
         self.drive()
 
     def passed(self, session: zenoh.Session, *listeners: Listener) -> None:
-        """Return when everything that `session` did has gone through and the listeners heard what it brought."""
+        """Return when everything that `session` did has gone through and the listeners heard
+        what it brought.
+        """
         list(session.get(f"{keys.ROOT}/map/**"))
         self._marks += 1
         mark = f"mark {self._marks}".encode()

@@ -1,8 +1,9 @@
-"""One enrolled car that does all that a valid car may, for a made-up hour, beside ten honest ones on their road.
+"""One enrolled car that does all that a valid car may, for a made-up hour, beside ten honest ones
+on their road.
 
-It sends as much as its limit lets through: visits all over a region and the world, a boot for each batch, JSON, batches
-with a foot in another month, its own reports again, as they were and under other numbers, and ice on a road that is its
-own. What questions cost is in `queries`. Engine,
+It sends as much as its limit lets through: visits all over a region and the world, a boot for each
+batch, JSON, batches with a foot in another month, its own reports again, as they were and under
+other numbers, and ice on a road that is its own. What questions cost is in `queries`. Engine,
 limits and archive are the service's; only time is made up. What it did is a figure too.
 """
 
@@ -38,7 +39,9 @@ WARM_S: Final = 60  # until pools and windows are what they are
 
 
 def _growth(grown: float, seconds: int, *, quick: bool) -> Figure:
-    """By the hour; of a quick run as it is: ten megabytes come and go, which is no rate of three minutes."""
+    """By the hour; of a quick run as it is: ten megabytes come and go, which is no rate of three
+    minutes.
+    """
     if quick:
         return replace(figure("faults.insider.mb_per_hour", grown), unit="MB in all")
     return figure("faults.insider.mb_per_hour", grown / seconds * 3600)

@@ -1,8 +1,9 @@
 """kill -9 of agents, router and service, one or several at once, again and again, under load.
 
-In rounds, each with an archive of its own, so that a restarted service has minutes to read back and not hours. It has
-old rows too, which retention removes amid all this, and is killed as well. At the end of a round everything is left
-running until all is settled; then the archive is compared with the journals.
+In rounds, each with an archive of its own, so that a restarted service has minutes to read back and
+not hours. It has old rows too, which retention removes amid all this, and is killed as well. At the
+end of a round everything is left running until all is settled; then the archive is compared with
+the journals.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from tests.faults.frame import Site
 from tests.faults.processes import Part, Stage, stage
 
 AGENTS: Final = 12
-# Observations/s of each: one that is restarting offers none, and 5 000/s are to remain. A start takes .6 s of a core, a
-# thousand observations .054 at 300/s and .025 at 700/s: so few agents that offer much, as two cores have the starts of
-# all that was killed to do as well.
+# Observations/s of each: one that is restarting offers none, and 5 000/s are to remain. A start
+# takes .6 s of a core, a thousand observations .054 at 300/s and .025 at 700/s: so few agents that
+# offer much, as two cores have the starts of all that was killed to do as well.
 RATE: Final = 700.0
 KILLS_PER_ROUND: Final = 20
 PAUSE_S: Final = (
@@ -44,7 +45,8 @@ PAUSE_S: Final = (
 )  # between kills: before, during and after the restart of the ones killed before
 DOWN_S: Final = (0.0, 1.0)  # how long the killed ones stay away
 DRAIN_S: Final = 90.0
-# So short that compaction, checkpoints and snapshots happen many times within the seconds that a service lives.
+# So short that compaction, checkpoints and snapshots happen many times within the seconds that a
+# service lives.
 PERIODS: Final[dict[str, object]] = {
     "compact_s": 2.0,
     "checkpoint_s": 1.5,
@@ -59,7 +61,9 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """Load during the kills: its amount, its duration [s], and whether retention removed a day meanwhile."""
+    """Load during the kills: its amount, its duration [s], and whether retention removed a day
+    meanwhile.
+    """
 
     observations: int
     seconds: float
@@ -67,7 +71,9 @@ class Load(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """200 kills in ten rounds; in a quick run, five in one with six agents, and bars that it can reach."""
+    """200 kills in ten rounds; in a quick run, five in one with six agents, and bars that it can
+    reach.
+    """
     random_ = random.Random(site.seed)
     kills = 0
     offered = 0
@@ -134,8 +140,9 @@ def _done(archive: Path) -> frozenset[str]:
 
 
 def map_difference(archive: Path) -> float:
-    """The map that a service begins with, from its checkpoint, against that of the log alone: the largest difference of
-    mu, of its bounds and of P(slippery); infinite if a cell or a visit is missing."""
+    """The map that a service begins with, from its checkpoint, against that of the log alone: the
+    largest difference of mu, of its bounds and of P(slippery); infinite if a cell or a visit is
+    missing."""
     maps = []
     for _ in range(2):
         with closing(Engine(ServiceConfig(), archive)) as engine:
@@ -155,7 +162,9 @@ def map_difference(archive: Path) -> float:
 
 
 def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tuple[Census, Load]:
-    """One round: what became of it, and what was offered from when all had started until the drain."""
+    """One round: what became of it, and what was offered from when all had started until the
+    drain.
+    """
     for number in range(agents):
         there.load([f"sim-{number:03}"], RATE, seed=number).start()
     for part in there.loads:

@@ -1,7 +1,9 @@
-"""Campaign on the link between a car and its router: loss, a new address, blocked UDP, a router that returns, a flood.
+"""Campaign on the link between a car and its router: loss, a new address, blocked UDP, a router
+that returns, a flood.
 
-Router and service are in one network namespace, cars in others; between them are links of `link_relay.py`. The same
-traffic runs over QUIC and over TLS, so that each figure has its control. Making namespaces and TUN devices needs root.
+Router and service are in one network namespace, cars in others; between them are links of
+`link_relay.py`. The same traffic runs over QUIC and over TLS, so that each figure has its control.
+Making namespaces and TUN devices needs root.
 """
 
 from __future__ import annotations
@@ -100,7 +102,9 @@ class Namespaces:
     def router(
         self, letter: str = "a", protocols: Sequence[str] = ("quic", "tls"), *, capped: bool = True
     ) -> subprocess.Popen[str]:
-        """Start a router of the road as `fleet-service certs` configures it, on some of its transports."""
+        """Start a router of the road as `fleet-service certs` configures it, on some of its
+        transports.
+        """
         file = self.certificates / f"router-{letter}.json5"
         config = json.loads(file.read_text())
         listen = config["listen"]
@@ -198,7 +202,9 @@ def namespaces(folder: Path) -> Iterator[Namespaces]:
 
 
 def change_address(site: Site, protocol: str, seconds: float) -> tuple[int, int, float]:
-    """Return how many samples a car put and lost while its address changed twice, and the longest gap [s]."""
+    """Return how many samples a car put and lost while its address changed twice, and the
+    longest gap [s].
+    """
     with namespaces(site.folder / f"address-{protocol}") as there:
         there.router()
         car, _ = there.connect("car", MOBILE)
@@ -265,7 +271,9 @@ def block_udp(site: Site) -> float:
 
 
 def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
-    """Return the longest time that a car takes to find a router that came back with TLS only [s]."""
+    """Return the longest time that a car takes to find a router that came back with TLS only
+    [s].
+    """
     longest = 0.0
     with namespaces(site.folder / "back") as there:
         router = there.router()
@@ -287,7 +295,9 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
 
 
 def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
-    """Return the p99 of honest messages with a flooding car over that without, and what passed of the flood [1/s]."""
+    """Return the p99 of honest messages with a flooding car over that without, and what passed
+    of the flood [1/s].
+    """
     with namespaces(site.folder / f"flood-{capped}") as there:
         there.router(capped=capped)
         cars, _ = there.connect("car", MOBILE)
@@ -329,7 +339,8 @@ def measure(site: Site) -> list[Figure]:
     put, lost, gap = change_address(site, "quic", address_s)
     _, tls_lost, tls_gap = change_address(site, "tls", address_s)
     site.say(
-        f"new addresses: QUIC lost {lost} of {put}, gap {gap:.2f} s; TLS lost {tls_lost}, gap {tls_gap:.2f} s"
+        f"new addresses: QUIC lost {lost} of {put}, gap {gap:.2f} s; TLS lost {tls_lost}, gap "
+        f"{tls_gap:.2f} s"
     )
     quic, tls = (delay_alerts(site, protocol, lossy_s) for protocol in ("quic", "tls"))
     site.say(f"lossy link: QUIC {quic}; TLS {tls}")
@@ -338,7 +349,8 @@ def measure(site: Site) -> list[Figure]:
     ratio, passed = flood(site, flood_s, capped=True)
     free_ratio, free = flood(site, flood_s, capped=False)
     site.say(
-        f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} {free_ratio:.2f} uncapped"
+        f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} "
+        f"{free_ratio:.2f} uncapped"
     )
     return [
         figure("link.address_change.lost", lost),

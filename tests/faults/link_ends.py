@@ -1,8 +1,9 @@
-"""`python -m tests.faults.link_ends JSON`: one end of the link campaign, in the network namespace that starts it.
+"""`python -m tests.faults.link_ends JSON`: one end of the link campaign, in the network namespace
+that starts it.
 
-Roles: `receive` subscribes and notes when each numbered message arrives; `send` puts numbered messages at a rate;
-`open` measures how long a session takes to open; `watch` tells when its link changes. Times are of the system's
-monotonic clock, which all processes of a machine share.
+Roles: `receive` subscribes and notes when each numbered message arrives; `send` puts numbered
+messages at a rate; `open` measures how long a session takes to open; `watch` tells when its link
+changes. Times are of the system's monotonic clock, which all processes of a machine share.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def open_end(given: dict[str, Any]) -> zenoh.Session:
 
 
 def receive(given: dict[str, Any]) -> None:
-    """Subscribe until stdin is closed; then print number, delay [s] and time of arrival [s] of each message by key."""
+    """Subscribe until stdin is closed; then print number, delay [s] and time of arrival [s] of
+    each message by key.
+    """
     arrived: dict[str, list[tuple[int, float, float]]] = {}
 
     def note(sample: zenoh.Sample) -> None:
@@ -60,8 +63,8 @@ def receive(given: dict[str, Any]) -> None:
 def send(given: dict[str, Any]) -> None:
     """Put messages of several streams until stdin is closed; print how many were put by key.
 
-    Each stream has a key, a size in bytes and a rate; its quality of service is that of its topic. A rate of 0 puts as
-    fast as the session takes it.
+    Each stream has a key, a size in bytes and a rate; its quality of service is that of its topic.
+    A rate of 0 puts as fast as the session takes it.
     """
     over = threading.Event()
     counts = dict[str, int]()

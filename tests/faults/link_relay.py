@@ -1,8 +1,10 @@
-"""`python -m tests.faults.link_relay JSON`: one mobile link between two network namespaces, with loss, delay and rate.
+"""`python -m tests.faults.link_relay JSON`: one mobile link between two network namespaces, with
+loss, delay and rate.
 
-Each namespace gets a TUN device. This process moves packets between both: it loses some at random, lets the others wait
-in a queue of limited length for the rate of the link, and delivers them after the delay. It needs no kernel module
-beyond TUN. Settings can be changed by a line of JSON on stdin, for example `{"drop_udp": true}`.
+Each namespace gets a TUN device. This process moves packets between both: it loses some at random,
+lets the others wait in a queue of limited length for the rate of the link, and delivers them after
+the delay. It needs no kernel module beyond TUN. Settings can be changed by a line of JSON on stdin,
+for example `{"drop_udp": true}`.
 """
 
 from __future__ import annotations

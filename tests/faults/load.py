@@ -1,9 +1,10 @@
-"""Load: observations of made-up visits through the agent's real publisher and outbox, with a journal of what is safe.
+"""Load: observations of made-up visits through the agent's real publisher and outbox, with a
+journal of what is safe.
 
-`python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its standard output:
-one line per batch that was committed to the outbox, and one per batch that an acknowledgement settled; unbuffered, so
-that it survives kill -9. SIGUSR1: offer nothing more, leave when everything is settled. SIGTERM: leave as an agent
-does. At the end, one line of JSON.
+`python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its
+standard output: one line per batch that was committed to the outbox, and one per batch that an
+acknowledgement settled; unbuffered, so that it survives kill -9. SIGUSR1: offer nothing more, leave
+when everything is settled. SIGTERM: leave as an agent does. At the end, one line of JSON.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class Plan:
 
 
 def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
-    """Tell `+ vehicle boot kind region seq records time` of what is on disk, `- …` of what is settled."""
+    """Tell `+ vehicle boot kind region seq records time` of what is on disk, `- …` of what is
+    settled.
+    """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
         os.write(
@@ -96,7 +99,9 @@ def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: 
 
 
 def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
-    """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and the longest lag [s]."""
+    """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and
+    the longest lag [s].
+    """
     rng = np.random.default_rng(plan.seed)
     per_block = plan.rate * BLOCK_S * len(plan.names)
     owed = 0.0

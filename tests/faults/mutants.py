@@ -89,7 +89,9 @@ _ENCODINGS: Final = (
 
 
 class Mutants:
-    """A source of malformed messages of the vehicles `rogue-NN`, as at the time `now` [ns], which may be set."""
+    """A source of malformed messages of the vehicles `rogue-NN`, as at the time `now` [ns],
+    which may be set.
+    """
 
     def __init__(self, seed: int, now: int) -> None:
         self._random = random.Random(seed)

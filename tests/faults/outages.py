@@ -1,5 +1,5 @@
-"""Outages: the router gone for a minute, router and service frozen, disks full; and leaving. Nothing is lost, nobody
-waits."""
+"""Outages: the router gone for a minute, router and service frozen, disks full; and leaving.
+Nothing is lost, nobody waits."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def router_down(site: Site) -> list[Figure]:
 
 
 def frozen(site: Site) -> list[Figure]:
-    """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose nothing."""
+    """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose
+    nothing.
+    """
     frozen_s = site.of(20, 3)
     spans = []
     with stage(site.folder) as there:
@@ -74,7 +76,9 @@ def frozen(site: Site) -> list[Figure]:
 
 
 def leaving(site: Site) -> list[Figure]:
-    """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone soon, and lose nothing."""
+    """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone
+    soon, and lose nothing.
+    """
     longest = 0.0
     lost = 0
     acknowledged = 0
@@ -102,7 +106,9 @@ def leaving(site: Site) -> list[Figure]:
 
 
 def disk_full(site: Site) -> list[Figure]:
-    """No file of the service may grow, then none of the agents: nothing false is acknowledged, and all of it later."""
+    """No file of the service may grow, then none of the agents: nothing false is acknowledged,
+    and all of it later.
+    """
     full_s = site.of(10, 2)
     false_acks = recovered = waiting = 0
     with stage(site.folder) as there:

@@ -1,8 +1,10 @@
-"""Vehicles at places where they cannot be, and two vehicles that report ice on roads where nobody drives.
+"""Vehicles at places where they cannot be, and two vehicles that report ice on roads where nobody
+drives.
 
-Teleports: cars that drive honestly also report one far place, in the same batch, in another batch, boot or region,
-before or after their other reports, or in short leaps. The oracle is the distance from their own way. Two cars: they
-report ice at 210 places along 400 km by leaps, as a backlog, or live, with a path at 65 m/s that is plausible.
+Teleports: cars that drive honestly also report one far place, in the same batch, in another batch,
+boot or region, before or after their other reports, or in short leaps. The oracle is the distance
+from their own way. Two cars: they report ice at 210 places along 400 km by leaps, as a backlog, or
+live, with a path at 65 m/s that is plausible.
 """
 
 from __future__ import annotations

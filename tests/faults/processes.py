@@ -1,7 +1,9 @@
-"""Router, service and load as processes of their own: started, killed, frozen and stopped by a campaign.
+"""Router, service and load as processes of their own: started, killed, frozen and stopped by a
+campaign.
 
-What they print goes through a pipe to `folder/NAME.log`, one file over all starts: what a process printed before it was
-killed is there, and a limit on its files does not limit its log. A router keeps its port over restarts.
+What they print goes through a pipe to `folder/NAME.log`, one file over all starts: what a process
+printed before it was killed is there, and a limit on its files does not limit its log. A router
+keeps its port over restarts.
 """
 
 from __future__ import annotations
@@ -86,7 +88,9 @@ class Part:
             self.wait(STOP_S)
 
     def wait(self, patience_s: float) -> int:
-        """Exit code, once it is gone and its log whole; subprocess.TimeoutExpired if it is not in time."""
+        """Exit code, once it is gone and its log whole; subprocess.TimeoutExpired if it is not
+        in time.
+        """
         assert self._process is not None
         assert self._writer is not None
         code = self._process.wait(patience_s)
@@ -99,7 +103,9 @@ class Part:
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:
-        """No file of the process may grow beyond `size` bytes, as on a full disk; -1 gives the room back."""
+        """No file of the process may grow beyond `size` bytes, as on a full disk; -1 gives the
+        room back.
+        """
         _, hard = resource.prlimit(self.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(self.pid, resource.RLIMIT_FSIZE, (hard if size < 0 else size, hard))
 
@@ -127,7 +133,9 @@ class Stage:
         return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
 
     def load(self, names: Sequence[str], rate: float, **more: object) -> Part:
-        """A generator of observations for these vehicles, `rate` per second each; not yet started."""
+        """A generator of observations for these vehicles, `rate` per second each; not yet
+        started.
+        """
         name = f"load-{len(self.loads):02}"
         config = self.folder / f"{name}.json"
         outbox = str(self.folder / f"{name}.sqlite")
@@ -160,8 +168,8 @@ class Stage:
     def drain(self, patience_s: float) -> None:
         """No new observations; wait until every generator has all of its batches settled.
 
-        Ends before if none settles anything for `patience_s`: what is left in an outbox then is missing in the archive,
-        and counted there.
+        Ends before if none settles anything for `patience_s`: what is left in an outbox then is
+        missing in the archive, and counted there.
         """
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
@@ -171,7 +179,9 @@ class Stage:
                 self._news(patience_s)
 
     def _news(self, patience_s: float) -> None:
-        """Wait until the generators have told more than now, or are gone. TimeoutError: nothing for so long."""
+        """Wait until the generators have told more than now, or are gone. TimeoutError: nothing
+        for so long.
+        """
         told = sum(journal.stat().st_size for journal in self.journals)
 
         def news() -> bool:

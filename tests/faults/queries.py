@@ -1,6 +1,8 @@
-"""Two readers ask for the whole map as GeoJSON in a loop; a third asks for one tile. How long does it wait?
+"""Two readers ask for the whole map as GeoJSON in a loop; a third asks for one tile. How long does
+it wait?
 
-The service is a process of its own, filled with cells before; askers are threads of processes of their own.
+The service is a process of its own, filled with cells before; askers are threads of processes of
+their own.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Attacks on a fleet with TLS and access list, each by the means of a vehicle, a reader or a stranger."""
+"""Attacks on a fleet with TLS and access list, each by the means of a vehicle, a reader or a
+stranger.
+"""
 
 from __future__ import annotations
 

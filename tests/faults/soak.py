@@ -1,4 +1,6 @@
-"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: a steady load for half an hour; does anything grow?"""
+"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: a steady load for half an hour; does
+anything grow?
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ def handles(part: Part) -> int:
 
 
 def slope(times: FloatArray, megabytes: FloatArray) -> float:
-    """Growth of what a process never gives back [MB per 10 min]: a line through the least of each minute.
+    """Growth of what a process never gives back [MB per 10 min]: a line through the least of each
+    minute.
 
     Within a minute it takes and gives back: a segment, a compaction, a query.
     """

@@ -1,7 +1,9 @@
-"""The newest segment cut, and any of its bytes changed, at every place: what is acknowledged and what is held agree.
+"""The newest segment cut, and any of its bytes changed, at every place: what is acknowledged and
+what is held agree.
 
-The newest segment is one that was written and not yet acknowledged when the power went: its rows may go, those of the
-older segments may not. A batch that is not held must be new to the service when its vehicle sends it again.
+The newest segment is one that was written and not yet acknowledged when the power went: its rows
+may go, those of the older segments may not. A batch that is not held must be new to the service
+when its vehicle sends it again.
 """
 
 from __future__ import annotations
@@ -99,7 +101,9 @@ def _expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 
 
 def _lost(root: Path, batches: Sequence[Batch]) -> int:
-    """Rows of older segments that are missing, and of the newest that count as held and are not, or are wrong."""
+    """Rows of older segments that are missing, and of the newest that count as held and are not,
+    or are wrong.
+    """
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
     streams = SequenceTrackers()
     restore_streams(root, streams)
@@ -119,7 +123,9 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
 
 
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
-    """Rows that are missing or doubled once a service has been sent everything again, and acknowledged it."""
+    """Rows that are missing or doubled once a service has been sent everything again, and
+    acknowledged it.
+    """
     with closing(Engine(ServiceConfig(), root)) as engine:
         engine.intake.ingest(_messages(batches), time.time_ns())
         ((_, ack),) = engine.settlement.flush()

@@ -1,5 +1,6 @@
-"""Archives of other versions: one that was kept from before files had any, under a service of today; and one of today
-with columns that nobody knows yet, as a newer version would write them, under a service that is rolled back to today's.
+"""Archives of other versions: one that was kept from before files had any, under a service of
+today; and one of today with columns that nobody knows yet, as a newer version would write them,
+under a service that is rolled back to today's.
 
 Nothing is set aside, every row is read, and the map is the one that its writer had.
 """

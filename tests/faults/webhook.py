@@ -1,7 +1,8 @@
 """Broken receivers of a webhook: every alert arrives, waits in the queue, or is counted as lost.
 
-Each kind of receiver is broken for its first connections and then sound. Two kinds never recover. A receiver keeps the
-ids of the alerts that it confirmed, which is the oracle; the sender's own counters only tell what it admits.
+Each kind of receiver is broken for its first connections and then sound. Two kinds never recover. A
+receiver keeps the ids of the alerts that it confirmed, which is the oracle; the sender's own
+counters only tell what it admits.
 """
 
 from __future__ import annotations
@@ -151,7 +152,9 @@ def stretch(number: int) -> StretchAlert:
 
 
 def run_kind(folder: Path, kind: str) -> tuple[int, int]:
-    """Send alerts to one kind of receiver; return how many arrived, and how many were lost without a word."""
+    """Send alerts to one kind of receiver; return how many arrived, and how many were lost
+    without a word.
+    """
     receiver = Receiver(kind)
     said = list[str]()
     queue = AlertQueue(folder / f"{kind}.sqlite", FEW if kind == "overflow" else 1000)

@@ -107,7 +107,8 @@ def batch(
     used: float | None = None,
     **changed: object,
 ) -> Batch:
-    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its columns.
+    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its
+    columns.
 
     Without `used` they used all of the grip: less says little of it.
     """
@@ -145,7 +146,9 @@ def key(vehicle: str) -> str:
 
 
 def send(session: zenoh.Session, sent: Batch, place: str | None = None) -> None:
-    """Put a batch on its vehicle's key, or another. By default Zenoh drops what waits a millisecond for a busy link."""
+    """Put a batch on its vehicle's key, or another. By default Zenoh drops what waits a
+    millisecond for a busy link.
+    """
     session.put(
         place or key(sent.vehicle),
         wire.encode(sent),

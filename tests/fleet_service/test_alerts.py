@@ -1,4 +1,6 @@
-"""Alerts that somebody can be sent to: stretches with length, direction, id and life cycle; a webhook that arrives."""
+"""Alerts that somebody can be sent to: stretches with length, direction, id and life cycle; a
+webhook that arrives.
+"""
 
 from __future__ import annotations
 
@@ -72,8 +74,8 @@ def test_an_icy_road_in_both_directions_is_one_alert() -> None:
     assert (found.direction, found.headings, found.cells) == ("east-west", ("east", "west"), 20)
     assert found.state == "raised"
     assert (
-        "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since 2027-01-15T08:00:00Z"
-        in found.line()
+        "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since "
+        "2027-01-15T08:00:00Z" in found.line()
     )
     (north,) = told(Stretches(), *(alert(0, y) for y in range(10)))
     assert north.direction == "north-south"

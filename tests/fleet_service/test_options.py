@@ -1,8 +1,8 @@
-"""Every option of the commands is seen to matter: it is changed, the command runs, and what it does is
-another thing than before.
+"""Every option of the commands is seen to matter: it is changed, the command runs, and what it does
+is another thing than before.
 
-A command runs on copies of the archive that is kept; what it prints, its exit code and every file below its folder is
-what it does. It does the same twice, so that a difference is the option's.
+A command runs on copies of the archive that is kept; what it prints, its exit code and every file
+below its folder is what it does. It does the same twice, so that a difference is the option's.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ USUAL: Final = {
     "rebuild": ["rebuild", *ARCHIVE, "--out", "{out}/r", "--to", "2024-10-04T23:59:50"],
 }
 BOX: Final = "11,57,13,59"  # around one of two towns
-# command -> option -> another value; or the words with which, and those without which, it is to be seen
+# command -> option -> another value; or the words with which, and those without which, it is to be
+# seen
 CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
     "compact": {
         "--archive": "{b}",

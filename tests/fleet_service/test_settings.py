@@ -1,4 +1,6 @@
-"""Every setting of the service is seen to matter: it is changed, and what the service does is another thing."""
+"""Every setting of the service is seen to matter: it is changed, and what the service does is
+another thing.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """An engine that has taken two cars' reports: one now, one of ten minutes ago, and one of a minute ahead."""
+    """An engine that has taken two cars' reports: one now, one of ten minutes ago, and one of a
+    minute ahead.
+    """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
         for name, age in (("sim-001", 1), ("sim-002", 600), ("sim-003", -60), ("sim-001", 300)):
@@ -149,9 +153,9 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "segment_s": (1.0, of_service(turns)),
     "put_s": (0.1, of_service(turns)),
 }
-# Where the network or the operator sees them: zenoh and regions where two services share the world, in
-# app/test_service.py, the archive and its copy in app/test_copy.py, the lease and who waits for it in
-# shards/test_successor.py, the others in tests/schemas/runtime and app/test_metrics.py.
+# Where the network or the operator sees them: zenoh and regions where two services share the world,
+# in app/test_service.py, the archive and its copy in app/test_copy.py, the lease and who waits for
+# it in shards/test_successor.py, the others in tests/schemas/runtime and app/test_metrics.py.
 SEEN_OUTSIDE: Final = {
     "zenoh",
     "regions",

@@ -1,4 +1,6 @@
-"""Batches that the tests of the contract share; also how the kept bytes of version 1 were made (see __main__)."""
+"""Batches that the tests of the contract share; also how the kept bytes of version 1 were made
+(see __main__).
+"""
 
 from __future__ import annotations
 

@@ -93,7 +93,10 @@ IN_README = (
     f"at most {SERVICE.oldest_s / 86400:.0f} days old",
     f"{SERVICE.vehicle_kb_s:.0f} kB/s, {SERVICE.vehicle_burst_kb:.0f} kB at once",
     f"counts {rate_limit.LEAST_BYTES} bytes at least",
-    f"{query.MAX_TEXT} characters, {query.MAX_ROUTE_POINTS} points of a route, {regions.ROUTE_MOST_M / 1e3:.0f} km",
+    (
+        f"{query.MAX_TEXT} characters, {query.MAX_ROUTE_POINTS} points of a route, "
+        f"{regions.ROUTE_MOST_M / 1e3:.0f} km"
+    ),
     *(f"`{encoding}`" for encoding in ENCODINGS),
     *(f"`{name}/<" for name in TOPICS),
 )

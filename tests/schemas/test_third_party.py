@@ -1,4 +1,6 @@
-"""A third party takes part with the contract alone: no compiler, no science library, nothing of agent or service."""
+"""A third party takes part with the contract alone: no compiler, no science library, nothing of
+agent or service.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ pytestmark = pytest.mark.timeout(
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """Return the results of a third party's process, with a router and a service in processes of their own."""
+    """Return the results of a third party's process, with a router and a service in processes of
+    their own.
+    """
     folder = tmp_path_factory.mktemp("third-party")
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"

@@ -1,8 +1,10 @@
-"""A third party: `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that can load nothing else of GripMap.
+"""A third party: `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that can load nothing
+else of GripMap.
 
-python -m tests.schemas.third_party ENDPOINT: reports ice by two vehicles, one in protobuf and one in JSON, reads its
-acknowledgements, the reports, the tile, the alerts and the map's answers, and prints what it found as one line of JSON.
-Only ever run as a program: to import it would hinder the importer too.
+python -m tests.schemas.third_party ENDPOINT: reports ice by two vehicles, one in protobuf and one
+in JSON, reads its acknowledgements, the reports, the tile, the alerts and the map's answers, and
+prints what it found as one line of JSON. Only ever run as a program: to import it would hinder the
+importer too.
 """
 
 from __future__ import annotations
@@ -79,7 +81,9 @@ def protobuf_batch(now: int) -> bytes:
 
 
 def json_batch(now: int) -> bytes:
-    """The same visits as a person would write them: cell, sector and region follow from the pose."""
+    """The same visits as a person would write them: cell, sector and region follow from the
+    pose.
+    """
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
     numbers = {
         "latitude": LATITUDE,

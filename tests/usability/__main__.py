@@ -1,6 +1,7 @@
 """`make usability`: every figure of the first hour, measured; writes `.usability/figures.json`.
 
---only NAME ... measures these; what is left out is not in the file, and a missing figure is a failure.
+--only NAME ... measures these; what is left out is not in the file, and a missing figure is a
+failure.
 """
 
 from __future__ import annotations
@@ -129,7 +130,9 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
 
 
 def service_ready_s(house: House) -> float:
-    """From the command to `ready:` of a service on an empty archive, kernels as `make setup` left them."""
+    """From the command to `ready:` of a service on an empty archive, kernels as `make setup`
+    left them.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     (house.folder / "ready.json").write_text(json.dumps({"zenoh": {"connect": endpoints}}))
     words = [

@@ -1,4 +1,6 @@
-"""Mistakes at the command line: each is one line with exit code 2 or argparse's own, and never a traceback."""
+"""Mistakes at the command line: each is one line with exit code 2 or argparse's own, and never a
+traceback.
+"""
 
 from __future__ import annotations
 
@@ -143,7 +145,9 @@ def prepare(folder: Path) -> None:
 
 
 def tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """Return how many mistakes were made, and those answered with a traceback or with exit code 0."""
+    """Return how many mistakes were made, and those answered with a traceback or with exit code
+    0.
+    """
     bad = []
     lines: list[tuple[Callable[[list[str]], int], str]] = [
         (edge_agent.cli.main, line) for line in EDGE

@@ -1,7 +1,8 @@
-"""Run the commands of the tutorials, as written and in order, in a network of their own and an empty folder.
+"""Run the commands of the tutorials, as written and in order, in a network of their own and an
+empty folder.
 
-Commands that stay (router, service, agent, watch, page) are started and must still run at the end. `pip install` is not
-run.
+Commands that stay (router, service, agent, watch, page) are started and must still run at the end.
+`pip install` is not run.
 """
 
 from __future__ import annotations

@@ -44,7 +44,8 @@ LASTING: Final = (
 
 
 def longest(command: list[str], cache: Path, ready: bytes | None = None) -> float:
-    """The longest time between two signs of life of a command on a terminal, its begin and its end counted [s].
+    """The longest time between two signs of life of a command on a terminal, its begin and its end
+    counted [s].
 
     One that is `ready` with a word is interrupted there, and its end does not count.
     """

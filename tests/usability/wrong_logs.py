@@ -33,7 +33,9 @@ WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence onc
 
 
 def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
-    """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be passed in silence."""
+    """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be
+    passed in silence.
+    """
     drive = drives(1, seed, rough=False)[0]
     out = [] if not _said(folder, drive) else ["the sound drive is suspected"]
     return out + [name for name in names if not _said(folder, _spoilt(name, drive))]

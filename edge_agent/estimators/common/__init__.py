@@ -1,1 +1,3 @@
-"""What all estimators share: believable readings, what is used of the grip, arrays and records of small filters."""
+"""What all estimators share: believable readings, what is used of the grip, arrays and records
+of small filters.
+"""

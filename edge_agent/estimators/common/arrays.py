@@ -1,4 +1,6 @@
-"""Copying and clearing small arrays by plain loops: a slice assignment costs seconds of compilation, each."""
+"""Copying and clearing small arrays by plain loops: a slice assignment costs seconds of
+compilation, each.
+"""
 
 from __future__ import annotations
 

@@ -10,7 +10,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import UTILISED_WINDOW_S
 
 SLOTS = 64
-SLOT_S = 0.02  # a slot is at least so long, so that the ring holds the last second at any rate of samples
+# a slot is at least so long, so that the ring holds the last second at any rate of samples
+SLOT_S = 0.02
 
 
 class Excitation:

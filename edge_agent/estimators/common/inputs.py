@@ -1,8 +1,10 @@
-"""Readings of one vehicle made fit for a filter that steps once a sample: refusals, gaps, replacements, grip used.
+"""Readings of one vehicle made fit for a filter that steps once a sample: refusals, gaps,
+replacements, grip used.
 
-A reading that is missing, infinite or unbelievable is NaN in `now`, and that row of a measurement is left out. Where a
-filter takes it as an input it is replaced in `inputs`: accelerations by nothing and r*v_x, yaw rate and steering by the
-last value, torque by the share of m*a_x; a wheel without speed stays NaN and is taken to roll freely.
+A reading that is missing, infinite or unbelievable is NaN in `now`, and that row of a measurement
+is left out. Where a filter takes it as an input it is replaced in `inputs`: accelerations by
+nothing and r*v_x, yaw rate and steering by the last value, torque by the share of m*a_x; a wheel
+without speed stays NaN and is taken to roll freely.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ class InputTrack:
 def take(
     track: InputTrack, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, int, float]:
-    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds elapsed)."""
+    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED,
+    seconds elapsed).
+    """
     begins = not track.started
     dt = time - track.time
     if not math.isfinite(time) or not (begins or dt > 0.0):
@@ -118,7 +122,9 @@ def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
 
 @compiled
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
-    """Grip used by the hardest-working wheel now [1]: hypot of torque over radius and load, and lateral g."""
+    """Grip used by the hardest-working wheel now [1]: hypot of torque over radius and load, and
+    lateral g.
+    """
     use = track.inputs
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     most = 0.0
@@ -129,7 +135,9 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
 
 @compiled
 def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
-    """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation 10)."""
+    """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation
+    10).
+    """
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step
     return float(

@@ -21,7 +21,9 @@ FASTEST_TURN = 20.0  # [rad/s]
 
 @compiled
 def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
-    """Whether a filter has diverged whose first states are v_x and v_y, and whose state `yaw_rate` is the yaw rate."""
+    """Whether a filter has diverged whose first states are v_x and v_y, and whose state
+    `yaw_rate` is the yaw rate.
+    """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
     bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
     for i in range(mean.shape[0]):

@@ -1,8 +1,9 @@
-"""What every estimator reports, written into the columns of its output; friction as a Gaussian's interval.
+"""What every estimator reports, written into the columns of its output; friction as a Gaussian's
+interval.
 
-Friction is reported as the Gaussian's median and 5 % and 95 % quantiles, clipped to the range of the friction grid. The
-papers' filters do not know what a visit's measurements alone say, so their bank has no evidence: the agent publishes
-friction with its interval.
+Friction is reported as the Gaussian's median and 5 % and 95 % quantiles, clipped to the range of
+the friction grid. The papers' filters do not know what a visit's measurements alone say, so their
+bank has no evidence: the agent publishes friction with its interval.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """The motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate` is the yaw rate."""
+    """The motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate` is
+    the yaw rate.
+    """
     write_motion(
         output,
         mean[0],
@@ -78,7 +81,9 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
-    """Median, 5 % and 95 % of the uniform prior, from column `first` on: nothing is known of the road."""
+    """Median, 5 % and 95 % of the uniform prior, from column `first` on: nothing is known of the
+    road.
+    """
     output[first] = 0.5 * (LOWER + UPPER)
     output[first + 1], output[first + 2] = 0.95 * LOWER + 0.05 * UPPER, 0.05 * LOWER + 0.95 * UPPER
 

@@ -41,7 +41,9 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 @compiled
 def believe(sample: FloatArray, now: FloatArray) -> int:
-    """now (15,) = the readings of a sample (18,), NaN where missing, infinite or unbelievable; returns health flags."""
+    """now (15,) = the readings of a sample (18,), NaN where missing, infinite or unbelievable;
+    returns health flags.
+    """
     odd = 0
     missing = 0
     for channel in range(INPUTS):
@@ -70,7 +72,9 @@ def position_health(time: float, last: float) -> int:
 
 @compiled
 def rolling_speed(row: FloatArray, now: FloatArray) -> float:
-    """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without any wheel."""
+    """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without
+    any wheel.
+    """
     first = second = math.nan
     for wheel in range(4):
         speed = row[Parameter.RADIUS] * now[S.OMEGA + wheel]

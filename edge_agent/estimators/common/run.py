@@ -1,7 +1,8 @@
-"""The one way through the samples that every paper's filter goes: take a sample in, begin or step, report.
+"""The one way through the samples that every paper's filter goes: take a sample in, begin or step,
+report.
 
-A paper's file is the record of what its filter carries (`PaperMemory` with its own fields), three compiled functions
-and the citation; `kernel_of` makes a bank's kernel of them.
+A paper's file is the record of what its filter carries (`PaperMemory` with its own fields), three
+compiled functions and the citation; `kernel_of` makes a bank's kernel of them.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ def kernel_of(
     Args:
         begin: begins the filter at the sample in memory.track.
         step: predicts by so many seconds and updates; whether the filter has not diverged.
-        report: writes motion and friction into the output; the friction by which wheels are judged to slide.
+        report: writes motion and friction into the output; the friction by which wheels are judged
+            to slide.
     """
 
     @nogil
@@ -97,7 +99,9 @@ def kernel_of(
 def new_filters(
     kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None
 ) -> RecordArray:
-    """Return a record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
+    """Return a record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects
+    it.
+    """
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)
     fit_tyres(filters, TyreOption() if tyre is None else tyre)

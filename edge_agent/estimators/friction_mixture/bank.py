@@ -33,8 +33,8 @@ def mixture_bank(
 ) -> EstimatorBank:
     """Friction mixtures of vehicles with parameters `rows` (N, 15).
 
-    `spreads` and `means` (N, STATES) are standard deviations and means of their states' priors, where they are not
-    those of the design.
+    `spreads` and `means` (N, STATES) are standard deviations and means of their states' priors,
+    where they are not those of the design.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
@@ -136,7 +136,9 @@ def _report_friction(friction: Quantiles, upper: float, output: FloatArray, firs
 
 @compiled
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
-    """Write what is known before the first usable sample: the prior, and no motion with a wide spread."""
+    """Write what is known before the first usable sample: the prior, and no motion with a wide
+    spread.
+    """
     write_unknown(output)
     for k, level in enumerate((0.5, LOWER_END, UPPER_END)):
         value = quantile(design.mu, design.prior, design.prior, level)

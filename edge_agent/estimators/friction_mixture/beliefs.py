@@ -21,7 +21,9 @@ def report_beliefs(
     own: FloatArray,
     visit: FloatArray,
 ) -> None:
-    """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both (N, 32), maximum 0."""
+    """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both
+    (N, 32), maximum 0.
+    """
     design = contexts[0].design
     scratch = contexts[0].scratch
     for n in range(own.shape[0]):

@@ -1,9 +1,10 @@
-"""From the sums of a block to the few numbers that the measurement equations need (`BlockFeatures`).
+"""From the sums of a block to the few numbers that the measurement equations need
+(`BlockFeatures`).
 
-Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from a_x shared out
-with a spread to match (`drive_split.py`). An accelerometer feels slope and bank as tyres do: they are force, offsets
-are not. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs
-and arms).
+Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from
+a_x shared out with a spread to match (`drive_split.py`). An accelerometer feels slope and bank as
+tyres do: they are force, offsets are not. Lateral axle forces come from m*a_y and Iz*r' (paper 004,
+equation 2; errata 000 on signs and arms).
 """
 
 from __future__ import annotations
@@ -97,7 +98,9 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 
 @compiled
 def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> int:
-    """Force, and the part of noise_std that comes from it, of the four wheels; returns health flags."""
+    """Force, and the part of noise_std that comes from it, of the four wheels; returns health
+    flags.
+    """
     health = 0
     loads = features.loads
     row = memory.row
@@ -181,7 +184,9 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Slip noise and force noise meet under the total-least-squares residual with half the variance each."""
+    """Slip noise and force noise meet under the total-least-squares residual with half the
+    variance each.
+    """
     row = memory.row
     constants = design.constants
     before = memory.last_side
@@ -241,7 +246,8 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
 def abruptness(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
-    """How far a wheel is from its smoothed speed, moved on by the car's acceleration [m/s]; 0 where it is unknown.
+    """How far a wheel is from its smoothed speed, moved on by the car's acceleration [m/s]; 0 where
+    it is unknown.
 
     A wheel that spins up or locks goes on for some blocks, a bump is over within one or two.
     """
@@ -256,7 +262,9 @@ def abruptness(
 
 @compiled
 def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
-    """Speed ahead [m/s] of the centre of gravity over a wheel that rolls freely; NaN without a reading."""
+    """Speed ahead [m/s] of the centre of gravity over a wheel that rolls freely; NaN without a
+    reading.
+    """
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
     return float(
@@ -267,7 +275,9 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _inform(constants: Constants, features: BlockFeatures) -> None:
-    """informs_x and informs_y: below some force it is noise of the slip that would say what stiffness is."""
+    """informs_x and informs_y: below some force it is noise of the slip that would say what
+    stiffness is.
+    """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
         side = features.side[axle]
@@ -279,9 +289,11 @@ def _inform(constants: Constants, features: BlockFeatures) -> None:
 
 @compiled
 def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> float:
-    """Largest difference between the sides of an axle of slip (as linear force over load) not asked for by force.
+    """Largest difference between the sides of an axle of slip (as linear force over load) not asked
+    for by force.
 
-    Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be is allowed for.
+    Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be
+    is allowed for.
     """
     row = memory.row
     block = memory.block
@@ -312,9 +324,11 @@ def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatur
 
 @compiled
 def demand(features: BlockFeatures) -> float:
-    """Return the larger force over load of the two axles [1]; a missing lateral force counts as none.
+    """Return the larger force over load of the two axles [1]; a missing lateral force counts as
+    none.
 
-    An axle is taken as a whole: how its wheels share the force is not measured where an inner wheel is almost unloaded.
+    An axle is taken as a whole: how its wheels share the force is not measured where an inner wheel
+    is almost unloaded.
     """
     most = 0.0
     for axle in range(2):

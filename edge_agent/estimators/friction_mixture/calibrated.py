@@ -13,11 +13,10 @@ from schemas.signals import WHEELS
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-# state -> (quantity of the calibration, what the state carries beside it: the pitch and slope that a_x feels, toe and
-# crossfall that steering holds against, another load, slip that the nominal stiffness leaves on a driven wheel,
-# half a sample).
-# Tighter ones (.03, .0003, .0005) made intervals wider on six towns of rough cars: what a state may not carry reads as
-# a contradiction.
+# state -> (quantity of the calibration, what the state carries beside it: the pitch and slope that
+# a_x feels, toe and crossfall that steering holds against, another load, slip that the nominal
+# stiffness leaves on a driven wheel, half a sample). Tighter ones (.03, .0003, .0005) made
+# intervals wider on six towns of rough cars: what a state may not carry reads as a contradiction.
 LEARNED: Final[dict[int, tuple[str, float]]] = {
     NodeState.BIAS_X: ("ax", 0.12),
     NodeState.STEER: ("steer_offset", 0.0015),
@@ -33,7 +32,8 @@ EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make o
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
-    """Standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a vehicle's calibration knows.
+    """Standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a vehicle's
+    calibration knows.
 
     The calibration's values are no longer in the signals (inputs.correct), so that the means stay.
     """
@@ -51,10 +51,11 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
 
 
 def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
-    """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a vehicle where it is known.
+    """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a
+    vehicle where it is known.
 
-    Understeer learned from drives counts before that of the vehicle file's axles; without both the mean of all vehicles
-    stays.
+    Understeer learned from drives counts before that of the vehicle file's axles; without both the
+    mean of all vehicles stays.
     """
     means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(means, vehicles, strict=True):

@@ -1,7 +1,8 @@
 """Every number of the filter family, with unit and reason: one table, one record for the kernels.
 
-Figures marked (vehicle) follow from how well a vehicle and its sensors are known: mass 3 %, inertia 5 %, stiffness 10
-to 12 %, torque 3 %, white noise and offsets of ordinary inertial sensors. Figures marked (errata) are measured wisdom.
+Figures marked (vehicle) follow from how well a vehicle and its sensors are known: mass 3 %, inertia
+5 %, stiffness 10 to 12 %, torque 3 %, white noise and offsets of ordinary inertial sensors. Figures
+marked (errata) are measured wisdom.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ SPLIT_NODES = 30  # hypotheses of a split road: a low and a high friction, eithe
 ALL_NODES = NODES + SPLIT_NODES
 PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
 CURVED = 4  # states in which the rows of measurement are not linear
-STRAIGHT = 10  # states up to this one are differentiated one by one; the others follow from these and from speeds
+# states up to this one are differentiated one by one; the others follow from these and from speeds
+STRAIGHT = 10
 ACTIVE = 18  # states that the rows see within a block
 STATES = 20
 ROWS = 6  # of measurement: four wheels along, two axles across
@@ -37,18 +39,22 @@ class NodeState(IntEnum):
     RADIUS = 10  # relative error of the radius of each of four wheels
     LAG_WHEEL = 14  # of the wheel speeds behind the accelerometers [s]
     LAG_STEER = 15  # of the steering behind the gyroscope [s]
-    COMPLIANCE = 16  # slip angle that steering and bushes take from the front axle, per side force over load [rad]
+    # slip angle that steering and bushes take from the front axle, per side force over load [rad]
+    COMPLIANCE = 16
     STEER_GAIN = 17  # relative error of the front steering angle
     SLOPE = 18  # gravity along the road, felt ahead: a force holds it, but it moves nothing [m/s^2]
     BANK = 19  # gravity across the road, felt to the left [m/s^2]
 
 
 class Constants(NamedTuple):
-    """The numbers; above each its unit and its reason. `Constants(name=value)` changes one in a study."""
+    """The numbers; above each its unit and its reason. `Constants(name=value)` changes one in a
+    study.
+    """
 
     # [s] one measurement update per block: model error is correlated over more, so nothing is lost
     block_time: float = 0.05
-    # [s] one independent measurement of the tyre per so much time: R is inflated by it over a block (errata)
+    # [s] one independent measurement of the tyre per so much time: R is inflated by it over a block
+    # (errata)
     correlation_time: float = 0.2
     # [s] window of the innovation variances
     window: float = 1.0
@@ -57,16 +63,19 @@ class Constants(NamedTuple):
     hazard: float = 1 / 190
     # [1/m] slow change to a neighbouring node
     diffusion: float = 0.003
-    # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is covered)
+    # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is
+    # covered)
     patch_length: float = 8.0
-    # [1] probability of unlike sides at the first sign of them, slip that force does not ask for (.05: called late)
+    # [1] probability of unlike sides at the first sign of them, slip that force does not ask for
+    # (.05: called late)
     split_prior: float = 0.2
     # [1/m] end of such a road
     split_hazard: float = 1 / 60
     # [1] left against right, in force over load, that wakes the split nodes
     split_asymmetry: float = 0.12
 
-    # [1] force over load at which half of the evidence on mu is taken (errata .12: there a gentle slalom read as ice)
+    # [1] force over load at which half of the evidence on mu is taken (errata .12: there a gentle
+    # slalom read as ice)
     demand_half: float = 0.13
     # [1] steepness of that
     demand_power: float = 4.0
@@ -78,20 +87,25 @@ class Constants(NamedTuple):
     steady_time: float = 2.0
     # [1] change of force over load from the usual at which half of the evidence is new
     steady_half: float = 0.03
-    # [1] evidence left, and weight of the axles, where nothing changes: errors of curve and offsets are the same again
+    # [1] evidence left, and weight of the axles, where nothing changes: errors of curve and offsets
+    # are the same again
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.3
-    # [1] weight of the density that sliding spreads over slip: not every braking car slides on all wheels
+    # [1] weight of the density that sliding spreads over slip: not every braking car slides on all
+    # wheels
     sliding_penalty: float = 0.3
-    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated one (.28: false ice)
+    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated
+    # one (.28: false ice)
     axle_penalty: float = 0.24
 
-    # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a contradiction
+    # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a
+    # contradiction
     farthest: float = 4.0
     # [1] innovation in standard deviations beyond which a row is trusted less
     huber: float = 2.0
-    # [m/s] a node farther than this from the most probable one has diverged: accelerometers forbid it
+    # [m/s] a node farther than this from the most probable one has diverged: accelerometers forbid
+    # it
     diverged_x: float = 0.7
     # [m/s] the same across
     diverged_y: float = 1.0
@@ -102,19 +116,24 @@ class Constants(NamedTuple):
     curve_e: float = -0.1
     # [1] tyres between round and sharp: most of them
     shape_std: float = 1.0
-    # [s] return of the shape to its prior: a curve's error differs from slip to slip, and load to load
+    # [s] return of the shape to its prior: a curve's error differs from slip to slip, and load to
+    # load
     shape_time: float = 60.0
-    # [1] log of the factor along: files of real cars are a third off (BMW M8, AV-21), and no drive got worse by it
+    # [1] log of the factor along: files of real cars are a third off (BMW M8, AV-21), and no drive
+    # got worse by it
     stiffness_x_std: float = 0.18
     # [1] log of the factor across (vehicle)
     stiffness_y_std: float = 0.12
-    # [s] return of the stiffness factors: what they stand for is another one from bend to bend (300: twice too sure)
+    # [s] return of the stiffness factors: what they stand for is another one from bend to bend
+    # (300: twice too sure)
     stiffness_time: float = 60.0
-    # [1] power of the stiffness factor that divides a wheel's residual: slip is noisy, force is quiet
+    # [1] power of the stiffness factor that divides a wheel's residual: slip is noisy, force is
+    # quiet
     stiffness_power_x: float = 1.0
     # [1] the same for an axle, where both are
     stiffness_power_y: float = 0.3
-    # [1] demand at which a wheel informs half of what it could of stiffness: below, noise of slip does
+    # [1] demand at which a wheel informs half of what it could of stiffness: below, noise of slip
+    # does
     informing_x: float = 0.06
     # [1] the same for an axle
     informing_y: float = 0.1
@@ -132,9 +151,11 @@ class Constants(NamedTuple):
 
     # [m/s^2] offset of a_x: tilted mount and sensor, .22 to .96 on logs of real cars
     bias_x_std: float = 0.25
-    # [m/s^2] offset of a_y, .07 to .54 there; a crossfall that the wheels do not steer against reads the same
+    # [m/s^2] offset of a_y, .07 to .54 there; a crossfall that the wheels do not steer against
+    # reads the same
     bias_y_std: float = 0.2
-    # [s] return of the offsets, of radii and of lags to their prior: what they stand for changes with slope and bend
+    # [s] return of the offsets, of radii and of lags to their prior: what they stand for changes
+    # with slope and bend
     bias_time: float = 60.0
     # [m/s^2] slope of the road: 3 %
     slope_std: float = 0.3
@@ -150,17 +171,21 @@ class Constants(NamedTuple):
     steer_std: float = 0.004
     # [1] gain of the steering ratio: vehicle files of real cars are 3 to 8 % off
     steer_gain_std: float = 0.02
-    # [rad] steering compliance per side force over load: production cars have 0 to .035 (front C/F_z of 10 to 20)
+    # [rad] steering compliance per side force over load: production cars have 0 to .035 (front
+    # C/F_z of 10 to 20)
     compliance_mean: float = 0.005
     # [rad] its spread
     compliance_std: float = 0.01
     # [s] return of gain and compliance to their prior: they are properties of the car
     steer_time: float = 600.0
-    # [1] radius of a wheel against the others: pressure, wear, and axles whose tyres differ (1 % on BMW M8 and AV-21)
+    # [1] radius of a wheel against the others: pressure, wear, and axles whose tyres differ (1 % on
+    # BMW M8 and AV-21)
     wheel_std: float = 0.008
-    # [1] radius of all wheels together: nominal radii of real cars are up to 1.5 % off; nothing here tells it
+    # [1] radius of all wheels together: nominal radii of real cars are up to 1.5 % off; nothing
+    # here tells it
     radius_std: float = 0.0125
-    # [s] lag that all devices share: 60 ms are common, .2 s are met; no sensor tells it, it is in the spread of v_x
+    # [s] lag that all devices share: 60 ms are common, .2 s are met; no sensor tells it, it is in
+    # the spread of v_x
     common_lag: float = 0.05
     # [s] lag of wheel speeds and of steering against the inertial sensors: devices up to 60 ms late
     lag_std: float = 0.025
@@ -176,9 +201,11 @@ class Constants(NamedTuple):
 
     # [rad/s] white noise of a wheel speed sample (vehicle)
     omega_noise: float = 0.03
-    # [rad/s] what wheel speeds have wrong beside their noise: steps that cannot be seen, teeth, tyres that wobble
+    # [rad/s] what wheel speeds have wrong beside their noise: steps that cannot be seen, teeth,
+    # tyres that wobble
     step_noise: float = 0.06
-    # [1] of slip that came just now: a tyre's force needs .3 m, and a bump changes the radius that it rolls on
+    # [1] of slip that came just now: a tyre's force needs .3 m, and a bump changes the radius that
+    # it rolls on
     abrupt_share: float = 0.5
     # [s] in which it has become usual: a bump lasts .05 s, a wheel locks or spins up in .1 to .3
     abrupt_time: float = 0.15
@@ -186,7 +213,8 @@ class Constants(NamedTuple):
     angle_std: float = 0.0003
     # [1] how the wheels of an axle point, of the angle; the common gain of the steering is a state
     angle_share: float = 0.01
-    # [rad/s] offset and white noise of the yaw rate in a block: turns an axle's slip, most at low speed
+    # [rad/s] offset and white noise of the yaw rate in a block: turns an axle's slip, most at low
+    # speed
     gyro_std: float = 0.002
     # [1] rolling resistance, in force over load
     floor_x: float = 0.006
@@ -205,7 +233,8 @@ class Constants(NamedTuple):
     # [m/s^2] where torque is missing: a_x that is not force and not an offset
     no_torque_floor: float = 0.1
 
-    # [1] of the force that spins a wheel up or down: torque and wheel speed have clocks of their own, ABS acts at 8 Hz
+    # [1] of the force that spins a wheel up or down: torque and wheel speed have clocks of their
+    # own, ABS acts at 8 Hz
     spin_share: float = 0.3
 
     # [s] for which a slide is remembered
@@ -242,14 +271,17 @@ class Constants(NamedTuple):
     # [rad] sideslip of a following rear axle beside what the side force asks
     following_std: float = 0.004
 
-    # [1] a node's friction may lie so far below the grip in use: offset of the accelerometers, slope and smoothing
+    # [1] a node's friction may lie so far below the grip in use: offset of the accelerometers,
+    # slope and smoothing
     guard_margin: float = 0.06
     # [1] one standard deviation of that
     guard_std: float = 0.03
 
-    # [1] degrees of freedom with which a car begins as strained as the model: few rows say nothing of it yet
+    # [1] degrees of freedom with which a car begins as strained as the model: few rows say nothing
+    # of it yet
     strain_prior: float = 2.0
-    # [1] strain at which the axles are as sure as stated: level drives have .2 to .5, rough ones .5 to 2
+    # [1] strain at which the axles are as sure as stated: level drives have .2 to .5, rough ones .5
+    # to 2
     strain_usual: float = 0.7
     # [1] power of strain over the usual in R of the axles: what one error says of the next
     strain_power: float = 2.0
@@ -258,13 +290,16 @@ class Constants(NamedTuple):
     # [1] most of it
     strain_most: float = 3.0
 
-    # [nat] likelihood ratio at which contradiction is believed: errors that are three times what is stated, for 1 s
+    # [nat] likelihood ratio at which contradiction is believed: errors that are three times what is
+    # stated, for 1 s
     odd_least: float = 12.0
-    # [s] before the model is tried again, the first time: a bend or two of a race track would pass, a lap does not
+    # [s] before the model is tried again, the first time: a bend or two of a race track would pass,
+    # a lap does not
     patience: float = 120.0
     # [1] R of the axles while distrusted, over R
     distrust_noise: float = 1000.0
     # [m/s/s^.5] walk of v_y while distrusted
     distrust_drift: float = 3.0
-    # [s] in which while distrusted what was learned of vehicle, sensors and road goes back to the prior
+    # [s] in which while distrusted what was learned of vehicle, sensors and road goes back to the
+    # prior
     distrust_forget: float = 5.0

@@ -82,7 +82,9 @@ def design_of(
     constants: Constants | None = None,
     curve: Curve | None = None,
 ) -> MixtureDesign:
-    """The tables of a filter; other `constants` are for studies, another `curve` for other tyres."""
+    """The tables of a filter; other `constants` are for studies, another `curve` for other
+    tyres.
+    """
     mu, prior = node_table(NODES)
     constants = constants or Constants()
     return MixtureDesign(

@@ -1,8 +1,10 @@
-"""How the force along is shared by front and rear where torque is missing: which axles drive, learned from their slip.
+"""How the force along is shared by front and rear where torque is missing: which axles drive,
+learned from their slip.
 
-The driven axle of a car that pulls turns faster than the other, by what its force asks of its tyres; three kinds of car
-are told apart within a second of brisk driving. Brakes favour the front on all cars. Sums of wheels on low friction
-look like more force than is asked: an axle may slip more than its kind asks for, not less.
+The driven axle of a car that pulls turns faster than the other, by what its force asks of its
+tyres; three kinds of car are told apart within a second of brisk driving. Brakes favour the front
+on all cars. Sums of wheels on low friction look like more force than is asked: an axle may slip
+more than its kind asks for, not less.
 """
 
 from __future__ import annotations

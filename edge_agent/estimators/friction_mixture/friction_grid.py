@@ -21,7 +21,9 @@ SMALLEST = 1e-12  # a probability that mixing by road change will raise again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
-    """(mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of each cell."""
+    """(mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of each
+    cell.
+    """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), count + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
     return middle**2, np.diff(edges**2) / (UPPER - LOWER)
@@ -37,10 +39,12 @@ def change_road(
     drift: float,
     out: FloatArray,
 ) -> None:
-    """out = w after a change to anywhere with probability hazard and to a neighbour with probability about drift.
+    """out = w after a change to anywhere with probability hazard and to a neighbour with
+    probability about drift.
 
-    Only the first `chain` nodes have neighbours; the others are left for anywhere with probability `leaving` as well.
-    The exchange between neighbours is in detailed balance with the prior, which therefore stays what it is.
+    Only the first `chain` nodes have neighbours; the others are left for anywhere with probability
+    `leaving` as well. The exchange between neighbours is in detailed balance with the prior, which
+    therefore stays what it is.
     """
     count = w.shape[0]
     left = 0.0
@@ -73,7 +77,9 @@ def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 @compiled
 def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
-    """The q-quantile of mu under the density that is linear between nodes and level beyond the outer ones."""
+    """The q-quantile of mu under the density that is linear between nodes and level beyond the
+    outer ones.
+    """
     count = mu.shape[0]
     total = 0.0
     for j in range(count + 1):

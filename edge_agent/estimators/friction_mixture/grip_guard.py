@@ -44,7 +44,9 @@ def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """The upper end of a friction, never below the grip in use: racing tyres pass the grid's 1.2."""
+    """The upper end of a friction, never below the grip in use: racing tyres pass the grid's
+    1.2.
+    """
     return max(friction.upper, grip.held + ABOVE)
 
 
@@ -52,8 +54,9 @@ def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
 def lower_while_sliding(slides: float, used: float, lower: float) -> float:
     """Return the lower end of a friction whose wheels slide: a sliding tyre may be at its peak.
 
-    A tyre that slides gives between its peak force and the smaller force of full sliding. Slip tells which of them
-    only as well as the speed is known, and no wheel rolls that would tell the speed.
+    A tyre that slides gives between its peak force and the smaller force of full sliding. Slip
+    tells which of them only as well as the speed is known, and no wheel rolls that would tell the
+    speed.
 
     Args:
         slides: membership in "a wheel slides" [1].

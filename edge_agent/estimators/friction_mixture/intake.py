@@ -1,7 +1,9 @@
-"""Taking a sample in: refusal of the impossible, the yaw-rate filter, the kinematics and sums of the block.
+"""Taking a sample in: refusal of the impossible, the yaw-rate filter, the kinematics and sums of
+the block.
 
-Missing readings and what replaces them: a_x by zero and a_y by r*v_x, both with a random walk to match; yaw rate by the
-difference of the rear wheels; steering by its last value; the rest is left out of the sums.
+Missing readings and what replaces them: a_x by zero and a_y by r*v_x, both with a random walk to
+match; yaw rate by the difference of the rear wheels; steering by its last value; the rest is left
+out of the sums.
 """
 
 from __future__ import annotations
@@ -120,7 +122,9 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _believed(value: float, used: float, read: float) -> float:
-    """The accelerometer's reading; NaN where it is far from both the last one that was used and the last one read."""
+    """The accelerometer's reading; NaN where it is far from both the last one that was used and
+    the last one read.
+    """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
     return math.nan if jumps else value
 
@@ -129,7 +133,8 @@ def _believed(value: float, used: float, read: float) -> float:
 def _move(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
-    """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
+    """Velocity gained since the block began, in the axes of now: the exact solution for inputs
+    constant over dt.
 
     ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
     """

@@ -105,7 +105,9 @@ class WheelSlip:
 class Trust:
     """Whether any friction explains what is measured."""
 
-    ratio: float  # squared innovations of the axles over their stated variance, smoothed, as far as unexplained [1]
+    # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
+    # [1]
+    ratio: float
     odd: float  # how much more likely it is of late that none does [nat]
     distrust: float  # 1 where none does, else 0
     left: float  # of that, before it is tried again [s]
@@ -176,7 +178,8 @@ def new_filters(
 ) -> RecordArray:
     """Filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
 
-    The prior of their states is `nominal`, with the means and standard deviations `means`, `spreads` (N, STATES).
+    The prior of their states is `nominal`, with the means and standard deviations `means`,
+    `spreads` (N, STATES).
     """
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]

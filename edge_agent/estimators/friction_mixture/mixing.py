@@ -5,9 +5,9 @@ Legend
     m, P            mean and covariance of the whole mixture
     zeta            share of a node's predicted mass that came from anywhere by a road change [1]
 
-The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two moments: an
-improbable node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models,
-Blom and Bar-Shalom 1988). Covariances are only ever added here.
+The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two
+moments: an improbable node keeps the state of the vehicle and is ready to explain the next sample
+(interacting multiple models, Blom and Bar-Shalom 1988). Covariances are only ever added here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from schemas.runtime.jit import compiled
 
 LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
 LEAST_WEIGHT = 1e-9  # nor does a node of less
-SLEEPING_SHARE = 0.5  # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
+# of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
+SLEEPING_SHARE = 0.5
 FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
 BRINK = 4  # power of doubt in that: a contradiction that merely grows forgets nothing yet
 # of a node's mass in a block: more would overshoot the balance between neighbours
@@ -44,7 +45,9 @@ def awake(memory: MixtureMemory) -> int:
 
 @compiled
 def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Split nodes take part from the first sign of such a road until they have become improbable."""
+    """Split nodes take part from the first sign of such a road until they have become
+    improbable.
+    """
     weight = memory.weight
     visit = memory.visit_weight
     constants = design.constants
@@ -69,7 +72,9 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float) -> None:
-    """Road change over `metres`: probabilities flow, and each node is mixed with what came to it."""
+    """Road change over `metres`: probabilities flow, and each node is mixed with what came to
+    it.
+    """
     count = awake(memory)
     constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
@@ -155,7 +160,9 @@ def match_moments(
 def reset_diverged(
     mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
 ) -> None:
-    """Give nodes (K, n) whose motion has diverged the state of the most probable one, and no weight."""
+    """Give nodes (K, n) whose motion has diverged the state of the most probable one, and no
+    weight.
+    """
     best = int(np.argmax(weight))
     for j in range(weight.shape[0]):
         astray = max(

@@ -1,4 +1,5 @@
-"""One node of the mixture: the cubature filter of the vehicle, given the friction under its two sides.
+"""One node of the mixture: the cubature filter of the vehicle, given the friction under its two
+sides.
 
 Legend
     m, L        mean (n,) and square root of the covariance, L*L' = P          (n, n)
@@ -6,9 +7,10 @@ Legend
     f, a        row of A that is taken in, and its variance f'f + r^2
     D           derivative of the rows by a state that they depend on linearly
 
-The rows are linear but for velocity and stiffness: the third-degree cubature rule is taken in those four dimensions,
-and leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule). Rows are taken in one after the other
-(Potter 1963): L <- L*(I - g*f*f'), with g such that no covariance is ever subtracted.
+The rows are linear but for velocity and stiffness: the third-degree cubature rule is taken in those
+four dimensions, and leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule).
+Rows are taken in one after the other (Potter 1963): L <- L*(I - g*f*f'), with g such that no
+covariance is ever subtracted.
 """
 
 from __future__ import annotations
@@ -63,8 +65,9 @@ def update_node(
 ) -> NodeUpdate:
     """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
 
-    R of the axles is larger still where they are distrusted, and where nothing changes: what is wrong of curve and
-    offsets is the same again, and taken for noise it would be averaged into stiffness and shape.
+    R of the axles is larger still where they are distrusted, and where nothing changes: what is
+    wrong of curve and offsets is the same again, and taken for noise it would be averaged into
+    stiffness and shape.
 
     Writes its innovation and its theoretical variance without the inflation.
     """
@@ -111,7 +114,8 @@ def update_node(
 
 @compiled
 def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Fill node.derivative of node j, leave node.force as at the mean, and return the price of sliding.
+    """Fill node.derivative of node j, leave node.force as at the mean, and return the price of
+    sliding.
 
     Leak and offset of a_y move the same forces, so that one derivative tells the other.
     """
@@ -169,9 +173,11 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
 def _by_wheel_speeds(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
 ) -> None:
-    """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own speed.
+    """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own
+    speed.
 
-    All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force is as at the mean.
+    All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force
+    is as at the mean.
     """
     row = memory.row
     mean = memory.mean[j]
@@ -201,10 +207,11 @@ def _by_wheel_speeds(
 def weigh_slopes(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Fill node.noise with the variances of the rows' noise at node.slip, and return the price of sliding.
+    """Fill node.noise with the variances of the rows' noise at node.slip, and return the price of
+    sliding.
 
-    The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread
-    thin.
+    The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so
+    its density is spread thin.
     """
     slip = node.slip
     price = 0.0
@@ -232,17 +239,20 @@ def weigh_slopes(
 
 @compiled
 def unfelt(slope: float) -> float:
-    """Share of slip noise that a residual on a curve of this slope does not feel, of the half it feels on slope 1.
+    """Share of slip noise that a residual on a curve of this slope does not feel, of the half it
+    feels on slope 1.
 
-    Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in variables). Taken for as
-    large on the flat as on the rise, it would favour nodes whose wheels slide: they do not feel it.
+    Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in
+    variables). Taken for as large on the flat as on the rise, it would favour nodes whose wheels
+    slide: they do not feel it.
     """
     return 0.5 - slope * slope / (1.0 + slope * slope)
 
 
 @compiled
 def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its variance.
+    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its
+    variance.
 
     scratch.root[j] is lower triangular.
     """
@@ -280,7 +290,9 @@ def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: in
 
 @compiled
 def doubted_noise(trust: Trust, constants: Constants) -> float:
-    """Factor on R of the axles: what contradicts shall not move the motion while it is found out."""
+    """Factor on R of the axles: what contradicts shall not move the motion while it is found
+    out.
+    """
     if trust.distrust > 0.0:
         return 1.0 + constants.distrust_noise
     return 1.0 + DOUBTED * constants.distrust_noise * (trust.odd / constants.odd_least) ** 2
@@ -288,7 +300,9 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on R of the rear axle's rows: the front axle has met another surface that the rear has not."""
+    """Return the factor on R of the rear axle's rows: the front axle has met another surface
+    that the rear has not.
+    """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
 
@@ -305,7 +319,8 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 def take_rows(
     mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
 ) -> tuple[float, int]:
-    """Take in the innovations node.residual (6,) one by one: half the normalised square with its price, and rows.
+    """Take in the innovations node.residual (6,) one by one: half the normalised square with its
+    price, and rows.
 
     What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
     """
@@ -329,7 +344,8 @@ def take_rows(
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
     """Keep what is a property of vehicle or sensor within what it can be; mean (n,).
 
-    Radii are told against each other only: what all share scales the speed, and no sensor here knows that scale.
+    Radii are told against each other only: what all share scales the speed, and no sensor here
+    knows that scale.
     """
     far = constants.farthest
     common = 0.0
@@ -347,10 +363,12 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 def predict_node(
     memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
 ) -> None:
-    """Advance node j over the block: exact rotation, gained velocity, process variances scratch.process.
+    """Advance node j over the block: exact rotation, gained velocity, process variances
+    scratch.process.
 
-    The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).
-    What is a property of vehicle or sensor returns to its prior by scratch.keep. scratch.root[j] is changed to F*L.
+    The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)'
+    + diag(noise). What is a property of vehicle or sensor returns to its prior by scratch.keep.
+    scratch.root[j] is changed to F*L.
     """
     nominal = memory.nominal
     keep = scratch.keep

@@ -8,10 +8,11 @@ Legend
     e_a         slip at the measured force by the inverse tyre, minus the measured slip, as linear force over load [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
-Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force alike; on the flat
-and beyond the peak it is the force that decides, so the row of a sliding wheel is what its friction is (errata, what
-made the difference, 1). An axle takes one mean slip; its wheels share the side force by load.
-What a node believes of the vehicle (leak, gain of torque, shape of the tyre) corrects the measured force.
+Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force
+alike; on the flat and beyond the peak it is the force that decides, so the row of a sliding wheel
+is what its friction is (errata, what made the difference, 1). An axle takes one mean slip; its
+wheels share the side force by load. What a node believes of the vehicle (leak, gain of torque,
+shape of the tyre) corrects the measured force.
 """
 
 from __future__ import annotations
@@ -66,7 +67,9 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
 
 @compiled
 def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Change of the force along by the linear force along, at least FLATTEST: 1 at small slip, 0 on the flat."""
+    """Change of the force along by the linear force along, at least FLATTEST: 1 at small slip, 0
+    on the flat.
+    """
     square = g_x * g_x + g_y * g_y
     if square < TINY:
         return 1.0
@@ -88,7 +91,8 @@ def find_slips(
 ) -> None:
     """Fill node.slip at node.point, a state at the beginning of the block; mean (n,) is the node's.
 
-    A log stiffness is drawn towards the node's mean where the force is too small to tell it from noise of the slip.
+    A log stiffness is drawn towards the node's mean where the force is too small to tell it from
+    noise of the slip.
     """
     x = node.point
     slip = node.slip
@@ -127,9 +131,11 @@ def find_slips(
 
 @compiled
 def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
-    """Return by how much the front wheels point farther left than measured [rad], with state x (n,).
+    """Return by how much the front wheels point farther left than measured [rad], with state x
+    (n,).
 
-    The front axle yields to its own side force: steering column and bushes of production cars take up to 35 mrad/g.
+    The front axle yields to its own side force: steering column and bushes of production cars take
+    up to 35 mrad/g.
     """
     lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
     return float(
@@ -143,7 +149,9 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
 def find_shape_force(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
-    """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right wheels."""
+    """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right
+    wheels.
+    """
     slip = node.slip
     out = node.shape_force
     out[4] = out[5] = 0.0
@@ -168,10 +176,12 @@ def correct_forces(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape.
+    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of
+    torque and shape.
 
-    Without torque only the sum of both sides is measured; on a split road the slippery side gives SPLIT_LIMIT of its
-    friction at most, and the other side the rest. The unlike forces turn the car, which the axles' side forces hold.
+    Without torque only the sum of both sides is measured; on a split road the slippery side gives
+    SPLIT_LIMIT of its friction at most, and the other side the rest. The unlike forces turn the
+    car, which the axles' side forces hold.
     """
     leak = node.point[NodeState.LEAK_Y]
     shape = node.point[NodeState.SHAPE]
@@ -216,7 +226,8 @@ def correct_forces(
 
 @compiled
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
-    """Return the force over load of one side where `mean` acts on both: alike until the slippery side is at its limit.
+    """Return the force over load of one side where `mean` acts on both: alike until the slippery
+    side is at its limit.
 
     Args:
         mean: of both sides, signed [1].

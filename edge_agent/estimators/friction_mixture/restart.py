@@ -1,4 +1,6 @@
-"""Beginning, and beginning anew: the first sample, a silence, wheels that have long contradicted every node."""
+"""Beginning, and beginning anew: the first sample, a silence, wheels that have long contradicted
+every node.
+"""
 
 from __future__ import annotations
 
@@ -120,7 +122,9 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
+    """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within
+    `spread`.
+    """
     if not math.isnan(speed):
         memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
     memory.overall_mean[NodeState.VY] = 0.0
@@ -139,7 +143,9 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 
 @compiled
 def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
-    """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the motion starts anew."""
+    """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the
+    motion starts anew.
+    """
     last = memory.last
     now = memory.last.now
     prior = design.prior
@@ -162,11 +168,13 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 
 @compiled
 def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Call the motion back where it is far from what wheels tell that agree and roll; returns health flags.
+    """Call the motion back where it is far from what wheels tell that agree and roll; returns
+    health flags.
 
-    Where wheels have agreed for long, vehicle and friction are forgotten with the motion. Where wheels have just begun
-    to roll without force, after a slide, only the motion is set: nodes that call them sliding would not find back by
-    themselves, because the tyre curve is flat there. Noise that a slide has raised is no reason for either.
+    Where wheels have agreed for long, vehicle and friction are forgotten with the motion. Where
+    wheels have just begun to roll without force, after a slide, only the motion is set: nodes that
+    call them sliding would not find back by themselves, because the tyre curve is flat there. Noise
+    that a slide has raised is no reason for either.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):
@@ -189,7 +197,9 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
 
 @compiled
 def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the speed [m/s] of wheels that turn alike and without force, so that they roll; NaN where they do not."""
+    """Return the speed [m/s] of wheels that turn alike and without force, so that they roll; NaN
+    where they do not.
+    """
     slowest = math.inf
     fastest = -math.inf
     for wheel in range(4):
@@ -205,7 +215,9 @@ def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
-    """Motion at `speed` [m/s], or where that is NaN at the one believed, and the prior of all else."""
+    """Motion at `speed` [m/s], or where that is NaN at the one believed, and the prior of all
+    else.
+    """
     forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
     restart_motion(memory, speed, LOST_SPREAD_M_S)
     for group in range(2):

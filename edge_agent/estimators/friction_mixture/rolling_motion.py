@@ -1,9 +1,10 @@
 """Motion that needs no tyre: wheels that stand, wheels that roll alike, a rear axle that follows.
 
-A tyre beyond its peak does not hold its slip: it locks or spins up within a tenth of a second unless something steers
-it, and never four alike. So four wheels that agree for a second are the speed, but for the slip that their force asks
-of them; without this a lasting offset of an accelerometer has one explanation, four wheels sliding on ice, which
-predicts anything and is never left. Likewise a rear axle that is hardly asked for side force does not slide across.
+A tyre beyond its peak does not hold its slip: it locks or spins up within a tenth of a second
+unless something steers it, and never four alike. So four wheels that agree for a second are the
+speed, but for the slip that their force asks of them; without this a lasting offset of an
+accelerometer has one explanation, four wheels sliding on ice, which predicts anything and is never
+left. Likewise a rear axle that is hardly asked for side force does not slide across.
 """
 
 from __future__ import annotations
@@ -133,7 +134,9 @@ def _tell(
 
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Take what the wheels tell of the motion into node j; returns what its disagreement costs it [nat]."""
+    """Take what the wheels tell of the motion into node j; returns what its disagreement costs
+    it [nat].
+    """
     rolling = memory.rolling
     constants = design.constants
     features = scratch.features
@@ -174,7 +177,9 @@ def _take_velocity(
     direction: tuple[float, float],
     reading: tuple[float, float, float],
 ) -> float:
-    """Take in a velocity along `direction` (x, y): (innovation, variance, huber); half its normalised square."""
+    """Take in a velocity along `direction` (x, y): (innovation, variance, huber); half its
+    normalised square.
+    """
     root = scratch.root[j]
     row = scratch.velocity_row
     innovation, variance, huber = reading

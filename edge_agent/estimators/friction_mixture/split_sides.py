@@ -1,7 +1,8 @@
 """Split roads: a low and a high friction under the two sides of the vehicle, either way round.
 
-The frictions of a side are cells of a coarse grid; a node stands for a triangular density about the middle of its cell
-that reaches to the neighbours' middles, so that a friction between two nodes is held by both.
+The frictions of a side are cells of a coarse grid; a node stands for a triangular density about the
+middle of its cell that reaches to the neighbours' middles, so that a friction between two nodes is
+held by both.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is t
 
 
 class Sides(NamedTuple):
-    """Friction under the left and right wheels of all nodes: those of one friction first, then the split ones."""
+    """Friction under the left and right wheels of all nodes: those of one friction first, then
+    the split ones.
+    """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
     prior: Annotated[FloatArray, ALL_NODES]
@@ -84,7 +87,9 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """out (K,) = probabilities of the cells of the K nodes, those of the split nodes (SPLIT_NODES, K) shared out."""
+    """out (K,) = probabilities of the cells of the K nodes, those of the split nodes
+    (SPLIT_NODES, K) shared out.
+    """
     chain = out.shape[0]
     for j in range(chain):
         out[j] = w[j]

@@ -1,8 +1,9 @@
 """One sample of one vehicle: sums of the block, and at the block's end one step of the mixture.
 
-Order at the end of a block: road change per metre and mixing, measurement update of every node at the state of the
-block's beginning, reweighing with the evidence tempered by demand, adaptation of R, prediction to the block's end.
-Between ends of blocks the velocity is carried on by the same exact kinematics.
+Order at the end of a block: road change per metre and mixing, measurement update of every node at
+the state of the block's beginning, reweighing with the evidence tempered by demand, adaptation of
+R, prediction to the block's end. Between ends of blocks the velocity is carried on by the same
+exact kinematics.
 """
 
 from __future__ import annotations

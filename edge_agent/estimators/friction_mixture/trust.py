@@ -1,19 +1,22 @@
-"""How far the model is believed: by how strained it is, and whether any friction explains what is measured.
+"""How far the model is believed: by how strained it is, and whether any friction explains what is
+measured.
 
-**Strain** is the chi-square of what is believed of vehicle and sensors against its prior, over the degrees of freedom
-that have been learned (Birge 1932). Errors share their cause: where offsets, radii, lags and steering are found to be
-small, the axles' other errors are small as well, and where much had to be believed, they are not. So strain scales R
-of the axles, and is an input of the rules that take a share of the evidence on friction.
+**Strain** is the chi-square of what is believed of vehicle and sensors against its prior, over the
+degrees of freedom that have been learned (Birge 1932). Errors share their cause: where offsets,
+radii, lags and steering are found to be small, the axles' other errors are small as well, and where
+much had to be believed, they are not. So strain scales R of the axles, and is an input of the rules
+that take a share of the evidence on friction.
 
-**Contradiction** is a test of two hypotheses in sequence (after Page 1954): that the model holds, and that the axles'
-innovations have FACTOR times the variance that it states: late steering, a race track's bank. Ice that explains the
-data is no sign of it, nor is a far belief alone. Likelihood ratios add up to `odd` [nat] where they speak against the
-model, and fade within minutes; a straight, on which it could not fail, does not speak for it. At `odd_least` nothing is
-concluded any more: the interval goes back to the prior, the axles have no say in the motion, and what was learned
-meanwhile is forgotten. The test leaves out slides, road believed slippery and walking pace (`unexplained`). Then the
-data test nothing, and the model is tried again after `patience` [s], four times as long with each relapse: sensors
-stay as they are. Motion that had to be called back by the wheels is half a
-contradiction by itself.
+**Contradiction** is a test of two hypotheses in sequence (after Page 1954): that the model holds,
+and that the axles' innovations have FACTOR times the variance that it states: late steering, a race
+track's bank. Ice that explains the data is no sign of it, nor is a far belief alone. Likelihood
+ratios add up to `odd` [nat] where they speak against the model, and fade within minutes; a
+straight, on which it could not fail, does not speak for it. At `odd_least` nothing is concluded any
+more: the interval goes back to the prior, the axles have no say in the motion, and what was learned
+meanwhile is forgotten. The test leaves out slides, road believed slippery and walking pace
+(`unexplained`). Then the data test nothing, and the model is tried again after `patience` [s], four
+times as long with each relapse: sensors stay as they are. Motion that had to be called back by the
+wheels is half a contradiction by itself.
 """
 
 from __future__ import annotations
@@ -55,7 +58,8 @@ def judge(
         return
     trust = memory.trust
     constants = design.constants
-    # by what any car may be: a calibration makes the belief of this one narrower, and contradicts nothing
+    # by what any car may be: a calibration makes the belief of this one narrower, and contradicts
+    # nothing
     cost = belief_cost(memory.overall_mean, design.nominal)
     trust.strain = strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
@@ -89,10 +93,11 @@ def judge(
 
 @compiled
 def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return what of `ratio`, squared innovations over their variance, neither a slide nor slippery road explains.
+    """Return what of `ratio`, squared innovations over their variance, neither a slide nor slippery
+    road explains.
 
-    A wheel that slides, or a road that is believed slippery, makes the axles' forces unlike those of the model for a
-    while. Tight turns at walking pace are outside the model's range.
+    A wheel that slides, or a road that is believed slippery, makes the axles' forces unlike those
+    of the model for a while. Tight turns at walking pace are outside the model's range.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
@@ -113,13 +118,17 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 @compiled
 def strain(cost: float, learned: float, prior: float) -> float:
-    """Chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was learned."""
+    """Chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was
+    learned.
+    """
     return (2.0 * cost + prior) / (learned + prior)
 
 
 @compiled
 def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
-    """How many states of vehicle and sensors have been learned: the share of their prior variance (n,) that is gone."""
+    """How many states of vehicle and sensors have been learned: the share of their prior
+    variance (n,) that is gone.
+    """
     total = 0.0
     for i in range(NodeState.LN_KX, covariance.shape[0]):
         total += max(1.0 - covariance[i, i] / nominal.std[i] ** 2, 0.0)
@@ -141,11 +150,15 @@ def likeness(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def credence(trust: Trust, constants: Constants) -> float:
-    """Share of the evidence that is believed: less while a contradiction grows, none once it is believed."""
+    """Share of the evidence that is believed: less while a contradiction grows, none once it is
+    believed.
+    """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 
 
 @compiled
 def axles_ratio(ratio: float) -> float:
-    """Return the log-likelihood ratio of FACTOR times the stated variance against the stated one."""
+    """Return the log-likelihood ratio of FACTOR times the stated variance against the stated
+    one.
+    """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

@@ -1,4 +1,5 @@
-"""The tyre curve of the nodes as tables: force, slope, slip at a force, and how tyres differ in shape.
+"""The tyre curve of the nodes as tables: force, slope, slip at a force, and how tyres differ in
+shape.
 
 Legend
     theta    normalised slip, see edge_agent.dynamics.tyres           [1]
@@ -21,7 +22,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 CELLS: Final = 1024  # linear between: errors below 1e-6 of the force
-# (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads beyond the round one
+# (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads
+# beyond the round one
 SHARP: Final = (1.60, -0.45)
 ROUND: Final = (1.33, 0.05)
 
@@ -42,7 +44,9 @@ def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
 
 
 Curve: TypeAlias = Callable[[FloatArray], FloatArray]
-"""Force over mu*F_z of normalised slips theta >= 0: slope 1 at none, peak 1, and level or falling beyond."""
+"""Force over mu*F_z of normalised slips theta >= 0: slope 1 at none, peak 1, and level or
+falling beyond.
+"""
 
 
 def proven(curve: Curve) -> Curve:

@@ -1,9 +1,11 @@
-"""A friction that jumps inside a visit: what the visit's first part told, before the road became another.
+"""A friction that jumps inside a visit: what the visit's first part told, before the road became
+another.
 
-The visit's own belief starts from the prior and follows the road, so that at the end it tells the last surface alone.
-Beside it the surest belief of the visit so far is kept, by information over the prior. Where the belief lies almost
-whole at frictions that the surest one had excluded, the friction has jumped: the surest is the evidence of the part
-that ends, and the next part begins. A belief on its way from one to the other takes nobody's place.
+The visit's own belief starts from the prior and follows the road, so that at the end it tells the
+last surface alone. Beside it the surest belief of the visit so far is kept, by information over the
+prior. Where the belief lies almost whole at frictions that the surest one had excluded, the
+friction has jumped: the surest is the evidence of the part that ends, and the next part begins. A
+belief on its way from one to the other takes nobody's place.
 
 Legend
     w, s       probabilities of the nodes in the visit, and where it was surest   (K,)
@@ -29,7 +31,8 @@ EXCLUDED = math.exp(
 )  # of the largest likelihood: what lies below it, the surest belief excludes
 ALMOST_WHOLE = 0.9
 COMPATIBLE = 0.5  # as much as may lie there of a belief that takes the surest one's place
-KNOWING = 0.7  # [nat] half of the range is excluded; a belief that knows less says nothing against another
+# [nat] half of the range is excluded; a belief that knows less says nothing against another
+KNOWING = 0.7
 
 
 @compiled
@@ -41,7 +44,9 @@ def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Keep the surest belief; where friction has jumped, write what the part that ends told (32,) and begin another."""
+    """Keep the surest belief; where friction has jumped, write what the part that ends told
+    (32,) and begin another.
+    """
     if memory.split:
         return
     w = memory.visit_weight[:NODES]

@@ -1,4 +1,6 @@
-"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and the adaptation of R."""
+"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and the
+adaptation of R.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def measure(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every node that is awake; note NIS and the predictive log-likelihood of the mixture."""
+    """Update every node that is awake; note NIS and the predictive log-likelihood of the
+    mixture.
+    """
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
     count = awake(memory)
     for group in range(2):
@@ -84,8 +88,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """scratch.log_likelihood becomes what the block counts for each node [nat].
 
-    What falls short of the grip in use pays whatever the demand; nothing is concluded at full distrust. Without
-    accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
+    What falls short of the grip in use pays whatever the demand; nothing is concluded at full
+    distrust. Without accelerations, yaw rate or steering, sliding cannot be told from rolling:
+    nothing is concluded on friction.
     """
     constants = design.constants
     features = scratch.features
@@ -116,10 +121,12 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
 
 @compiled
 def charge(memory: MixtureMemory, node: int, price: float) -> float:
-    """Price [nat] of what a node has come to believe of the vehicle; a refund is at most what has been charged.
+    """Price [nat] of what a node has come to believe of the vehicle; a refund is at most what has
+    been charged.
 
-    Tempered evidence has charged it in part only, while its state has moved by all that was measured: on gentle drives
-    a low friction would else live on a stiffness or an offset three spreads from what is known, and hardly pay.
+    Tempered evidence has charged it in part only, while its state has moved by all that was
+    measured: on gentle drives a low friction would else live on a stiffness or an offset three
+    spreads from what is known, and hardly pay.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
@@ -128,7 +135,9 @@ def charge(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Share of the evidence that slip is worth at low speed: none when creeping, all from twice that speed on."""
+    """Share of the evidence that slip is worth at low speed: none when creeping, all from twice
+    that speed on.
+    """
     fastest = abs(vx)
     for wheel in range(4):
         if not math.isnan(features.rolling[wheel]):
@@ -138,7 +147,9 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 
 @compiled
 def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
-    """Return the membership of the forces in "new": against their smoothed past `usual` (6,), moved on by a block."""
+    """Return the membership of the forces in "new": against their smoothed past `usual` (6,),
+    moved on by a block.
+    """
     keep = math.exp(-features.duration / constants.steady_time)
     most = 0.0
     for r in range(6):

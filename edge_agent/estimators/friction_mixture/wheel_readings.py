@@ -1,4 +1,6 @@
-"""Readings of a wheel speed: jumps that no wheel makes, and the width of the steps in which it is read."""
+"""Readings of a wheel speed: jumps that no wheel makes, and the width of the steps in which it
+is read.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-SPINS_M_S = 20.0  # faster than the second slowest wheel by more is a decoding error (512 km/h were met), not a spin
+# faster than the second slowest wheel by more is a decoding error (512 km/h were met), not a spin
+SPINS_M_S = 20.0
 SAME_RAD_S = 0.02  # a reading that changes by less is the same
 HELD = 3  # readings that were the same before a change is a step, and not noise
 # [rad/s] steps that are met: 1 km/h is .9
@@ -22,7 +25,9 @@ STEP_PACE = 0.1  # share of a new step in the mean
 
 @compiled
 def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
-    """Make NaN of the wheel speeds of readings (15,) that stand far above the others; returns health flags."""
+    """Make NaN of the wheel speeds of readings (15,) that stand far above the others; returns
+    health flags.
+    """
     slowest = second = math.inf
     for wheel in range(4):
         omega = now[S.OMEGA + wheel]
@@ -40,7 +45,9 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def note_step(last: LastInputs, wheel: int, omega: float) -> None:
-    """Take in how a reading follows the last one: a speed that stands still and jumps is read in steps."""
+    """Take in how a reading follows the last one: a speed that stands still and jumps is read in
+    steps.
+    """
     change = abs(omega - last.omega[wheel])
     if change < SAME_RAD_S:
         last.omega_held[wheel] += 1

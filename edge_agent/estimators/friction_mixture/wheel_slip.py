@@ -1,9 +1,10 @@
 """Slip that the wheel speeds show by themselves, without any belief about friction or motion.
 
-A wheel slides when it runs at another speed than the other wheels by more than tyre radii explain, or when it changes
-its speed faster than the car does. This is the evidence that anti-lock and traction control work with. The filter uses
-it in three places: as an input of the rule base (`adaptation/rule_base.py`), as an explanation of large innovations
-(`trust.py`), and as a sign that the road has just changed (`mixing.py`).
+A wheel slides when it runs at another speed than the other wheels by more than tyre radii explain,
+or when it changes its speed faster than the car does. This is the evidence that anti-lock and
+traction control work with. The filter uses it in three places: as an input of the rule base
+(`adaptation/rule_base.py`), as an explanation of large innovations (`trust.py`), and as a sign that
+the road has just changed (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
-    """Return True if a front wheel is farther from the speed of the car than the rear wheels are."""
+    """Return True if a front wheel is farther from the speed of the car than the rear wheels
+    are.
+    """
     front = 0.0
     rear = 0.0
     for wheel in range(4):
@@ -84,6 +87,8 @@ def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
 
 @compiled
 def wheel_speed(memory: MixtureMemory, features: BlockFeatures, wheel: int) -> float:
-    """Return the speed ahead [m/s] by one wheel, with its radius as believed; NaN without a reading."""
+    """Return the speed ahead [m/s] by one wheel, with its radius as believed; NaN without a
+    reading.
+    """
     radius = 1.0 + memory.overall_mean[NodeState.RADIUS + wheel]
     return float(at_centre(memory.row, features, wheel) * radius)

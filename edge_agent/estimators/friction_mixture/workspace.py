@@ -1,4 +1,6 @@
-"""Records that a step writes before it reads them: intermediate results of one block of one vehicle."""
+"""Records that a step writes before it reads them: intermediate results of one block of one
+vehicle.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ from schemas.numeric import FloatArray
 class BlockFeatures:
     """Inputs of the measurement equations, of one block.
 
-    The mean velocity of the block is rotation(cos, sin)*v + gains, v at the block's beginning. Wheels are in the order
-    fl, fr, rl, rr, axles front, rear; rows of measurement are the four wheels along, then the two axles across.
+    The mean velocity of the block is rotation(cos, sin)*v + gains, v at the block's beginning.
+    Wheels are in the order fl, fr, rl, rr, axles front, rear; rows of measurement are the four
+    wheels along, then the two axles across.
     """
 
     duration: float  # [s]

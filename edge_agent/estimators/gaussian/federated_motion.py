@@ -1,12 +1,14 @@
-"""Two cubature sub-filters and a master on the planar motion: what papers 000 and 001 have in common.
+"""Two cubature sub-filters and a master on the planar motion: what papers 000 and 001 have in
+common.
 
-State [v_x, v_y, a_x, a_y, r, r'] (the papers carry the moment Gamma = I_z*r'). Sub-filter 1 measures [a_x, a_y, r],
-sub-filter 2 [a_y, r] (000, below equation 53). A step: share (15) to (17), predict (21) to (25), update (31) to (39),
-fuse (49), (50).
+State [v_x, v_y, a_x, a_y, r, r'] (the papers carry the moment Gamma = I_z*r'). Sub-filter 1
+measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). A step: share (15) to (17),
+predict (21) to (25), update (31) to (39), fuse (49), (50).
 
-Departures: a_y and r are measured once but used by both sub-filters, so each takes them with twice the variance, and
-the fused estimate is that of one filter; sub-filter 1 also measures the speed of the wheels, freed of the slip that
-their force needs, because nothing in the printed measurements observes v_x.
+Departures: a_y and r are measured once but used by both sub-filters, so each takes them with twice
+the variance, and the fused estimate is that of one filter; sub-filter 1 also measures the speed of
+the wheels, freed of the slip that their force needs, because nothing in the printed measurements
+observes v_x.
 """
 
 from __future__ import annotations
@@ -39,8 +41,9 @@ RULE = cubature(STATES)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
 STEP_S = 0.02  # process variances are per so much time
-# variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque does not know, and the
-# error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
+# variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque
+# does not know, and the error of the tyre model; the papers' 100, 1 and .01 for all states alike
+# are in no unit
 PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
 START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
 # [m/s], radius, and how wrong the slip of a force is
@@ -52,11 +55,14 @@ LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
 
 
 class MotionSetting(NamedTuple):
-    """Variances of the motion filter: process per STEP_S, at the start, and noise of each sub-filter's rows."""
+    """Variances of the motion filter: process per STEP_S, at the start, and noise of each
+    sub-filter's rows.
+    """
 
     process: tuple[float, ...] = tuple(map(float, PROCESS**2))
     start: tuple[float, ...] = tuple(map(float, START**2))
-    # with some model error; a_y and r, which both use, with twice the variance. The papers set theirs by manoeuvre
+    # with some model error; a_y and r, which both use, with twice the variance. The papers set
+    # theirs by manoeuvre
     first: tuple[float, float, float] = (0.01, 0.02, 2e-4)  # a_x, a_y, r
     second: tuple[float, float] = (0.02, 2e-4)  # a_y, r
     wheel_speed: bool = True  # whether sub-filter 1 also measures the speed of the wheels
@@ -100,7 +106,8 @@ class SubFilter(NamedTuple):
 def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
     """Write the setting into the filters, once, before their first sample."""
     motion = filters["motion"]
-    # of the rounded squares: the square roots are those of before, bit for bit, where nothing is set
+    # of the rounded squares: the square roots are those of before, bit for bit, where nothing is
+    # set
     usual = MotionSetting()
     motion["process"] = PROCESS if setting.process == usual.process else np.sqrt(setting.process)
     motion["start"] = START if setting.start == usual.start else np.sqrt(setting.start)
@@ -132,7 +139,9 @@ def begin_motion(memory: FederatedMemory) -> None:
 
 @compiled
 def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> None:
-    """Share, predict by `dt` [s] and update in both sub-filters, and fuse; friction (4,) is given."""
+    """Share, predict by `dt` [s] and update in both sub-filters, and fuse; friction (4,) is
+    given.
+    """
     motion = memory.motion
     track = memory.track
     row = memory.row
@@ -211,7 +220,9 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
 
 @compiled
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
-    """Mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x, v_y, ..., x[yaw_rate]."""
+    """Mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x, v_y, ...,
+    x[yaw_rate].
+    """
     total = 0.0
     count = 0
     use = track.inputs
@@ -224,13 +235,17 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 
 @compiled
 def doubted(std: float, innovation: float) -> float:
-    """Standard deviation [m/s] of the wheels' speed: spinning or locked wheels count as two of them, at most."""
+    """Standard deviation [m/s] of the wheels' speed: spinning or locked wheels count as two of
+    them, at most.
+    """
     return std if math.isnan(innovation) else max(std, abs(innovation) / FARTHEST)
 
 
 @compiled
 def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[float, float]:
-    """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN without any wheel."""
+    """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN
+    without any wheel.
+    """
     use = track.inputs
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     total = 0.0

@@ -1,8 +1,10 @@
-"""The papers' three-degree-of-freedom process model, by Heun's rule: state [v_x, v_y, a_x, a_y, r, z].
+"""The papers' three-degree-of-freedom process model, by Heun's rule: state [v_x, v_y, a_x, a_y, r,
+z].
 
-Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y, v_y' = a_y - r*v_x (004 prints the wrong sign),
-I_z*r' = moment of the tyres' forces; a_x and a_y are what the forces give. z is friction (004), or the yaw
-acceleration, where the papers carry the moment itself (000, 001): divided by I_z it is of a size with the others.
+Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y, v_y' = a_y - r*v_x (004 prints the
+wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y are what the forces give. z is
+friction (004), or the yaw acceleration, where the papers carry the moment itself (000, 001):
+divided by I_z it is of a size with the others.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
 CALM_M_S = 2.0
 SHORTEST_SHARE = 0.2
 POINTS = 12  # of the cubature rule in six dimensions, side by side in a row
-ABREAST = 8  # of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing else
+# of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing
+# else
+ABREAST = 8
 
 
 class PlanarState(IntEnum):
@@ -69,12 +73,14 @@ def carry(
     by_torque: bool,
     by_motor: bool = False,
 ) -> None:
-    """Move the states `columns` (6, POINTS) on by `dt` [s], in place; inputs run straight from before to now.
+    """Move the states `columns` (6, POINTS) on by `dt` [s], in place; inputs run straight from
+    before to now.
 
-    by_torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and friction (4,) is given;
-    the velocity follows a_x and a_y of the state alone, which measurements correct for drag and slopes. Else forces
-    come from slip and z is the friction of all wheels.
-    by_motor: longitudinal forces come from the torque of each axle's motor, half to each wheel; z is still friction.
+    by_torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and
+    friction (4,) is given; the velocity follows a_x and a_y of the state alone, which measurements
+    correct for drag and slopes. Else forces come from slip and z is the friction of all wheels.
+    by_motor: longitudinal forces come from the torque of each axle's motor, half to each wheel; z
+    is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
@@ -104,7 +110,9 @@ def carry(
 
 @inlined
 def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs) -> None:
-    """One of Heun's steps of the columns [first, last), in place. Arithmetic alone: the points go side by side."""
+    """One of Heun's steps of the columns [first, last), in place. Arithmetic alone: the points
+    go side by side.
+    """
     begin, end, step, by_torque = drive
     column_v = columns[0]
     column_u = columns[1]

@@ -1,8 +1,10 @@
-"""The friction of four wheels as states of a Gaussian filter: how it is forgotten, and what its mean is.
+"""The friction of four wheels as states of a Gaussian filter: how it is forgotten, and what its
+mean is.
 
-Legend: mu_i friction of a wheel, its prior mean m_0 and standard deviation s_0 (moments of the uniform prior), lambda
-metres after which it is forgotten, rho correlation of the wheels' roads. Over d metres
-mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda): without evidence it is the prior again.
+Legend: mu_i friction of a wheel, its prior mean m_0 and standard deviation s_0 (moments of the
+uniform prior), lambda metres after which it is forgotten, rho correlation of the wheels' roads.
+Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda): without
+evidence it is the prior again.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ SIDE_CORRELATION = 0.9
 
 
 def prior_root() -> FloatArray:
-    """Factor (4, 4) of P_0: wheels of a side alike but for a trace, sides correlated; wheel order fl, fr, rl, rr."""
+    """Factor (4, 4) of P_0: wheels of a side alike but for a trace, sides correlated; wheel
+    order fl, fr, rl, rr.
+    """
     same = 0.99
     other = SIDE_CORRELATION
     correlation = np.array(
@@ -44,7 +48,9 @@ PRIOR_ROOT = prior_root()
 
 @compiled
 def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: FloatArray) -> None:
-    """Forget the friction of four wheels over `metres`, in place; mean (4,), root (4, 4), work (4, 8) or larger."""
+    """Forget the friction of four wheels over `metres`, in place; mean (4,), root (4, 4), work
+    (4, 8) or larger.
+    """
     keep = math.exp(-metres / FORGET_M)
     fresh = math.sqrt(max(1.0 - keep * keep, 0.0))
     for i in range(4):
@@ -60,16 +66,20 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 @compiled
 def dependence(demand: float, dt: float) -> float:
-    """Factor on the standard deviation of a sample `dt` [s] after the last, at `demand` [g] of force.
+    """Factor on the standard deviation of a sample `dt` [s] after the last, at `demand` [g] of
+    force.
 
-    Model error lasts: many samples are one measurement. Without demand slip's noise is what is left, not friction.
+    Model error lasts: many samples are one measurement. Without demand slip's noise is what is
+    left, not friction.
     """
     return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Share of friction's spread that a measurement at `demand` [g] of force may see: none below, all far above."""
+    """Share of friction's spread that a measurement at `demand` [g] of force may see: none
+    below, all far above.
+    """
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)
 

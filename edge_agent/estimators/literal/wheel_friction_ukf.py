@@ -51,7 +51,9 @@ class UnscentedSetting(NamedTuple):
 
 
 AS_PRINTED: Final = UnscentedSetting()
-"""The printed alpha, kappa and beta; Q, R and P_0 are lost in the text and of the size that it describes."""
+"""The printed alpha, kappa and beta; Q, R and P_0 are lost in the text and of the size that it
+describes.
+"""
 UKF: Final = UnscentedSetting(square_root=False)
 UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)
 

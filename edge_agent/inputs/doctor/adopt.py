@@ -1,9 +1,10 @@
-"""Correction of a recorded drive by the measurements of the signal doctor: late devices and locked axles.
+"""Correction of a recorded drive by the measurements of the signal doctor: late devices and locked
+axles.
 
-A clock that is further off than the filter bears is a finding of the doctor. Where the drive tells by how much, the lag
-is taken out of the log before the estimator sees it; a clock that is off by an unknown time stays a finding, and the
-log is not published. Lags that the filter bears are left to its own states, so that a replay of a sound log stays
-causal.
+A clock that is further off than the filter bears is a finding of the doctor. Where the drive tells
+by how much, the lag is taken out of the log before the estimator sees it; a clock that is off by an
+unknown time stays a finding, and the log is not published. Lags that the filter bears are left to
+its own states, so that a replay of a sound log stays causal.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class Adopted(NamedTuple):
 
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Return a log as the estimator gets it: corrected by its calibration, then by the doctor's measurements."""
+    """Return a log as the estimator gets it: corrected by its calibration, then by the doctor's
+    measurements.
+    """
     return adopt_measured(replace(log, signals=corrected(log.t, log.signals, vehicle)), vehicle)
 
 
@@ -54,7 +57,8 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
         return Adopted(log, vehicle, diagnosis, [])
     notes = [
-        f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; corrected for this replay"
+        f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; "
+        "corrected for this replay"
         for device, seconds in delays.items()
     ]
     if any(finding.kind == "lift" for finding in diagnosis.findings):
@@ -80,9 +84,11 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def align_import(
     merged: Merged, profile: Profile, vehicle: Vehicle, merge_with: Callable[[Profile], Merged]
 ) -> tuple[Merged, Profile]:
-    """Return the merged recordings and their profile with the delays that the doctor measured of late devices.
+    """Return the merged recordings and their profile with the delays that the doctor measured of
+    late devices.
 
-    `merge_with` merges the same recordings by another profile. Without a late device both stay as they are.
+    `merge_with` merges the same recordings by another profile. Without a late device both stay as
+    they are.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
@@ -103,7 +109,9 @@ def align_import(
 
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
-    """Return signals (T, 18) with devices moved earlier by `delays` [s]; readings between samples are linear."""
+    """Return signals (T, 18) with devices moved earlier by `delays` [s]; readings between
+    samples are linear.
+    """
     signals = signals.copy()
     for device, seconds in delays.items():
         for name in OF_DEVICE[device]:

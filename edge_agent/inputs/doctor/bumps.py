@@ -1,8 +1,10 @@
-"""Front and rear wheels told apart by the road: a bump reaches the rear wheel one wheelbase after the front wheel.
+"""Front and rear wheels told apart by the road: a bump reaches the rear wheel one wheelbase after
+the front wheel.
 
-What the left and right wheel of an axle differ by, less its mean over some metres, is unevenness of the road and noise.
-Over the distance driven, the rear axle repeats the front one's after the wheelbase. The peak of their correlation
-there, or one wheelbase before, tells which axle is which; on a smooth road there is none.
+What the left and right wheel of an axle differ by, less its mean over some metres, is unevenness of
+the road and noise. Over the distance driven, the rear axle repeats the front one's after the
+wheelbase. The peak of their correlation there, or one wheelbase before, tells which axle is which;
+on a smooth road there is none.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole 
 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
-    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 where the road does not tell.
+    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 where the road
+    does not tell.
 
     t are times (T,) [s], signals (T, 18).
     """

@@ -30,7 +30,9 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
-    """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
+    """Measure by how much wheels and steering speak later than the inertial unit, and report
+    what is too much.
+    """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)
     for device, seconds in listed.items():
@@ -41,10 +43,11 @@ def measure_clocks(
 
 
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return by how many seconds each device speaks late, by the lags that the turns of a drive tell.
+    """Return by how many seconds each device speaks late, by the lags that the turns of a drive
+    tell.
 
-    Wheels and steering that are early by the same time show that the yaw rate is late. Where the accelerometer is not
-    late against the wheels, the gyroscope is late alone.
+    Wheels and steering that are early by the same time show that the yaw rate is late. Where the
+    accelerometer is not late against the wheels, the gyroscope is late alone.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

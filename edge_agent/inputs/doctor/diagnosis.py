@@ -14,7 +14,8 @@ class Finding:
     """One fault: the channel, what it is called, the words for it, and what mends it.
 
     Attributes:
-        scale: to multiply the channel by; offset: to add after that; delay_s: that its stamps are late.
+        scale: to multiply the channel by; offset: to add after that; delay_s: that its stamps are
+            late.
         confidence: log odds over the next best explanation, where there is one.
     """
 
@@ -29,7 +30,9 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """Faults, channels that are in order, channels that nothing was learned of, and the identities' fits."""
+    """Faults, channels that are in order, channels that nothing was learned of, and the
+    identities' fits.
+    """
 
     findings: list[Finding] = field(default_factory=list)
     sound: list[str] = field(default_factory=list)

@@ -1,4 +1,5 @@
-"""A drive made ready for its examination: even time, smoothed, with what the wheels alone say of the motion.
+"""A drive made ready for its examination: even time, smoothed, with what the wheels alone say of
+the motion.
 
 Legend
     v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle file
@@ -23,7 +24,8 @@ SMOOTH_S: Final = 0.5  # of a running mean, taken twice: motion of cars lies bel
 JOINED_S: Final = 1.5  # readings further apart are not joined
 FIX_S: Final = 1.0  # over which speed and course are taken from fixes
 LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
-UNLIKE: Final = 0.1  # share by which a wheel may be off its neighbour on the same side before it is said to slip
+# share by which a wheel may be off its neighbour on the same side before it is said to slip
+UNLIKE: Final = 0.1
 # share by which the wheels' speed may leave that over ground before they are said to slip
 LEFT: Final = 0.2
 SLIP_S: Final = 1.0  # before and behind a moment of slip, which is left out as well
@@ -32,7 +34,9 @@ CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever t
 
 @dataclass(frozen=True)
 class EvenDrive:
-    """Smoothed signals on even times (n,); NaN where nothing was read. `wheels` (n, 4) are speeds at the rim [m/s]."""
+    """Smoothed signals on even times (n,); NaN where nothing was read. `wheels` (n, 4) are
+    speeds at the rim [m/s].
+    """
 
     t: FloatArray
     ax: FloatArray
@@ -45,7 +49,8 @@ class EvenDrive:
     v_ground: FloatArray
     course: FloatArray
     course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
-    moving: FloatArray  # 1 where the car moves and no wheel slips by what the wheels say of each other, else 0
+    # 1 where the car moves and no wheel slips by what the wheels say of each other, else 0
+    moving: FloatArray
     grips: (
         FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
     )
@@ -111,7 +116,8 @@ def prepare(
         t: times.
         signals: the channels; readings of a wheel far off the median of the four are left out.
         vehicle: its radius, tracks and wheelbase.
-        ground: the receiver's own speed (T,) [m/s], where it was recorded; it is better than that of the fixes.
+        ground: the receiver's own speed (T,) [m/s], where it was recorded; it is better than that
+            of the fixes.
     """
     last = min(t[-1], t[0] + LONGEST_S)
     at = np.arange(t[0], last, 1.0 / RATE_HZ)
@@ -167,10 +173,12 @@ def prepare(
 
 
 def slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return where a wheel spins or locks, (n,), from what the wheels (n, 4) say of each other in any unit.
+    """Return where a wheel spins or locks, (n,), from what the wheels (n, 4) say of each other in
+    any unit.
 
-    Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is another tyre. A wheel
-    that is off all along is left out: it is a fault of its own and would hide the rest of the drive.
+    Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is
+    another tyre. A wheel that is off all along is left out: it is a fault of its own and would hide
+    the rest of the drive.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
@@ -192,7 +200,9 @@ def slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return where the wheels' speed leaves that over ground (n,), in any unit: all wheels spin or lock together."""
+    """Return where the wheels' speed leaves that over ground (n,), in any unit: all wheels spin
+    or lock together.
+    """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
         return np.zeros(len(v), bool)

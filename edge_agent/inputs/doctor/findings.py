@@ -1,7 +1,9 @@
-"""Findings of the signal doctor: one per fault, with its evidence, and the channels that are in order.
+"""Findings of the signal doctor: one per fault, with its evidence, and the channels that are in
+order.
 
-A channel is sound when an identity that was excited enough holds it and no fault explains the drive nearly as well;
-it is unknown when nothing was said of it. Only a log whose channels are all sound has passed.
+A channel is sound when an identity that was excited enough holds it and no fault explains the drive
+nearly as well; it is unknown when nothing was said of it. Only a log whose channels are all sound
+has passed.
 """
 
 from __future__ import annotations
@@ -38,9 +40,8 @@ from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
 
-# beyond these a constant error is a fault and not the ordinary tilt or zero of a device (std met: .35, .15 m/s^2,
-# .003 rad/s, .003 to .015 rad; radii .15 to 1.6 % apart)
-# [m/s^2]
+# beyond these a constant error is a fault and not the ordinary tilt or zero of a device (std met:
+# .35, .15 m/s^2, .003 rad/s, .003 to .015 rad; radii .15 to 1.6 % apart) [m/s^2]
 LARGEST_AX = 1.3
 LARGEST_AY = 0.75
 LARGEST_RATE = 0.02  # [rad/s]
@@ -70,7 +71,9 @@ CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta",
 def diagnose(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> Diagnosis:
-    """Examine a log: times t (T,) [s], signals (T, 18), and the receiver's speed (T,) [m/s] where it was recorded."""
+    """Examine a log: times t (T,) [s], signals (T, 18), and the receiver's speed (T,) [m/s]
+    where it was recorded.
+    """
     diagnosis = Diagnosis()
     t, slow = _seconds(t, diagnosis)
     if slow:
@@ -93,7 +96,10 @@ def diagnose(
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
         drive = prepare(t, signals, vehicle, ground)
     for axle, (left, right) in find_exchanged_axles(drive):
-        words = f"the {axle} wheels turn against the yaw rate, the others with it: left and right exchanged?"
+        words = (
+            f"the {axle} wheels turn against the yaw rate, the others with it: left and right "
+            "exchanged?"
+        )
         diagnosis.findings.append(Finding("omega", f"{axle} left and right exchanged", words))
         signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[
             :, [S.OMEGA + right, S.OMEGA + left]
@@ -112,7 +118,8 @@ def diagnose(
     )  # offsets and radii in wrong units say nothing
     late = clocks(found)
     if "wheels" in late and not wheels_speak_late(found["axle"], late["wheels"][0]):
-        late = {}  # in a slide wheels slow down before the car does; their yaw rate is not late then
+        # in a slide wheels slow down before the car does; their yaw rate is not late then
+        late = {}
     for device, (seconds, margin) in late.items():
         if margin < CLOCK_SETTLED:
             diagnosis.unknown.append(f"clock of the {device}")
@@ -162,8 +169,8 @@ def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
     """Status bits above a wheel's number: readings far off the other three, and back.
 
-    A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is whole from one
-    reading to the next, and adds the same each time.
+    A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is
+    whole from one reading to the next, and adds the same each time.
     """
     wheels = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(wheels).all(axis=1)
@@ -181,7 +188,10 @@ def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
         ):
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
-        words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
+        words = (
+            f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} "
+            "steps: status bits?"
+        )
         diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
         signals[rows[off], S.OMEGA + i] = np.nan
 
@@ -245,7 +255,9 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
 def _always(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if the drive's parts all have the gains that the faults make: a slide does not keep a gain."""
+    """Return True if the drive's parts all have the gains that the faults make: a slide does not
+    keep a gain.
+    """
     fault = verdict.faults[quantity]
     if quantity == "ay" and fault is not None and "g" in fault.name and not _turns(verdict, found):
         return False
@@ -279,7 +291,9 @@ def _always(
 
 
 def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
-    """Return True if the car turns as it is steered or as its course does: in a spin v·r is not an acceleration."""
+    """Return True if the car turns as it is steered or as its course does: in a spin v·r is not
+    an acceleration.
+    """
     for name in ("steering", "turning"):
         gain = 1.0
         for member in LAWS[name].members:
@@ -297,10 +311,12 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
 
 
 def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
-    """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged axles.
+    """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged
+    axles.
 
-    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly anything is asked. A
-    wheel that is off, but not seen to be so while the car coasts, adds the wheels to `doubts`.
+    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly
+    anything is asked. A wheel that is off, but not seen to be so while the car coasts, adds the
+    wheels to `doubts`.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)

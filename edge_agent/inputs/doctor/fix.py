@@ -40,7 +40,9 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 def corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return the findings, and the small lags as if they were findings: what a corrected profile takes out."""
+    """Return the findings, and the small lags as if they were findings: what a corrected profile
+    takes out.
+    """
     lags = small_lags(diagnosis)
     return [
         *diagnosis.findings,
@@ -51,7 +53,9 @@ def corrections(diagnosis: Diagnosis) -> list[Finding]:
 def fixed(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Profile and vehicle with what the findings say, and the findings that nobody can mend from here."""
+    """Profile and vehicle with what the findings say, and the findings that nobody can mend from
+    here.
+    """
     channels = dict(profile.channels)
     left = list[Finding]()
     update: dict[str, object] = {}

@@ -27,7 +27,8 @@ LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
 # another peak of the correlation that far off, as high as that share, leaves no lag known
 APART_S = 0.3
 RIVAL = 0.85
-PARTS: Final = 8  # of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
+# of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
+PARTS: Final = 8
 # understeer's share of the steering at the drive's fast speed: mean and std of cars
 USUAL_BEND = 0.3
 BEND_SPREAD = 0.4
@@ -39,7 +40,9 @@ CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 @dataclass(frozen=True)
 class Fit:
-    """left = gain · right + offset (+ what is beside): `error` of ln |gain| (std), correlation, lag of left [s]."""
+    """left = gain · right + offset (+ what is beside): `error` of ln |gain| (std), correlation,
+    lag of left [s].
+    """
 
     gain: float
     offset: float
@@ -64,11 +67,12 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not constant.
+    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not
+    constant.
 
-    `bend` (n,) is given where the left may grow by a share of right · bend that a drive may not tell from the gain:
-    at one speed, understeer and a gain of the steering are the same. `loose` are standard deviations of the gains of
-    what else the left holds, for the same reason.
+    `bend` (n,) is given where the left may grow by a share of right · bend that a drive may not
+    tell from the gain: at one speed, understeer and a gain of the steering are the same. `loose`
+    are standard deviations of the gains of what else the left holds, for the same reason.
     """
 
     left: FloatArray
@@ -85,12 +89,14 @@ def _lateral(d: EvenDrive) -> Relation:
 
 
 def _longitudinal(d: EvenDrive) -> Relation:
-    # slope, offset and drift lie below .1 Hz; what is left of both sides is braking and accelerating
+    # slope, offset and drift lie below .1 Hz; what is left of both sides is braking and
+    # accelerating
     return Relation(d.ax - smooth(d.ax, 10.0), d.v_dot - smooth(d.v_dot, 10.0))
 
 
 def _steering(d: EvenDrive) -> Relation:
-    # times v: turns at walking speed, where the angle is large and its map bent, would else outweigh all others
+    # times v: turns at walking speed, where the angle is large and its map bent, would else
+    # outweigh all others
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
     v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
     return Relation(
@@ -138,9 +144,11 @@ def fits(drive: EvenDrive) -> dict[str, Fit]:
 
 
 def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
-    """left = gain · right + offset + Σ k · beside, over the moving part, after the lag is taken out.
+    """left = gain · right + offset + Σ k · beside, over the moving part, after the lag is taken
+    out.
 
-    The gain is the geometric mean of both regressions, so that noise on either side does not bend it.
+    The gain is the geometric mean of both regressions, so that noise on either side does not bend
+    it.
 
     Args:
         sides: what is held against each other.
@@ -231,9 +239,11 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty makes.
+    """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty
+    makes.
 
-    Each share is tried: what it leaves of the left side, of `count` independent moments, against what cars have.
+    Each share is tried: what it leaves of the left side, of `count` independent moments, against
+    what cars have.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))
@@ -252,7 +262,9 @@ def _bend_of(
 def _loose(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Robust least squares with the last columns' gains drawn to zero, and standard deviations of all gains."""
+    """Robust least squares with the last columns' gains drawn to zero, and standard deviations
+    of all gains.
+    """
     solution = robust(table, y)
     off = np.abs(y - table @ solution)
     spread = max(1.4826 * float(np.median(off)), 1e-9)
@@ -298,7 +310,9 @@ def robust(table: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def shifted(x: FloatArray, seconds: float) -> FloatArray:
-    """x at times later by `seconds`: positive moves it back to where it belongs when it is early."""
+    """x at times later by `seconds`: positive moves it back to where it belongs when it is
+    early.
+    """
     n = np.arange(len(x))
     good = np.isfinite(x)
     if good.sum() < 2:
@@ -309,7 +323,8 @@ def shifted(x: FloatArray, seconds: float) -> FloatArray:
 
 
 def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
-    """Seconds that `left` is behind `right`, by the peak of |correlation|, and its error; infinite where unknown.
+    """Seconds that `left` is behind `right`, by the peak of |correlation|, and its error; infinite
+    where unknown.
 
     The two halves of the drive are asked as well: what they differ by is an error too.
     """

@@ -5,8 +5,9 @@
 
     m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
 
-The lag is where the correlation of both sides is largest; the peak is a parabola through three samples. A side force
-builds up behind its slip (LEAD), so that wheels and steering move a little before the body turns.
+The lag is where the correlation of both sides is largest; the peak is a parabola through three
+samples. A side force builds up behind its slip (LEAD), so that wheels and steering move a little
+before the body turns.
 """
 
 from __future__ import annotations
@@ -30,19 +31,21 @@ SMOOTH_S: Final = 0.1  # of a running mean, taken twice
 LONGEST_DRIVE_S: Final = 1800.0
 DRIVEN: Final = 4.0  # [m/s]
 SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
-# How fast a body answers to its wheels goes with the file's stiffness: .01 s at 10 % (BIAS of steer_lag in learn.py).
-# [s] that wheels and steering are ahead of the gyro where no device is late: force behind slip. Both are what twenty
-# simulated rough cars showed, with other seeds than those of the figures
+# How fast a body answers to its wheels goes with the file's stiffness: .01 s at 10 % (BIAS of
+# steer_lag in learn.py). [s] that wheels and steering are ahead of the gyro where no device is
+# late: force behind slip. Both are what twenty simulated rough cars showed, with other seeds than
+# those of the figures
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
 def lags(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
 ) -> dict[str, float]:
-    """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not tell are left out.
+    """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not
+    tell are left out.
 
-    `least` is the correlation from which on a lag is believed. Signals are smoothed less than the doctor's: over half a
-    second the peak is too round to tell milliseconds.
+    `least` is the correlation from which on a lag is believed. Signals are smoothed less than the
+    doctor's: over half a second the peak is too round to tell milliseconds.
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
 

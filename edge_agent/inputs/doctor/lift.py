@@ -1,8 +1,9 @@
 """A car on a lift or on rollers: wheels turn and gain speed, and the body feels nothing of it.
 
-On a road, wheels that gain .5 m/s² for a second are felt by the accelerometer, in a slide on ice as well: tyres without
-any grip turn, but then all wheels that are not driven show whether the car moves. So one axle must stand while the
-other turns fast, or all wheels must change their speed while body and yaw rate rest.
+On a road, wheels that gain .5 m/s² for a second are felt by the accelerometer, in a slide on ice as
+well: tyres without any grip turn, but then all wheels that are not driven show whether the car
+moves. So one axle must stand while the other turns fast, or all wheels must change their speed
+while body and yaw rate rest.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Where the receiver says the car is, and where it points: latitude and longitude exchanged, a compass for yaw."""
+"""Where the receiver says the car is, and where it points: latitude and longitude exchanged, a
+compass for yaw.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def _turned(angle: FloatArray) -> float:
 
 
 def _agreement(yaw: FloatArray, course: FloatArray) -> float:
-    """1 where they are equal, by the part of the mean resultant that lies along no difference at all."""
+    """1 where they are equal, by the part of the mean resultant that lies along no difference at
+    all.
+    """
     return float(np.mean(np.cos(yaw - course)))
 
 

@@ -1,4 +1,6 @@
-"""The doctor's findings as lines for a terminal, and as one page with plots that needs nothing beside it."""
+"""The doctor's findings as lines for a terminal, and as one page with plots that needs nothing
+beside it.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,10 @@ POINTS: Final = 600
 SIDE: Final = 260  # of a plot [pixel]
 EDGE: Final = 36
 STYLE: Final = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}"
-    "table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid #ddd;text-align:left}"
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 "
+    "1em;color:#222}"
+    "table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid "
+    "#ddd;text-align:left}"
     "figure{display:inline-block;margin:.5em}figcaption{font-size:13px;color:#555}.bad{color:#b00020}"
 )
 
@@ -114,7 +118,10 @@ def _table(fits: dict[str, Fit]) -> str:
         for name, fit in fits.items()
         if len(fit.right)
     ]
-    return f"<table><tr><th>identity<th>gain<th>offset<th>correlation<th>excited [s]<th>lag [s]{''.join(rows)}</table>"
+    return (
+        "<table><tr><th>identity<th>gain<th>offset<th>correlation<th>excited [s]<th>lag "
+        f"[s]{''.join(rows)}</table>"
+    )
 
 
 def _figure(name: str, fit: Fit) -> str:
@@ -144,7 +151,8 @@ def _figure(name: str, fit: Fit) -> str:
     return (
         f"<figure><svg width='{SIDE}' height='{SIDE}' viewBox='0 0 {SIDE} {SIDE}' role='img'>"
         f"<g fill='#3465a4' fill-opacity='.5'>{dots}</g>"
-        f"<polyline points='{law}' stroke='#999' fill='none'/><polyline points='{found}' stroke='#b00020' fill='none'/>"
+        f"<polyline points='{law}' stroke='#999' fill='none'/><polyline points='{found}' "
+        "stroke='#b00020' fill='none'/>"
         f"<text x='{SIDE / 2}' y='{SIDE - 8}' font-size='12' text-anchor='middle'>{across}</text>"
         f"<text x='12' y='{SIDE / 2}' font-size='12' text-anchor='middle' "
         f"transform='rotate(-90 12 {SIDE / 2})'>{up}</text>"

@@ -1,12 +1,14 @@
 """Which quantities have a wrong unit, sign or clock: the fewest faults that explain all identities.
 
-Every quantity may be sound or have one of a few faults, each a factor on what is recorded (Occam: a fault costs as much
-as FAULT_COST / 2 in log probability, since few columns are wrong). An identity says, in logarithms,
+Every quantity may be sound or have one of a few faults, each a factor on what is recorded (Occam: a
+fault costs as much as FAULT_COST / 2 in log probability, since few columns are wrong). An identity
+says, in logarithms,
 
     ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π sign(factor)
 
-Every set of at most two faulty quantities is tried. A quantity is settled when all explanations that say otherwise of
-it cost SETTLED more. Clocks likewise: the lag of an identity is the difference of two devices' lags.
+Every set of at most two faulty quantities is tried. A quantity is settled when all explanations
+that say otherwise of it cost SETTLED more. Clocks likewise: the lag of an identity is the
+difference of two devices' lags.
 """
 
 from __future__ import annotations
@@ -44,14 +46,17 @@ class Member(NamedTuple):
 
 
 class Law(NamedTuple):
-    """An identity's gain if all is sound, the spread of its logarithm among sound cars, and what it holds."""
+    """An identity's gain if all is sound, the spread of its logarithm among sound cars, and what
+    it holds.
+    """
 
     centre: float
     spread: float
     members: tuple[Member, ...]
 
 
-# centres and spreads: bodies that roll make a_y larger (4 to 7 degrees a g), pitch a_x; steering bends by understeer
+# centres and spreads: bodies that roll make a_y larger (4 to 7 degrees a g), pitch a_x; steering
+# bends by understeer
 LAWS: Final = {
     "lateral": Law(1.03, 0.06, (Member("ay", 1), Member("v", -1), Member("r", -1))),
     "longitudinal": Law(1.02, 0.10, (Member("ax", 1), Member("v", -1))),
@@ -130,7 +135,9 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of each quantity: the fault or None, and by how much the best explanation that differs costs more."""
+    """Of each quantity: the fault or None, and by how much the best explanation that differs
+    costs more.
+    """
 
     faults: dict[str, Mistake | None]
     margins: dict[str, float]
@@ -158,7 +165,9 @@ def explain(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
 
 
 def _alike(one: Mistake | None, other: Mistake | None) -> bool:
-    """Whether two faults come to the same: km/h is a radius of .28 m, which no drive tells from a wrong one."""
+    """Whether two faults come to the same: km/h is a radius of .28 m, which no drive tells from
+    a wrong one.
+    """
     if one is None or other is None:
         return one is other
     return abs(math.log(abs(one.factor / other.factor))) < ALIKE and one.factor * other.factor > 0.0
@@ -196,7 +205,9 @@ def _misfit(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 
 def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
-    """Device -> (seconds that its clock is late, the margin of that), for the fewest late devices; empty for none."""
+    """Device -> (seconds that its clock is late, the margin of that), for the fewest late
+    devices; empty for none.
+    """
     known = {
         name: fit
         for name, fit in found.items()

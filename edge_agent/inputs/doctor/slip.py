@@ -34,7 +34,9 @@ TURNS_LIKE: Final = 0.8
 
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
-    """Return True if a wheel leaves the others (n,) by sudden steps of a few sizes, FEWEST_STEPS at least."""
+    """Return True if a wheel leaves the others (n,) by sudden steps of a few sizes, FEWEST_STEPS
+    at least.
+    """
     enters = np.flatnonzero(~off[:-1] & off[1:])
     if len(enters) < FEWEST_STEPS:
         return False
@@ -49,7 +51,9 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 
 
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
-    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody spins for that long."""
+    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody
+    spins for that long.
+    """
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
     moves = np.abs(others) > 0.3 * fast
     return bool(
@@ -60,7 +64,8 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axles whose left and right wheels are exchanged, though the other axle's are not: name and wheels.
+    """Return the axles whose left and right wheels are exchanged, though the other axle's are not:
+    name and wheels.
 
     With both exchanged the axles agree, and the identity of the axles tells it.
     """
@@ -91,10 +96,11 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
 
 
 def find_locked_axles(drive: EvenDrive) -> list[str]:
-    """Return the axles whose wheels turn as one, "front" or "rear": a locked differential, or one sensor for both.
+    """Return the axles whose wheels turn as one, "front" or "rear": a locked differential, or one
+    sensor for both.
 
-    The other axle follows the yaw rate. A wheel speed of a locked axle tells the mean of both; a filter that takes the
-    difference for slip reads a slide in every tight turn.
+    The other axle follows the yaw rate. A wheel speed of a locked axle tells the mean of both; a
+    filter that takes the difference for slip reads a slide in every tight turn.
     """
     locked = []
     for name, own, other in (
@@ -118,7 +124,9 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return where the car goes as it is steered, (n,): it does not slide there, whatever the road."""
+    """Return where the car goes as it is steered, (n,): it does not slide there, whatever the
+    road.
+    """
     fast = np.maximum(np.abs(drive.v), 1.0)
     wanted = drive.wheelbase * drive.r / fast
     steered = np.isfinite(drive.delta) & np.isfinite(wanted)
@@ -128,9 +136,11 @@ def find_followed(drive: EvenDrive) -> BoolArray:
 
 
 def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
-    """Return True if speed over ground over the wheels' is the same while the car gains and loses speed.
+    """Return True if speed over ground over the wheels' is the same while the car gains and loses
+    speed.
 
-    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong radius always is.
+    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong
+    radius always is.
     """
     ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
     known = np.isfinite(ratio) & (drive.moving > 0)
@@ -141,7 +151,9 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return by how much the parts of a drive differ in what should be constant: a tilt is in all, a slide is not."""
+    """Return by how much the parts of a drive differ in what should be constant: a tilt is in
+    all, a slide is not.
+    """
     parts = [
         float(np.nanmedian(part))
         for part in np.array_split(beside, RADIUS_PARTS)
@@ -156,7 +168,9 @@ def is_steady(fit: Fit) -> bool:
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts whose gain is the given one, within `within` in logarithms."""
+    """Return the share of a drive's parts whose gain is the given one, within `within` in
+    logarithms.
+    """
     if not fit.parts:
         return 0.0
     near = [g * gain > 0.0 and abs(np.log(abs(g / gain))) < within for g in fit.parts if g]
@@ -166,9 +180,11 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
 def measure_lags_twice(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
 ) -> dict[str, float]:
-    """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all along.
+    """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all
+    along.
 
-    A car that slides answers to its steering later or sooner than its model, and not by the same time again.
+    A car that slides answers to its steering later or sooner than its model, and not by the same
+    time again.
     """
     half = len(t) // 2
     whole = lags(t, signals, vehicle)

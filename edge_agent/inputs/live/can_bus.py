@@ -18,7 +18,9 @@ OWN: Final = "gripmap"
 
 
 class Decoder:
-    """Frames to signals, by the database; of a message that the profile puts on another bus, nothing."""
+    """Frames to signals, by the database; of a message that the profile puts on another bus,
+    nothing.
+    """
 
     def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
         elsewhere = {

@@ -1,4 +1,6 @@
-"""Signals of a Kuksa databroker, by gRPC (kuksa.val.v2): paths of the vehicle signal specification (COVESA VSS)."""
+"""Signals of a Kuksa databroker, by gRPC (kuksa.val.v2): paths of the vehicle signal
+specification (COVESA VSS).
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ class DatabrokerFeed(Feed):
         address: host and port.
         paths: that the profile reads; those which the broker does not know are left out.
         lasting: of these, the ones that are sent when they change.
-        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`, a JSON web token.
+        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`,
+            a JSON web token.
 
     Raises:
         InputError: grpc is not installed, or a file cannot be read.
@@ -48,7 +51,8 @@ class DatabrokerFeed(Feed):
         self._address = address
         self._paths = sorted(paths)
         self._lasting = frozenset(lasting)
-        # protobuf's runtime is there with the core; the messages are made when a broker is asked for
+        # protobuf's runtime is there with the core; the messages are made when a broker is asked
+        # for
         self._messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
         try:
             read = {option: Path(file).read_bytes() for option, file in files.items()}
@@ -66,8 +70,8 @@ class DatabrokerFeed(Feed):
     def listen(self) -> None:
         """Hear updates until the broker goes.
 
-        Its first answer holds what it knew before, however old: not readings, but of what is sent when it changes the
-        value of now.
+        Its first answer holds what it knew before, however old: not readings, but of what is sent
+        when it changes the value of now.
         """
         with self._channel() as channel:
             known = self._known(channel)
@@ -117,7 +121,9 @@ class DatabrokerFeed(Feed):
         )
 
     def _known(self, channel: Any) -> list[str]:  # noqa: ANN401
-        """The paths that the broker knows: a subscription with an unknown one is refused as a whole."""
+        """The paths that the broker knows: a subscription with an unknown one is refused as a
+        whole.
+        """
         m = self._messages
         ask = self._method(channel.unary_unary, "GetValue", m.GetValueResponse)
         known = []

@@ -1,8 +1,9 @@
 """A live source: a thread that listens, opens anew what was lost, and hands over what it heard.
 
-Times are the host's: seconds since its start, by a clock that never steps. A source whose stamps are up to BELIEVED_S
-old when they arrive has the host's date and is believed. Any other has a clock of its own: its fastest message within
-WHILE_S to 2 WHILE_S is taken to have come at once (Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
+Times are the host's: seconds since its start, by a clock that never steps. A source whose stamps
+are up to BELIEVED_S old when they arrive has the host's date and is believed. Any other has a clock
+of its own: its fastest message within WHILE_S to 2 WHILE_S is taken to have come at once (Cristian,
+Distrib. Comput. 3 (1989): the minimum of the delays).
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class Feed(ABC):
 
     Attributes:
         name: how it was asked for.
-        heard: messages so far; lost: those known to be missing; broken: those that could not be read.
+        heard: messages so far; lost: those known to be missing; broken: those that could not be
+            read.
         openings, losses: how often the source was opened, and lost.
     """
 
@@ -95,7 +97,9 @@ class Feed(ABC):
 
     @abstractmethod
     def listen(self) -> None:
-        """Open the source, count that, and `hear` until `stopping` is set; to return or raise earlier is to lose it."""
+        """Open the source, count that, and `hear` until `stopping` is set; to return or raise
+        earlier is to lose it.
+        """
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
@@ -113,7 +117,9 @@ class Feed(ABC):
 
     @property
     def listening(self) -> bool:
-        """Whether its thread runs: after `close`, one that hangs, which its library may wait for at the exit."""
+        """Whether its thread runs: after `close`, one that hangs, which its library may wait for
+        at the exit.
+        """
         return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:

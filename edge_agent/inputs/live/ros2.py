@@ -1,8 +1,10 @@
-"""Topics of ROS 2 over rmw_zenoh, no ROS installed: a subscriber at a Zenoh router, messages decoded by rosbags.
+"""Topics of ROS 2 over rmw_zenoh, no ROS installed: a subscriber at a Zenoh router, messages
+decoded by rosbags.
 
-A topic's key is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, its payload CDR. The attachment begins with a sequence
-number and the time of publication (int64 each, little endian; rmw_zenoh_cpp, design.md): so what was lost is known.
-Signals are called as in a bag, /topic.field.field; topics of can_msgs/Frame are buses.
+A topic's key is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, its payload CDR. The attachment begins
+with a sequence number and the time of publication (int64 each, little endian; rmw_zenoh_cpp,
+design.md): so what was lost is known. Signals are called as in a bag, /topic.field.field; topics of
+can_msgs/Frame are buses.
 """
 
 from __future__ import annotations

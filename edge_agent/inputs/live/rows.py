@@ -1,9 +1,11 @@
-"""Rows at a fixed rate of what live sources heard: the importer's profile and merging, a tenth of a second at a time.
+"""Rows at a fixed rate of what live sources heard: the importer's profile and merging, a tenth of a
+second at a time.
 
-A row is made DELAY_S after its time, so that readings to either side of it are there; a source that speaks but is
-behind (its host is busy) is waited for up to PATIENCE_S. What comes later still is missing, and counted. The clock
-makes the rows: where all sources are silent they are empty, and the estimator widens.
-A fix that comes after its row is moved along its own course to the first row that is left.
+A row is made DELAY_S after its time, so that readings to either side of it are there; a source that
+speaks but is behind (its host is busy) is waited for up to PATIENCE_S. What comes later still is
+missing, and counted. The clock makes the rows: where all sources are silent they are empty, and the
+estimator widens. A fix that comes after its row is moved along its own course to the first row that
+is left.
 """
 
 from __future__ import annotations
@@ -113,7 +115,9 @@ class LiveRows:
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _behind(self, time: float) -> bool:
-        """Whether a source has yet to tell of a time: none that is silent, and no receiver, whose fixes are rare."""
+        """Whether a source has yet to tell of a time: none that is silent, and no receiver,
+        whose fixes are rare.
+        """
         return any(
             feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
             for feed, kept in zip(self.feeds, self._readings, strict=True)
@@ -221,11 +225,15 @@ class LiveRows:
                 signals[rows, CHANNELS.index(name)] = values
 
     def _steer(self, signals: FloatArray) -> None:
-        """As in a log: a front wheel that no profile names is as the other, rear wheels do not steer."""
+        """As in a log: a front wheel that no profile names is as the other, rear wheels do not
+        steer.
+        """
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
     def _start_ns(self) -> int:
-        """The date of the host's start: by a receiver's clock where the host's is off, settled by the first fix."""
+        """The date of the host's start: by a receiver's clock where the host's is off, settled
+        by the first fix.
+        """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [
                 feed.stamps.lead

@@ -1,8 +1,8 @@
 """CAN logs (BLF, ASC, candump, TRC, bus-logging MF4) to series, by way of a CAN database.
 
-Times are those of arrival, counted from the log's first frame in whole microseconds, so that one drive is one drive
-in every format. Buses are numbered as python-can does; of a message that several buses carry, that bus is taken which
-has most of what is asked for, unless it is named.
+Times are those of arrival, counted from the log's first frame in whole microseconds, so that one
+drive is one drive in every format. Buses are numbered as python-can does; of a message that several
+buses carry, that bus is taken which has most of what is asked for, unless it is named.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 
 @dataclass
 class Frames:
-    """Frames of one identifier on one bus: time of arrival [s as logged], and their bytes, filled up to LONGEST."""
+    """Frames of one identifier on one bus: time of arrival [s as logged], and their bytes,
+    filled up to LONGEST.
+    """
 
     times: list[float] = field(default_factory=list)
     data: bytearray = field(default_factory=bytearray)
@@ -51,7 +53,9 @@ Log: TypeAlias = dict[Key, Frames]
 
 
 Taker: TypeAlias = Callable[[set[int]], tuple[Log, float]]
-"""Frames of the wanted identifiers, and the time of the log's first frame [s since 1970 UTC, or since its start]."""
+"""Frames of the wanted identifiers, and the time of the log's first frame [s since 1970 UTC, or
+since its start].
+"""
 
 
 def decoded(

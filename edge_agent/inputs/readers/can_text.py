@@ -1,4 +1,6 @@
-"""CAN frames in text that python-can does not read: SavvyCAN's GVRET CSV, and PCAN traces without their header."""
+"""CAN frames in text that python-can does not read: SavvyCAN's GVRET CSV, and PCAN traces
+without their header.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,8 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames of a trace without header, times in milliseconds, and the time of the first [s].
+    """Return the frames of a trace without header, times in milliseconds, and the time of the first
+    [s].
 
     Raises:
         InputError: no line is a frame.

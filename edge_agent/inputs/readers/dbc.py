@@ -1,9 +1,9 @@
 """CAN databases, read tolerantly, and frames decoded a column at a time.
 
-Only `BO_` and `SG_` lines are read: names with blanks, doubled messages and unknown attributes, over which strict
-parsers stumble, do no harm. Multiplexed signals are decoded where their switch says so.
-Bit numbers are those of a DBC: little endian counts up from the start bit; big endian starts at the most significant
-bit and counts down within a byte, then on to the next byte.
+Only `BO_` and `SG_` lines are read: names with blanks, doubled messages and unknown attributes,
+over which strict parsers stumble, do no harm. Multiplexed signals are decoded where their switch
+says so. Bit numbers are those of a DBC: little endian counts up from the start bit; big endian
+starts at the most significant bit and counts down within a byte, then on to the next byte.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ Bytes: TypeAlias = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Signal:
-    """Where a signal lies in a frame: start and size [bit], byte order, and what makes a physical value of it."""
+    """Where a signal lies in a frame: start and size [bit], byte order, and what makes a
+    physical value of it.
+    """
 
     name: str
     start: int
@@ -88,7 +90,9 @@ class Signal:
 
 @dataclass(frozen=True)
 class CanMessage:
-    """A message of a database: identifier with its extended flag taken off, length [byte] and signals by name."""
+    """A message of a database: identifier with its extended flag taken off, length [byte] and
+    signals by name.
+    """
 
     name: str
     identifier: int
@@ -136,7 +140,9 @@ def read_dbc(path: Path) -> Database:
 
 
 def parse_dbc(text: str) -> Database:
-    """The messages of a database's text; lines that make no sense are left out, and of two alike the last holds."""
+    """The messages of a database's text; lines that make no sense are left out, and of two alike
+    the last holds.
+    """
     database: Database = {}
     message: CanMessage | None = None
     for line in text.splitlines():

@@ -1,6 +1,8 @@
-"""Positions as NMEA 0183 sentences or gpsd's JSON, one a line; lines that are broken are left out and counted.
+"""Positions as NMEA 0183 sentences or gpsd's JSON, one a line; lines that are broken are left out
+and counted.
 
-Of NMEA, RMC is read: time with date, place, speed, course. A sentence whose checksum is wrong counts as broken.
+Of NMEA, RMC is read: time with date, place, speed, course. A sentence whose checksum is wrong
+counts as broken.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ UNITS: Final = {"latitude": "deg", "longitude": "deg", "speed": "m/s", "course":
 
 
 class Fix(NamedTuple):
-    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where not given."""
+    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where
+    not given.
+    """
 
     time: int
     latitude: float

@@ -1,7 +1,8 @@
 """ASAM MDF 4: measured channels, or a logged bus, by asammdf; its blocks are walked first.
 
-A block that points to itself or out of the file would keep a reader busy for ever: the chains of data groups, channel
-groups and channels, and the data lists, are followed once here, each address at most once.
+A block that points to itself or out of the file would keep a reader busy for ever: the chains of
+data groups, channel groups and channels, and the data lists, are followed once here, each address
+at most once.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def check_blocks(path: Path) -> None:
     """Follow the chains of blocks.
 
     Raises:
-        InputError: a link leads out of the file or into a circle, or a group counts more records than the file holds.
+        InputError: a link leads out of the file or into a circle, or a group counts more records
+            than the file holds.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -90,7 +92,9 @@ def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
 
 
 class MdfContent(NamedTuple):
-    """What a file holds: frames and the time of the first [s since 1970 UTC], or the channels of a measurement."""
+    """What a file holds: frames and the time of the first [s since 1970 UTC], or the channels of
+    a measurement.
+    """
 
     frames: tuple[Log, float] | None
     recording: Recording | None
@@ -101,7 +105,8 @@ def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | No
 
     Args:
         path: the file.
-        identifiers: of the frames that are wanted, if it holds frames; None where nothing can decode them.
+        identifiers: of the frames that are wanted, if it holds frames; None where nothing can
+            decode them.
         names: of the channels that are wanted, if it is a measurement; None for all.
 
     Raises:
@@ -164,7 +169,9 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
 
 
 def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Channels of a measurement by name, all where none is asked for; of one name the first with samples."""
+    """Channels of a measurement by name, all where none is asked for; of one name the first with
+    samples.
+    """
     start = mdf.header.start_time.timestamp()
     recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)
     with foreign(path, "MDF 4"):

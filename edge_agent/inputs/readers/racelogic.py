@@ -1,4 +1,5 @@
-"""Racelogic VBO files, and the same columns saved as CSV: times, places and units as that format means them.
+"""Racelogic VBO files, and the same columns saved as CSV: times, places and units as that format
+means them.
 
 time        hhmmss.ss UTC of the day        lat, long    minutes, west positive
 velocity    km/h                            heading      degrees, clockwise from north

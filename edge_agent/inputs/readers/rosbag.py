@@ -1,7 +1,8 @@
 """ROS bags (version 2 folders and MCAP files, and version 1) by rosbags, no ROS installed.
 
-A signal is called `/topic.field.field`; elements of short arrays `/topic.field[0]`, joints `/topic.velocity[NAME]`.
-Its time is the message's own stamp where it has one, else that of the recorder. Topics of can_msgs/Frame are a CAN log.
+A signal is called `/topic.field.field`; elements of short arrays `/topic.field[0]`, joints
+`/topic.velocity[NAME]`. Its time is the message's own stamp where it has one, else that of the
+recorder. Topics of can_msgs/Frame are a CAN log.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """A reader, opened and in the end closed; the folder is taken for a database file that lies in it."""
+    """A reader, opened and in the end closed; the folder is taken for a database file that lies
+    in it.
+    """
     highlevel = library("rosbags.highlevel")
     typesys = library("rosbags.typesys")
     inside = (
@@ -58,7 +61,9 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
 
 
 def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]; a topic is a bus."""
+    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]; a
+    topic is a bus.
+    """
     log: Log = {}
     first = np.inf
     topics = [connection for connection in reader.connections if connection.msgtype == FRAME]
@@ -116,7 +121,9 @@ def stamp_of(message: Any) -> int:  # noqa: ANN401
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """The numbers in a message: their names behind the topic's, and how to take them out of one of its kind."""
+    """The numbers in a message: their names behind the topic's, and how to take them out of one
+    of its kind.
+    """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):
             continue

@@ -1,6 +1,7 @@
 """Tables, CSV and Parquet, one row per sample: every column that is a number becomes a series.
 
-The time is the column `t` [s], `timestamp`, or one whose name says time; a unit may stand in the name, `speed [km/h]`.
+The time is the column `t` [s], `timestamp`, or one whose name says time; a unit may stand in the
+name, `speed [km/h]`.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ def _csv(path: Path) -> pa.Table:
 
 
 def _racechrono(path: Path, lines: list[str]) -> pa.Table:
-    """Return the table of RaceChrono's CSV version 3: a preamble, then names, units and sources, a row each.
+    """Return the table of RaceChrono's CSV version 3: a preamble, then names, units and sources, a
+    row each.
 
     Raises:
         InputError: there is no row of names.

@@ -1,10 +1,12 @@
-"""Are cars that come to an alerted stretch warned in time, and no others? Simulated drivers, the real warnings.
+"""Are cars that come to an alerted stretch warned in time, and no others? Simulated drivers, the
+real warnings.
 
-The link is up and the map known, within SPREAD of `known_town`: what is judged is what a car makes of it, with the
-fixes of its receiver. A car comes to a stretch from road that is not slippery; who drives from snow onto ice is on it
-already. It is warned in time when it could stop before the stretch from where it was told: 1.5 s of reaction, then
-braking with the true friction of the road before it, with 3 m/s² at the most; and when the warning stands as it comes.
-A warning is false when nothing slippery lies within a lane's width of where the car then drove: no cell is finer.
+The link is up and the map known, within SPREAD of `known_town`: what is judged is what a car makes
+of it, with the fixes of its receiver. A car comes to a stretch from road that is not slippery; who
+drives from snow onto ice is on it already. It is warned in time when it could stop before the
+stretch from where it was told: 1.5 s of reaction, then braking with the true friction of the road
+before it, with 3 m/s² at the most; and when the warning stands as it comes. A warning is false when
+nothing slippery lies within a lane's width of where the car then drove: no cell is finer.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the look at which it was raised, what it said, and the look at which it ended."""
+    """One warning: the look at which it was raised, what it said, and the look at which it
+    ended.
+    """
 
     at: int
     distance: float
@@ -65,7 +69,9 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """One car's way: metre, speed, friction and the least beside it at each look, and what it was told, by name."""
+    """One car's way: metre, speed, friction and the least beside it at each look, and what it
+    was told, by name.
+    """
 
     metre: list[float] = field(default_factory=list)
     speed: list[float] = field(default_factory=list)
@@ -139,7 +145,9 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
 
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
-    """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it is at t [s]."""
+    """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it
+    is at t [s].
+    """
     true = fleet.truth
     every = round(RATE_HZ / BESIDE_HZ)
     x = true.x[::every]
@@ -206,7 +214,9 @@ def _judge(track: _Track, counts: Approaches) -> None:
 
 
 def _short(metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float) -> float:
-    """By how much the way to the stretch [m] is too short to stop on it, from look `at`; 0 or less: it is not."""
+    """By how much the way to the stretch [m] is too short to stop on it, from look `at`; 0 or
+    less: it is not.
+    """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)
     brakes = min(GRAVITY * float(mu[on_the_way].min()), COMFORT) if on_the_way.any() else COMFORT

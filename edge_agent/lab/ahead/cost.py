@@ -1,8 +1,8 @@
 """What listening costs a car in a day: megabytes down in a busy city, and processor.
 
-The city is a grid of streets 100 m apart, every place of both directions measured, STANDING alerts in each tile; the
-car drives DAY_KM through it at city speed. The bytes are those of the answers that a service would send, with their
-keys and FRAME bytes of transport each.
+The city is a grid of streets 100 m apart, every place of both directions measured, STANDING alerts
+in each tile; the car drives DAY_KM through it at city speed. The bytes are those of the answers
+that a service would send, with their keys and FRAME bytes of transport each.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def streets() -> IntArray:
 
 
 def way(rng: np.random.Generator, metres: float) -> FloatArray:
-    """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right, never out of it."""
+    """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right,
+    never out of it.
+    """
     here = np.array([BLOCKS // 2, BLOCKS // 2])
     heading = 0
     corners = [here]

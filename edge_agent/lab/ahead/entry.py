@@ -1,9 +1,11 @@
-"""What the map as a prior is worth: the error at entry, how long a wrong map delays, and what of it is published.
+"""What the map as a prior is worth: the error at entry, how long a wrong map delays, and what of it
+is published.
 
-One drive of the default estimator through drawn towns gives what each filter believed and measured, ten times a second;
-the maps are laid beside it afterwards, since the filter never sees one. A map is `known_town`'s: off by chance as far
-as it says. It is wrong where the scenario's black ice appears, dry as it was before; and, the other way round, where it
-says ice of as long a stretch that is dry.
+One drive of the default estimator through drawn towns gives what each filter believed and measured,
+ten times a second; the maps are laid beside it afterwards, since the filter never sees one. A map
+is `known_town`'s: off by chance as far as it says. It is wrong where the scenario's black ice
+appears, dry as it was before; and, the other way round, where it says ice of as long a stretch that
+is dry.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """What N filters said at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T, N)."""
+    """What N filters said at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T,
+    N).
+    """
 
     place: IntArray
     own: FloatArray
@@ -65,7 +69,8 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
         old_map = heard(places_of(scenario, BEFORE_S), now, rng)
         fake_map = heard(_with_fake_ice(scenario, seconds, rng), now, rng)
         errors.append(entry_errors(trace, true_map, now))
-        # where the old map says grip and there is ice; where the fake one says ice and there is grip
+        # where the old map says grip and there is ice; where the fake one says ice and there is
+        # grip
         for name, wrong in (("ice", old_map), ("dry", fake_map)):
             delays[name] += arrivals(trace, wrong, true_map, now)
         nats = max(nats, published_change(fleet, trace, seconds))
@@ -129,7 +134,9 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrivals(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
+    """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the
+    stay, if never.
+    """
     differ = _differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)
     alone = _medians(np.exp(trace.own))
@@ -150,7 +157,9 @@ def arrivals(
 
 
 def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
-    """Largest change [nat] of a published likelihood where the cars hear a map that is wrong everywhere."""
+    """Largest change [nat] of a published likelihood where the cars hear a map that is wrong
+    everywhere.
+    """
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
     short = min(seconds, 20.0)

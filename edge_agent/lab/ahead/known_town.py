@@ -1,4 +1,6 @@
-"""A scenario's roads as a fleet that has been everywhere would know them: every place with its truth."""
+"""A scenario's roads as a fleet that has been everywhere would know them: every place with its
+truth.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how f
 
 
 class KnownPlaces(NamedTuple):
-    """Places that lanes lead through, each once, (n,): cell * 4 + sector, and least friction there."""
+    """Places that lanes lead through, each once, (n,): cell * 4 + sector, and least friction
+    there.
+    """
 
     key: IntArray
     mu: FloatArray

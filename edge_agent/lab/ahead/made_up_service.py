@@ -1,4 +1,6 @@
-"""A service's side for what judges listening cars: answers for the map and for standing alerts, puts alerts."""
+"""A service's side for what judges listening cars: answers for the map and for standing alerts,
+puts alerts.
+"""
 
 from __future__ import annotations
 
@@ -60,9 +62,11 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 @dataclass
 class MadeUpService:
-    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes what it was asked.
+    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes
+    what it was asked.
 
-    They were observed at `now`. With `kept` it answers with the tile as it was made then, as a store of messages would.
+    They were observed at `now`. With `kept` it answers with the tile as it was made then, as a
+    store of messages would.
     """
 
     settings: ZenohSettings

@@ -1,1 +1,3 @@
-"""`edge-agent evaluate`: the papers' manoeuvres for every estimator, as figures, a table and plots."""
+"""`edge-agent evaluate`: the papers' manoeuvres for every estimator, as figures, a table and
+plots.
+"""

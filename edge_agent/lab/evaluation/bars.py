@@ -1,4 +1,6 @@
-"""The figures of a campaign: those with a bar as one table, and every measure beside them for context."""
+"""The figures of a campaign: those with a bar as one table, and every measure beside them for
+context.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 
 
 class EstimatorBar(NamedTuple):
-    """A figure by name, how it is read from the results (NaN where not measured), its unit and its bar."""
+    """A figure by name, how it is read from the results (NaN where not measured), its unit and
+    its bar.
+    """
 
     name: str
     read: Callable[[Results], float]
@@ -49,7 +53,9 @@ def in_the_world(name: str) -> Callable[[Results], float]:
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Interval score with over without fuzzy inference, or with what the colony found over what chance found."""
+    """Interval score with over without fuzzy inference, or with what the colony found over what
+    chance found.
+    """
     return lambda results: worth.ratio(results.worth, name)
 
 
@@ -59,7 +65,9 @@ def mean(values: FloatArray | None) -> float:
 
 
 def false_per_hour(results: Results) -> float:
-    """False changes of the default over all hours of scenarios whose friction is one and does not change."""
+    """False changes of the default over all hours of scenarios whose friction is one and does
+    not change.
+    """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
     return sum(float(m["false_changes"].sum()) for m in counted) / hours if hours else math.nan
@@ -176,7 +184,9 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Bars first (when quick, those that were measured), then `KIND.SCENARIO.ESTIMATOR.MEASURE` with its spread."""
+    """Bars first (when quick, those that were measured), then `KIND.SCENARIO.ESTIMATOR.MEASURE`
+    with its spread.
+    """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
     listed += worth.figures(results.worth)

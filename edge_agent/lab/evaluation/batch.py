@@ -25,7 +25,8 @@ FINE_HZ = 500.0
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length.
+    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction,
+    rate, length.
 
     road, slope: relief by name and a lasting slope upon it; torque: whether it is recorded.
     """
@@ -74,7 +75,9 @@ def realistic(
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
-    """One drive with sensors without error, of a vehicle known exactly; simulated finely, sampled at the rate."""
+    """One drive with sensors without error, of a vehicle known exactly; simulated finely,
+    sampled at the rate.
+    """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
 

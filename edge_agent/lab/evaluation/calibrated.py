@@ -1,6 +1,7 @@
 """Calibration against the truth of simulated rough cars: its errors, and what it brings.
 
-Errors are in units of the standard deviations that it claims; what it brings is the width of the friction's interval.
+Errors are in units of the standard deviations that it claims; what it brings is the width of the
+friction's interval.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def truth(seed: int, car: int) -> dict[str, float]:
             f"{name}_lag": float(mounted[Misaligned.LAG + device] - mounted[Misaligned.LAG])
             for name, device in (("steer", 1), ("wheel", 2))
         },
-        "understeer": 0.0,  # front and rear tyres of the simulated cars have one stiffness over load
+        # front and rear tyres of the simulated cars have one stiffness over load
+        "understeer": 0.0,
         "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _heavier(seed, car),
     }
 
@@ -64,7 +66,9 @@ def _heavier(seed: int, car: int) -> float:
 
 
 class Narrowed(NamedTuple):
-    """Of some cars: mean width of the 90 % interval, and share of truths inside, without and with calibration."""
+    """Of some cars: mean width of the 90 % interval, and share of truths inside, without and
+    with calibration.
+    """
 
     plain_width: float
     plain_coverage: float
@@ -129,7 +133,9 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
 
 
 def figures(cars: int, seed: int) -> list[Figure]:
-    """RMS of (learned − true) / standard deviation over cars, by quantity; the four radii as one."""
+    """RMS of (learned − true) / standard deviation over cars, by quantity; the four radii as
+    one.
+    """
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):
         at = seed + first // CARS_AT_ONCE

@@ -1,4 +1,6 @@
-"""The campaign: every scenario for every estimator that can take part; figures and plots are made of its numbers."""
+"""The campaign: every scenario for every estimator that can take part; figures and plots are
+made of its numbers.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ DEFAULT = "aco-fckf"
 QUICK_ESTIMATORS = (DEFAULT, "paper-aco-fckf")
 HARD = ("split", "abs", "spin")  # unlike roads and wheels past the peak have bars of their own
 QUICK_SCENARIOS = ("004.dlc", "003.split", "default.jump.accel")
-FAULTY_SEEDS = 4  # drives per manoeuvre under each sensor fault: three manoeuvres, thirteen faults, all estimators
+# drives per manoeuvre under each sensor fault: three manoeuvres, thirteen faults, all estimators
+FAULTY_SEEDS = 4
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,9 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal` without errors."""
+    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal`
+    without errors.
+    """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
@@ -115,7 +120,9 @@ def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """The bank for a paper's own conditions: where friction is set by hand, it is set to the truth of the start."""
+    """The bank for a paper's own conditions: where friction is set by hand, it is set to the
+    truth of the start.
+    """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":
         return adaptive_federated_ckf.bank(batch.vehicles, friction)

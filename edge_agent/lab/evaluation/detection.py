@@ -1,7 +1,9 @@
-"""Detection judge: does the estimator find slippery road, how soon, and does it report ice where there is none?
+"""Detection judge: does the estimator find slippery road, how soon, and does it report ice where
+there is none?
 
-Towns are drawn by the seed; cars are rough ones (ROUGH_FLEET) or plain ones. "short" drives last 120 s, "long" ones
-900 s, because faults that silence a car only show there. All figures of one kind pool the samples of its towns.
+Towns are drawn by the seed; cars are rough ones (ROUGH_FLEET) or plain ones. "short" drives last
+120 s, "long" ones 900 s, because faults that silence a car only show there. All figures of one kind
+pool the samples of its towns.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least SLIDE_S
@@ -58,7 +60,9 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums of one town or of several: means by name, counts by name, and lists of seconds by name."""
+    """Sums of one town or of several: means by name, counts by name, and lists of seconds by
+    name.
+    """
 
     total: dict[str, float] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
@@ -133,7 +137,9 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Return everything that one town tells; `oracle`: ask the oracle about excited visits to ice too."""
+    """Return everything that one town tells; `oracle`: ask the oracle about excited visits to
+    ice too.
+    """
     tally = DetectionTally()
     _judge_samples(tally, drive)
     for n in range(drive.mu.shape[1]):
@@ -234,7 +240,9 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds of each without it."""
+    """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds
+    of each without it.
+    """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
     for first, end in slides:
@@ -243,7 +251,8 @@ def _judge_contradictions(
     low = drive.mu[:, n] <= SNOW_MU
     flagged = (drive.health[:, n] & int(Health.CONTRADICTION)) > 0
     onset = np.flatnonzero(flagged[1:] & ~flagged[:-1]) + 1
-    # a slide may end on dry road: what counts is that it was on slippery road within the last moment
+    # a slide may end on dry road: what counts is that it was on slippery road within the last
+    # moment
     was_low = lately(low[:, None], AFTER_SLIDE_S)[:, 0].astype(bool)
     in_slide = extended[onset]
     tally.add("contradictions.slide", np.array([float((in_slide & was_low[onset]).sum())]))
@@ -253,7 +262,9 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Settled false events of the estimator, of its belief at each threshold, and of the slip flag."""
+    """Settled false events of the estimator, of its belief at each threshold, and of the slip
+    flag.
+    """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~lately(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
     ways = {

@@ -1,4 +1,6 @@
-"""Figures of the detection judge: how each is read from a tally, its unit, and its bars for rough and plain cars."""
+"""Figures of the detection judge: how each is read from a tally, its unit, and its bars for
+rough and plain cars.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure of the detection judge: which drives it is of, how it is read, its unit, and bars for both KINDS.
+    """A figure of the detection judge: which drives it is of, how it is read, its unit, and bars
+    for both KINDS.
 
     `length`: one of LENGTHS, or "" for both together.
     """
@@ -198,9 +201,11 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """List `NAME.KIND` for every DETECTION, those with a bar first, with the standard error over towns.
+    """List `NAME.KIND` for every DETECTION, those with a bar first, with the standard error over
+    towns.
 
-    `NAME.KIND.winter` and `NAME.KIND.other`: the same in the winter towns and in the others, where both were driven.
+    `NAME.KIND.winter` and `NAME.KIND.other`: the same in the winter towns and in the others, where
+    both were driven.
     """
     listed = []
     for bar in sorted(DETECTION, key=lambda bar: bar.bars is None):

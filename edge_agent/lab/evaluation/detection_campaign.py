@@ -1,8 +1,10 @@
 """Detection campaign: towns of rough and of plain cars, short and long, judged one after the other.
 
-Half of the towns are winter towns, in which all cars have winter equipment. Chosen towns, with a table:
+Half of the towns are winter towns, in which all cars have winter equipment. Chosen towns, with a
+table:
 
-    python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900 50003:rough:120:winter
+    python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900
+    50003:rough:120:winter
 
 Each is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
 """
@@ -45,7 +47,9 @@ DEFAULT: Final = "aco-fckf"
 
 
 class DetectionTown(NamedTuple):
-    """A town to judge: its seed, "rough" or "plain" cars, length [s], how many cars, and whether it is winter there."""
+    """A town to judge: its seed, "rough" or "plain" cars, length [s], how many cars, and whether
+    it is winter there.
+    """
 
     seed: int
     kind: str
@@ -60,7 +64,8 @@ class DetectionTown(NamedTuple):
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the same ones.
+    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the
+    same ones.
 
     Towns with an odd seed are winter towns.
     """
@@ -96,14 +101,18 @@ def judge_towns(
     *,
     oracle: bool = True,
 ) -> DetectionResults:
-    """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line per town."""
+    """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line
+    per town.
+    """
     results = DetectionResults()
     for town in chosen:
         tally = judge_drive(drive_town(town, make_bank), oracle=oracle and town.length == "short")
         results.add(town.length, town.kind, TownTally(town.winter, tally))
         log_line(
-            f"town {town.seed}{' in winter' if town.winter else ''}, {town.kind}, {town.seconds:.0f} s: "
-            f"ice visits with a value {tally.mean('ice.yield'):.2f}, passes found {tally.mean('passes.ice'):.2f}, "
+            f"town {town.seed}{' in winter' if town.winter else ''}, {town.kind}, "
+            f"{town.seconds:.0f} s: "
+            f"ice visits with a value {tally.mean('ice.yield'):.2f}, passes found "
+            f"{tally.mean('passes.ice'):.2f}, "
             f"false ice {tally.mean('false_ice'):.5f}"
         )
     return results

@@ -1,7 +1,8 @@
-"""Drives through drawn towns for the detection judge: truth, estimates, visits with their evidence, the slip flag.
+"""Drives through drawn towns for the detection judge: truth, estimates, visits with their evidence,
+the slip flag.
 
-Cars are those of `SimulatedFleet`; visits and evidence are made by the agent's own pipeline (`observe`). A drive is
-made in chunks, so that fifteen minutes of sixteen cars fit in memory.
+Cars are those of `SimulatedFleet`; visits and evidence are made by the agent's own pipeline
+(`observe`). A drive is made in chunks, so that fifteen minutes of sixteen cars fit in memory.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ Samples: TypeAlias = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DetectionVisits:
-    """Published visits: vehicle (V,), first and last sample (V,), ln L on the friction grid (V, 32)."""
+    """Published visits: vehicle (V,), first and last sample (V,), ln L on the friction grid (V,
+    32).
+    """
 
     vehicle: IntArray
     first: IntArray
@@ -52,9 +55,11 @@ class DetectionDrive:
     Attributes:
         speed, ax, ay: true motion [m/s, m/s^2]
         mu: mean true friction of the four wheels
-        mu_wheel, theta, used: friction, normalised slip and share of the grip that is used, per wheel
+        mu_wheel, theta, used: friction, normalised slip and share of the grip that is used, per
+            wheel
         lower, median, upper, health: estimates
-        favoured: ln of the best belief below SLIPPERY_MU over the best above; NaN where the estimator has no belief
+        favoured: ln of the best belief below SLIPPERY_MU over the best above; NaN where the
+            estimator has no belief
         flagged: friction that the slip flag reports, infinite where none is up
         controlled: ABS, traction control or ESC works, of cars with winter equipment
         stood: ice or snow appeared under the car while it stood, and it has not left it since
@@ -201,7 +206,9 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the likelihood bytes of visits, (V, 32); flat where the estimator tells no evidence."""
+    """Return the likelihood bytes of visits, (V, 32); flat where the estimator tells no
+    evidence.
+    """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)
 

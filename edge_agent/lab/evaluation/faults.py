@@ -1,6 +1,7 @@
 """Sensor faults: what goes wrong, what is expected then, and what every estimator makes of it.
 
-The drives are ordinary ones; a fault begins at BEGINS. `told` is whether health reports the flag in every drive.
+The drives are ordinary ones; a fault begins at BEGINS. `told` is whether health reports the flag in
+every drive.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of faults: `flag` is the flag that health must carry, OK where no sensor can tell."""
+    """One row of the table of faults: `flag` is the flag that health must carry, OK where no
+    sensor can tell.
+    """
 
     faults: tuple[Fault, ...]
     flag: Health
@@ -88,7 +91,8 @@ CASES: Final = {
     "believable-spikes": Case(
         during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0),
         Health.OK,
-        "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted less",
+        "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted "
+        "less",
     ),
     "bias-step": Case(
         (Fault("bias", "ay", BEGINS, size=0.3),),
@@ -134,7 +138,9 @@ def harmed(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def outcome(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
+    """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from
+    BEGINS on, RMSE.
+    """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)
     ordered = (reported.mu_lower <= reported.mu) & (reported.mu <= reported.mu_upper)

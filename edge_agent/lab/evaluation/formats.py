@@ -1,4 +1,6 @@
-"""One drive on a bus in every format that is read, written by the libraries that others write them with."""
+"""One drive on a bus in every format that is read, written by the libraries that others write
+them with.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What comes in by files: frames decoded as by cantools, a minute of a bus at once, one drive alike in all formats."""
+"""What comes in by files: frames decoded as by cantools, a minute of a bus at once, one drive
+alike in all formats.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +38,8 @@ START_S: Final = 1_700_000_000
 def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
     """Values that differ from those of cantools, and how many were compared.
 
-    Made frames of random bytes for every shipped profile with a database; and those of a recorded log, by the database
-    of the profile that it has frames of.
+    Made frames of random bytes for every shipped profile with a database; and those of a recorded
+    log, by the database of the profile that it has frames of.
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)
@@ -80,7 +82,9 @@ def _against(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int
 
 
 def on_a_bus(drive: Recorded) -> list[Any]:
-    """A drive as frames: four messages a sample, among others that nobody asks for if there is room in a minute."""
+    """A drive as frames: four messages a sample, among others that nobody asks for if there is
+    room in a minute.
+    """
     frames = []
     columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
     for t, row in zip(drive.t, columns, strict=True):
@@ -99,7 +103,9 @@ def _frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 pytho
 
 
 def a_minute(path: Path) -> Path:
-    """MINUTE_FRAMES of a bus in a minute: four messages at 100 Hz that are asked for, and OTHERS."""
+    """MINUTE_FRAMES of a bus in a minute: four messages at 100 Hz that are asked for, and
+    OTHERS.
+    """
     rng = np.random.default_rng(1)
     others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
     chosen = np.concatenate([np.tile(np.arange(256, 260), 6000), others])
@@ -139,7 +145,9 @@ def estimates_of(log: Path, drive: Recorded) -> FloatArray:
 
 
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
-    """Largest difference of estimates of one drive over its formats, and how many formats there were."""
+    """Largest difference of estimates of one drive over its formats, and how many formats there
+    were.
+    """
     (drive,) = drives(1, seed, rough=True, seconds=seconds)
     frames = on_a_bus(drive)
     profile = profile_of("can")

@@ -1,8 +1,9 @@
 """What is measured of estimates against truth; every measure gives one number per drive, (N,).
 
-Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the stated spread is
-right; NIS squared innovation over its stated variance, per row [1]. Their mean over N drives at one instant has
-95 % of its values within chi-squared bounds if the filter is right (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the
+stated spread is right; NIS squared innovation over its stated variance, per row [1]. Their mean
+over N drives at one instant has 95 % of its values within chi-squared bounds if the filter is right
+(Bar-Shalom, Li, Kirubarajan 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
-    """Where the mean of "nees" or "nis" over so many drives lies 95 times in 100 if the filter is right."""
+    """Where the mean of "nees" or "nis" over so many drives lies 95 times in 100 if the filter
+    is right.
+    """
     from scipy.stats import chi2
 
     count = COMPONENTS[measure] * drives
@@ -75,7 +78,9 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
 
 
 def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,) each."""
+    """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,)
+    each.
+    """
     found = {}
     for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):
         low, high = bounds(name, value.shape[1])
@@ -102,7 +107,9 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Seconds from the change of friction until mu is within NEAR of it; what never arrives counts to the end."""
+    """Seconds from the change of friction until mu is within NEAR of it; what never arrives
+    counts to the end.
+    """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])
     for n in range(len(seconds)):
@@ -114,7 +121,9 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or longer, per drive."""
+    """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or
+    longer, per drive.
+    """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))
     count = np.zeros(wrong.shape[1])

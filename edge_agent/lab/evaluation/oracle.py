@@ -1,8 +1,10 @@
-"""How well anybody could do with these sensors: two bars of the papers, and an oracle that knows nearly everything.
+"""How well anybody could do with these sensors: two bars of the papers, and an oracle that knows
+nearly everything.
 
-An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is given the truth of
-all that is not listed as unknown. What is unknown to him is what vehicle file and data sheet leave open to anybody.
-Everything is linear about the truth, so that his estimate is that of least squares with a Gaussian prior.
+An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is
+given the truth of all that is not listed as unknown. What is unknown to him is what vehicle file
+and data sheet leave open to anybody. Everything is linear about the truth, so that his estimate is
+that of least squares with a Gaussian prior.
 
 `speed`: v_x of an accelerating sine. He hears the wheels without noise: W = (1 + ρ) v.
 
@@ -10,8 +12,8 @@ Everything is linear about the truth, so that his estimate is that of least squa
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of STRETCH_S
     unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and pitches, b offsets
 
-`friction`: μ under .6 g, at the end of the drive. He hears the mean of four wheels, knows the force of every tyre, and
-the speed but for offset and leak of a_x.
+`friction`: μ under .6 g, at the end of the drive. He hears the mean of four wheels, knows the force
+of every tyre, and the speed but for offset and leak of a_x.
 
     R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))    s true slip
     g    slip that the forces take at μ and with that shape of the tyre's curve, over the true one
@@ -50,7 +52,9 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """A drive of 002.sine: what the oracle knows, and what rolls and pitches in the accelerometers, (T,) each."""
+    """A drive of 002.sine: what the oracle knows, and what rolls and pitches in the
+    accelerometers, (T,) each.
+    """
 
     batch: DriveSet
     rolled: FloatArray
@@ -167,7 +171,9 @@ def _curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated out (Laplace)."""
+    """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated
+    out (Laplace).
+    """
     t = np.arange(len(v)) / 100.0
     std = np.array(
         [

@@ -1,7 +1,8 @@
-"""Mistakes of recordings, planted into simulated drives: what the signal doctor has to find and name.
+"""Mistakes of recordings, planted into simulated drives: what the signal doctor has to find and
+name.
 
-Sizes are those met when foreign logs were brought in: units, signs, offsets, a clock .4 s off, status bits in a wheel
-speed, exchanged columns, and a vehicle file with another tyre.
+Sizes are those met when foreign logs were brought in: units, signs, offsets, a clock .4 s off,
+status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre.
 """
 
 from __future__ import annotations
@@ -191,7 +192,9 @@ def drives(
 
 
 def icy(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
-    """Return drives through the town in winter: ice where it was wet or snow, snow elsewhere but in one quarter."""
+    """Return drives through the town in winter: ice where it was wet or snow, snow elsewhere but
+    in one quarter.
+    """
     usual = scenario_named("hills")
     worse = {WET: SNOW, SNOW: ICE}
     patches = tuple(replace(patch, mu=worse.get(patch.mu, patch.mu)) for patch in usual.patches)
@@ -211,7 +214,8 @@ def named(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return shares over all mistakes and drives, smooth and rough; the drives without a mistake are the control.
+    """Return shares over all mistakes and drives, smooth and rough; the drives without a mistake
+    are the control.
 
     In winter, smooth and rough cars drive in a winter town.
     """

@@ -1,4 +1,6 @@
-"""Plots as in the papers, of the first seed: motion against truth, friction with its band, adaptation, fuzzy sets."""
+"""Plots as in the papers, of the first seed: motion against truth, friction with its band,
+adaptation, fuzzy sets.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ FORMS: Final = ("png", "svg", "pdf")
 def draw(
     results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png"
 ) -> list[Path]:
-    """Write the plots into `folder`; returns their paths. `seed`: of the drive that is shown; `form`: one of FORMS."""
+    """Write the plots into `folder`; returns their paths. `seed`: of the drive that is shown;
+    `form`: one of FORMS.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -104,7 +108,10 @@ def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
     speed = batch.truth["true_vx"][0, 0]
     road = f"{mu.min():.2f}" if np.ptp(mu) < NEARLY_ALIKE else f"{mu.max():.2f} to {mu.min():.2f}"
     about = spec.about if spec is not None else "drive"
-    return f"{scenario}: {about}\nfrom {speed:.0f} m/s, μ {road}, {batch.vehicles[0].name}, seed {seed}"
+    return (
+        f"{scenario}: {about}\nfrom {speed:.0f} m/s, μ {road}, {batch.vehicles[0].name}, seed "
+        f"{seed}"
+    )
 
 
 def _line(estimator: str) -> dict[str, Any]:
@@ -118,7 +125,9 @@ def _true() -> dict[str, Any]:
 
 
 def _rough(world: RealWorldResults, path: Path) -> Path:
-    """One rough car in a hilly town: speed beside the wheels', slope, friction with the default's interval, health."""
+    """One rough car in a hilly town: speed beside the wheels', slope, friction with the
+    default's interval, health.
+    """
     from matplotlib import pyplot as plt
 
     batch = world.batch
@@ -193,7 +202,9 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def _consistency(figures: Sequence[Figure], path: Path) -> Path:
-    """NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the drives at one instant."""
+    """NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the
+    drives at one instant.
+    """
     from matplotlib import pyplot as plt
 
     ends = {figure.name: figure.value for figure in figures if figure.name.startswith("bounds.")}
@@ -288,7 +299,9 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
-    """Write the ROC plot: passes found against settled false events, estimator, slip flag and oracle."""
+    """Write the ROC plot: passes found against settled false events, estimator, slip flag and
+    oracle.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")

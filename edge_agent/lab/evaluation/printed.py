@@ -1,4 +1,6 @@
-"""What the papers print, and where our figure for it stands; and why some of it cannot be reproduced."""
+"""What the papers print, and where our figure for it stands; and why some of it cannot be
+reproduced.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ from typing import Final, NamedTuple
 
 
 class Printed(NamedTuple):
-    """A number that a paper prints: where, what, its value, and the figures that stand beside it."""
+    """A number that a paper prints: where, what, its value, and the figures that stand beside
+    it.
+    """
 
     paper: str
     what: str

@@ -1,8 +1,8 @@
 """Judgement of the estimator on recorded drives of real cars, for owners of such logs.
 
-A folder holds LOG.parquet with its vehicle file LOG.json, and optionally LOG.truth.parquet (t, vx, vy, mu, as far as
-they were measured) and LOG.meta.json (`mu_known`: friction that the surface surely had). Of the time in which a car
-moves, from the third second on:
+A folder holds LOG.parquet with its vehicle file LOG.json, and optionally LOG.truth.parquet (t, vx,
+vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: friction that the surface
+surely had). Of the time in which a car moves, from the third second on:
 
     informative    share with an interval narrower than INFORMATIVE of the prior's
     right          of that, share whose interval meets what is known: true friction, else at least the grip in use
@@ -148,7 +148,9 @@ def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray
 
 
 def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
-    """Return what was measured of the truth, by column, at the times of the log; NaN where nothing was."""
+    """Return what was measured of the truth, by column, at the times of the log; NaN where
+    nothing was.
+    """
     file = path.with_suffix(".truth.parquet")
     if not file.exists():
         return {name: np.full(len(t), np.nan) for name in TRUTH}
@@ -175,7 +177,9 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and what is known of it."""
+    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and
+    what is known of it.
+    """
     t = adopted.log.t
     signals = adopted.log.signals
     values, slippery = estimates
@@ -225,7 +229,9 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return the friction that the surface of a log had at least: what is known of it, or what the car used."""
+    """Return the friction that the surface of a log had at least: what is known of it, or what
+    the car used.
+    """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (smooth(even(t, signals[:, channel], at), SMOOTH_S) for channel in (S.AX, S.AY))
     used = np.hypot(along, across)[np.interp(at, t, moving.astype(float)) > 0.5] / GRAVITY
@@ -246,7 +252,9 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return figures over all logs: means weighted by time, and the worst log where one log is too many."""
+    """Return figures over all logs: means weighted by time, and the worst log where one log is
+    too many.
+    """
     seconds = np.array([log.seconds for log in found])
 
     def mean(name: str) -> float:
@@ -278,7 +286,10 @@ def table_row(log: LogFigures) -> str:
         f"{value:.3g}" if math.isfinite(value) else "–"
         for value in (asdict(log)[name] for name in HEAD)
     ]
-    return f"| {log.name} | {log.seconds:.0f} | {'yes' if log.passed else 'no'} | {' | '.join(cells)} |"
+    return (
+        f"| {log.name} | {log.seconds:.0f} | {'yes' if log.passed else 'no'} | "
+        f"{' | '.join(cells)} |"
+    )
 
 
 def table(found: Sequence[LogFigures]) -> str:

@@ -1,15 +1,17 @@
-"""The world as it is: rough cars in hilly towns, and a car that stands on a slope; what every estimator makes of it.
+"""The world as it is: rough cars in hilly towns, and a car that stands on a slope; what every
+estimator makes of it.
 
-Towns (friction, hills), cars, sensors and clocks are drawn by the seed, half of the cars without torque. All figures
-are over samples, so that a minute on dry road weighs a minute.
+Towns (friction, hills), cars, sensors and clocks are drawn by the seed, half of the cars without
+torque. All figures are over samples, so that a minute on dry road weighs a minute.
 
 Legend
     surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
     missed ice    share of the samples on ice where excited whose upper end is not below SLIPPERY_MU
     false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the truth
     false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU; "settled": of
-                  those that left snow and ice SETTLED_S ago, or never met any: who drives off the ice learns of it
-                  when he uses the grip; "of_all": share of all samples that are such on a road above SURE_GRIP
+                  those that left snow and ice SETTLED_S ago, or never met any: who drives off the
+                  ice learns of it when he uses the grip; "of_all": share of all samples that are
+                  such on a road above SURE_GRIP
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
     contradiction share of the samples in which the estimator says that no friction explains its data (health)
@@ -74,7 +76,9 @@ class Tally:
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Mean by name; NaN of nothing. What ends in "_squared" is reported as its root, without that end."""
+        """Mean by name; NaN of nothing. What ends in "_squared" is reported as its root, without
+        that end.
+        """
         found = {
             name: total / self.count[name] if self.count[name] else np.nan
             for name, total in self.total.items()
@@ -129,7 +133,9 @@ def lately(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> 
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Width and MISS times how far the truth lies outside; the only way to lower it is to be sharp and right."""
+    """Width and MISS times how far the truth lies outside; the only way to lower it is to be
+    sharp and right.
+    """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
     )
@@ -190,7 +196,9 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Cars that stand on the slope: each seed another, with ordinary sensors, and with rough ones without torque."""
+    """Cars that stand on the slope: each seed another, with ordinary sensors, and with rough
+    ones without torque.
+    """
     batches = []
     for sensors in (USUAL, "rough"):
         for k, preset in enumerate(PRESETS.values()):
@@ -209,7 +217,9 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Figures by estimator, and "baseline" (the wheels' speed, the prior's interval), then by name; a drive to plot."""
+    """Figures by estimator, and "baseline" (the wheels' speed, the prior's interval), then by
+    name; a drive to plot.
+    """
 
     found: dict[str, dict[str, float]]
     batch: DriveSet
@@ -217,7 +227,9 @@ class RealWorldResults:
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
-    """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is kept for plots."""
+    """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is
+    kept for plots.
+    """
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies = {name: Tally() for name in (*estimators, "baseline")}
     world = None

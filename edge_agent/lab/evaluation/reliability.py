@@ -1,9 +1,10 @@
 """Reliability: how often the truth lies below each stated quantile of friction, at LEVELS.
 
-An estimates file tells three quantiles. An estimator that tells the evidence of a visit tells more: a visit that has
-lasted since the start begins at the uniform prior, so its likelihood on the friction grid is the whole posterior. It
-is asked of a copy of the bank, so that the drive itself goes on as if nobody had asked. Other estimators are Gaussian
-between their quantiles, or tell the prior.
+An estimates file tells three quantiles. An estimator that tells the evidence of a visit tells more:
+a visit that has lasted since the start begins at the uniform prior, so its likelihood on the
+friction grid is the whole posterior. It is asked of a copy of the bank, so that the drive itself
+goes on as if nobody had asked. Other estimators are Gaussian between their quantiles, or tell the
+prior.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
 def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
-    """What the bank says of the drives, and the rank of the truth in its posterior once every EVERY_S, (K, N)."""
+    """What the bank says of the drives, and the rank of the truth in its posterior once every
+    EVERY_S, (K, N).
+    """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
     parts = []
@@ -60,7 +63,9 @@ def _rank(bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates) -
 
 
 def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
-    """Share below the truth (N,) of posteriors with log-likelihoods (N, 32) upon the uniform prior, (N,)."""
+    """Share below the truth (N,) of posteriors with log-likelihoods (N, 32) upon the uniform
+    prior, (N,).
+    """
     weight = np.exp(log_likelihood)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
     return np.array(
@@ -71,7 +76,9 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
 def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """The same of Gaussians with these 5, 50 and 95 % quantiles, one of which may be cut off; of the prior, uniform."""
+    """The same of Gaussians with these 5, 50 and 95 % quantiles, one of which may be cut off; of
+    the prior, uniform.
+    """
     from scipy.stats import norm
 
     std = np.maximum(np.maximum(mu - lower, upper - mu), 1e-9) / norm.ppf(0.95)

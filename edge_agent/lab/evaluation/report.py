@@ -301,7 +301,9 @@ def detection_report(figures: Sequence[Figure]) -> str:
 
 
 def detection_table(figures: Sequence[Figure]) -> str:
-    """Return one row per figure of the detection judge: rough and plain cars with standard errors, and the bars."""
+    """Return one row per figure of the detection judge: rough and plain cars with standard
+    errors, and the bars.
+    """
     by_name = {figure.name: figure for figure in figures}
     names = dict.fromkeys(
         name.rpartition(".")[0] for name in by_name if name.endswith((".rough", ".plain"))

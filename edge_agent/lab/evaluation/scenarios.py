@@ -1,7 +1,8 @@
-"""The scenarios: the papers' manoeuvres with the papers' vehicles, those of the default's bars, and other vehicles.
+"""The scenarios: the papers' manoeuvres with the papers' vehicles, those of the default's bars, and
+other vehicles.
 
-What a paper does not give (tyres, wheel inertia, the vehicle of 003) is that of the simulator's sedan or of an ordinary
-car; all four wheels drive, as in the papers.
+What a paper does not give (tyres, wheel inertia, the vehicle of 003) is that of the simulator's
+sedan or of an ordinary car; all four wheels drive, as in the papers.
 """
 
 from __future__ import annotations
@@ -53,9 +54,11 @@ MATCHED: Final = matched(
 
 
 def steered_behind(speed: float) -> TrueVehicle:
-    """The vehicle of 000 and 001 with the rear wheels steered for no sideslip in a steady turn at `speed` [m/s].
+    """The vehicle of 000 and 001 with the rear wheels steered for no sideslip in a steady turn at
+    `speed` [m/s].
 
-    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), alike at both axles.
+    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase),
+    alike at both axles.
     """
     light = LIGHT.vehicle
     a = light.cg_to_front_axle
@@ -174,7 +177,8 @@ VEHICLES: Final = {
     )
 }
 
-# tyres that are not of the estimators' family or shape; "all scenarios" are driven with each in turn
+# tyres that are not of the estimators' family or shape; "all scenarios" are driven with each in
+# turn
 FOREIGN: Final = {
     "brush": {"curve": "brush"},
     "sharp": {"shape": 1.65, "curvature": -0.6},

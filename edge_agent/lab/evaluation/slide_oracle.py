@@ -1,14 +1,17 @@
-"""Oracle for visits: the evidence of an observer with knowledge of the motion and every tyre's force, but not the tyre.
+"""Oracle for visits: the evidence of an observer with knowledge of the motion and every tyre's
+force, but not the tyre.
 
-It bounds what any estimator can conclude from a visit. Unknown are the shape of the tyre's curve and its stiffness.
+It bounds what any estimator can conclude from a visit. Unknown are the shape of the tyre's curve
+and its stiffness.
 
     f    |F| / F_z, known with noise FORCE_STD          q    slip times stiffness per load, known with the wheels' noise
     f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic Formula, k ln-normal
 
-    ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope · σ_q)²) · p(q)
+    ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope ·
+    σ_q)²) · p(q)
 
-p(q) is the slope, at least LEAST_SLOPE: drivers ask for a force, of which all are as likely, and the slip follows.
-Every EACH-th sample counts: errors are correlated over as many.
+p(q) is the slope, at least LEAST_SLOPE: drivers ask for a force, of which all are as likely, and
+the slip follows. Every EACH-th sample counts: errors are correlated over as many.
 """
 
 from __future__ import annotations
@@ -37,7 +40,9 @@ STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
 
 
 def tyres_drawn() -> FloatArray:
-    """Return (TYRES, 3) tyres: shape c, curvature e and stiffness factor k, always the same ones."""
+    """Return (TYRES, 3) tyres: shape c, curvature e and stiffness factor k, always the same
+    ones.
+    """
     rng = np.random.default_rng(0)
     shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)
     curvature = np.clip(rng.normal(*CURVATURE, TYRES), -0.9, 0.6)
@@ -47,7 +52,9 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return ln L (BINS,) of a visit, maximum 0: true f and q (T, 4) [1], speed (T,) [m/s]; rng draws the noise."""
+    """Return ln L (BINS,) of a visit, maximum 0: true f and q (T, 4) [1], speed (T,) [m/s]; rng
+    draws the noise.
+    """
     picked = slice(None, None, EACH)
     noise = STIFF * SPEED_STD / np.maximum(speed[picked], SLOWEST)
     read_force = force[picked] + FORCE_STD * rng.standard_normal(force[picked].shape)
@@ -64,7 +71,9 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return ln L (TYRES, BINS) for each tyre by itself; noise: standard deviation of the slip (T,)."""
+    """Return ln L (TYRES, BINS) for each tyre by itself; noise: standard deviation of the slip
+    (T,).
+    """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):
         shape, curvature, stiffness = tyres[j]

@@ -1,9 +1,13 @@
-"""Slip flag: the friction that ordinary ABS, traction control and ESC logic reports, without any estimator.
+"""Slip flag: the friction that ordinary ABS, traction control and ESC logic reports, without any
+estimator.
 
-Baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and steering, and the vehicle file.
+Baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and steering,
+and the vehicle file.
 
-    reference speed  fastest wheel while braking, slowest while driving, else the median; it changes no faster than the
-                     accelerometer says, plus FREE; where all wheels have agreed for AGREE_S it is their speed
+    reference speed  fastest wheel while braking, slowest while driving, else the median; it changes
+    no faster than the
+                     accelerometer says, plus FREE; where all wheels have agreed for AGREE_S it is
+                     their speed
     slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i includes the yaw rate
                      wheels and cars slower than SLOWEST do not slip
     yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
@@ -32,7 +36,8 @@ YAW_S: Final = 0.15
 FREE: Final = 1.0  # [m/s^2]
 AGREE: Final = 0.04
 AGREE_S: Final = 0.3
-FAR: Final = 0.15  # share of the speed beyond which wheels that agree are not believed: all of them may slide
+# share of the speed beyond which wheels that agree are not believed: all of them may slide
+FAR: Final = 0.15
 SLOWEST: Final = 1.5  # [m/s]
 SMOOTH_S: Final = 0.1
 BRAKING: Final = 0.6  # [m/s^2]
@@ -68,7 +73,9 @@ def _median(values: FloatArray, count: int) -> float:
 
 @compiled
 def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
-    """Return the flagged friction (T,) of one car: signals (T, channels); car: radius, wheelbase, half track, share."""
+    """Return the flagged friction (T,) of one car: signals (T, channels); car: radius,
+    wheelbase, half track, share.
+    """
     out = np.full(signals.shape[0], np.inf)
     smooth = 1.0 - np.exp(-period / SMOOTH_S)
     rim = np.zeros(4)

@@ -1,4 +1,5 @@
-"""What fuzzy inference and the ant colony bring: interval scores on rough drives that nobody tuned on.
+"""What fuzzy inference and the ant colony bring: interval scores on rough drives that nobody tuned
+on.
 
 Legend, all scores less is better
     fuzzy        the default as it comes, with all of its rules and the shipped vertices
@@ -7,7 +8,8 @@ Legend, all scores less is better
     default      all rules with untuned vertices
     random       what each random search found, mean over the searches; colony: the same of the colony, equal budget
 
-Each seed is a town of rough cars and a set of rough manoeuvres on hills, with friction and vehicles of its own.
+Each seed is a town of rough cars and a set of rough manoeuvres on hills, with friction and vehicles
+of its own.
 """
 
 from __future__ import annotations
@@ -92,7 +94,9 @@ def ways() -> dict[str, list[tuple[Memberships, bool]]]:
 
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
-    """One drive of each manoeuvre with misaligned devices: vehicle, friction and road drawn by the seed."""
+    """One drive of each manoeuvre with misaligned devices: vehicle, friction and road drawn by
+    the seed.
+    """
     rng = np.random.default_rng([seed, 17])
     drives = []
     for k, manoeuvre in enumerate(MANOEUVRES):
@@ -114,7 +118,9 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 def _scored(
     batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: bool
 ) -> dict[str, float]:
-    """Mean interval score over the drives, and over all samples of each surface (NaN where none is met)."""
+    """Mean interval score over the drives, and over all samples of each surface (NaN where none
+    is met).
+    """
     drives = []
     samples = []
     for batch in batches:
@@ -135,7 +141,9 @@ def _scored(
 
 
 def ratio(scores: Scores, name: str) -> float:
-    """Mean interval score of a way over that of another, over all seeds; NaN where one of them was not measured."""
+    """Mean interval score of a way over that of another, over all seeds; NaN where one of them
+    was not measured.
+    """
     over, under = (scores.get(way) for way in RATIOS[name])
     return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan
 

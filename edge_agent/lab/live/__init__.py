@@ -1,1 +1,3 @@
-"""Peers of the live sources: a bus, a ROS node, a databroker and a receiver, each a process of its own."""
+"""Peers of the live sources: a bus, a ROS node, a databroker and a receiver, each a process of
+its own.
+"""

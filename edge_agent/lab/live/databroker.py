@@ -1,7 +1,9 @@
-"""The interface kuksa.val.v2 served by gRPC: what the specification says of GetValue, Subscribe and PublishValue.
+"""The interface kuksa.val.v2 served by gRPC: what the specification says of GetValue, Subscribe and
+PublishValue.
 
-Unknown paths are NOT_FOUND; a subscription answers at once with all that is known, and then with each update; what a
-slow subscriber does not fetch is buffered up to its `buffer_size`, and then the oldest is dropped.
+Unknown paths are NOT_FOUND; a subscription answers at once with all that is known, and then with
+each update; what a slow subscriber does not fetch is buffered up to its `buffer_size`, and then the
+oldest is dropped.
 """
 
 from __future__ import annotations

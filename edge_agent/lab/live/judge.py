@@ -1,4 +1,6 @@
-"""What live sources lose: samples at 100 Hz for a minute, and the agent itself when a source is killed."""
+"""What live sources lose: samples at 100 Hz for a minute, and the agent itself when a source is
+killed.
+"""
 
 from __future__ import annotations
 
@@ -162,7 +164,9 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 
 
 def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
-    """Agents that did not notice a loss or a return of their source, or did not end as they should: why; losses."""
+    """Agents that did not notice a loss or a return of their source, or did not end as they
+    should: why; losses.
+    """
     vehicle = folder / "car.json"
     vehicle.write_text(
         Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True)
@@ -220,7 +224,8 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         if missed or agent.returncode or not output.strip().endswith("}"):
             unseen = f"did not see {', '.join(missed)}" if missed else "saw all"
             bad.append(
-                f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {output[-200:]!r}"
+                f"{kind}: the agent {unseen}, ended with {agent.returncode} and said "
+                f"{output[-200:]!r}"
             )
     return bad, losses
 
@@ -233,7 +238,9 @@ def _shows(
     silent: bool,
     patience_s: float = PATIENCE_S,
 ) -> bool:
-    """Whether the health of a running agent comes to say that a source is silent, or no longer says so."""
+    """Whether the health of a running agent comes to say that a source is silent, or no longer
+    says so.
+    """
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
         troubles = _troubles(port)

@@ -1,8 +1,9 @@
-"""What live sources listen to, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS SAMPLES RATE`.
+"""What live sources listen to, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS
+SAMPLES RATE`.
 
-A peer says `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and says how many messages
-that were. It ends with its input; so it can be killed and started anew at the same address.
-Of a databroker it is the interface kuksa.val.v2 as published, not the broker itself.
+A peer says `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and says
+how many messages that were. It ends with its input; so it can be killed and started anew at the
+same address. Of a databroker it is the interface kuksa.val.v2 as published, not the broker itself.
 """
 
 from __future__ import annotations
@@ -97,7 +98,9 @@ def can(address: str, samples: int, rate: float) -> int:
 
 
 def ros2(address: str, samples: int, rate: float) -> int:
-    """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a router is opened."""
+    """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a
+    router is opened.
+    """
     session = open_session(
         ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
     )

@@ -1,4 +1,6 @@
-"""Simulated vehicles: manoeuvres on a test track and fleets on a road network, with truth beside the signals."""
+"""Simulated vehicles: manoeuvres on a test track and fleets on a road network, with truth beside
+the signals.
+"""
 
 from edge_agent.lab.simulation.faults import FAULTS, Fault
 from edge_agent.lab.simulation.fleet import SimulatedFleet, Truth

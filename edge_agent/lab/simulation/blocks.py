@@ -15,7 +15,9 @@ BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
 def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
-    """Blocks of BLOCK_S without end; simulated time begins at the moment the first block is asked for."""
+    """Blocks of BLOCK_S without end; simulated time begins at the moment the first block is
+    asked for.
+    """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0
     while True:

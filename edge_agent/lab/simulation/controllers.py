@@ -1,14 +1,17 @@
-"""Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control and ESC.
+"""Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control
+and ESC.
 
-They act in steps of the plant, on slip that they know exactly: only their action is modelled, not their sensors.
+They act in steps of the plant, on slip that they know exactly: only their action is modelled, not
+their sensors.
 
     ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half of the limit, and
-           gets it back, fast up to NEARLY of the torque at which it let go, then slowly: 6 to 10 cycles per second;
-           the rear wheels share the lower torque
+           gets it back, fast up to NEARLY of the torque at which it let go, then slowly: 6 to 10
+           cycles per second; the rear wheels share the lower torque
     TCS    the engine's torque is cut while a driven wheel spins, and the brake holds a wheel that spins much; the same
            cut ends the drag of engine or generator at lift-off, and while ABS works
     ESC    where the yaw rate is off what steering asks for, one wheel is braked: the outer front wheel of a car that
-           turns too much, the inner rear wheel of one that turns too little; the engine's torque is cut
+           turns too much, the inner rear wheel of one that turns too little; the engine's torque is
+           cut
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
+# slip control lets go of the rear wheels at this share of the limit, so that they still guide
+REAR_LIMIT: Final = 0.5
 # a controller counts as active so long after it acted: its lamp blinks no faster
 SHOWN_S: Final = 0.25
 ABS_SLOWEST: Final = 1.5  # [m/s] below it brakes may lock the wheels
@@ -106,7 +110,9 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 @compiled
 def spins(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
-    """Return how much faster than the ground wheel `i` turns, over the limit of traction control."""
+    """Return how much faster than the ground wheel `i` turns, over the limit of traction
+    control.
+    """
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
@@ -114,7 +120,9 @@ def spins(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
 
 @compiled
 def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
-    """Cut or give back the engine's torque; whether a driven wheel spins, or is dragged to a slip, now."""
+    """Cut or give back the engine's torque; whether a driven wheel spins, or is dragged to a
+    slip, now.
+    """
     acts = drags = False
     for i in range(4):
         spin = spins(x, p, w, i)

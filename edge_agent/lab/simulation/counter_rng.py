@@ -1,9 +1,10 @@
 """Random numbers without a state: the number is a hash of (key, counter).
 
-A generator that is carried along would couple a vehicle's noise to how many vehicles there are and to how a drive is
-cut into blocks. A counter-based generator (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)
-does not: sample k of channel c of a vehicle is the same number whoever asks for it, in whatever order. The hash is the
-finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+A generator that is carried along would couple a vehicle's noise to how many vehicles there are and
+to how a drive is cut into blocks. A counter-based generator (Salmon et al., "Parallel random
+numbers: as easy as 1, 2, 3", SC 2011) does not: sample k of channel c of a vehicle is the same
+number whoever asks for it, in whatever order. The hash is the finaliser of SplitMix64 (Steele, Lea,
+Flood, OOPSLA 2014).
 
 Counters must be non-negative.
 """
@@ -40,7 +41,9 @@ def checked_seed(seed: int) -> int:
 
 
 def key_of(*seeds: int) -> np.uint64:
-    """A key from non-negative integers, e.g. (seed, vehicle number): different lists give unrelated streams."""
+    """A key from non-negative integers, e.g. (seed, vehicle number): different lists give
+    unrelated streams.
+    """
     return np.uint64(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0])
 
 
@@ -61,7 +64,9 @@ def uniform(key: np.uint64, counter: int) -> float:
 
 @compiled
 def normal(key: np.uint64, counter: int) -> float:
-    """A standard normal number (Box and Muller, 1958); uses the hashes 2·counter and 2·counter + 1 of the stream."""
+    """A standard normal number (Box and Muller, 1958); uses the hashes 2·counter and 2·counter +
+    1 of the stream.
+    """
     first = TWO * np.uint64(counter)
     u = (float(mixed(key, first) >> DROP) + 0.5) * UNIT
     angle = 2.0 * math.pi * float(mixed(key, first + ONE) >> DROP) * UNIT

@@ -1,9 +1,11 @@
-"""The driver of a simulated vehicle: follows a route for ever, brakes before junctions, is caught out by black ice.
+"""The driver of a simulated vehicle: follows a route for ever, brakes before junctions, is caught
+out by black ice.
 
-He aims at a point ahead on his lane (pure pursuit), and at a speed from the lane's profile and his budget q: the share
-of the grip he *believes* in that he likes to use, at most what is comfortable. His belief follows the looks of the road
-ahead, falls fast when he feels a wheel slide, and comes back slowly. Now and then somebody ahead makes him brake.
-Other vehicles are not seen: each drives as if alone, so that a drive does not depend on how many there are.
+He aims at a point ahead on his lane (pure pursuit), and at a speed from the lane's profile and his
+budget q: the share of the grip he *believes* in that he likes to use, at most what is comfortable.
+His belief follows the looks of the road ahead, falls fast when he feels a wheel slide, and comes
+back slowly. Now and then somebody ahead makes him brake. Other vehicles are not seen: each drives
+as if alone, so that a drive does not depend on how many there are.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class Driver(IntEnum):
     WOBBLE = 6  # [m] amplitude of his wandering in the lane
     SHORT = 7  # [m] left to the next point of the lane
     STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
-    CROSS_SLOPE = 9  # rise of the road to his left [1], as it has turned over so far from one bend into the next
+    # rise of the road to his left [1], as it has turned over so far from one bend into the next
+    CROSS_SLOPE = 9
     WARNED_IN = 10  # [s] until he acts on the warning that he was given
     WARNED_START = 11  # [m] to the slippery stretch that he was warned of,
     WARNED_END = 12  # [m] and to its end; 0 or less: he knows of none
@@ -71,8 +74,9 @@ LEAST_BELIEF: Final = 0.12
 PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
 # [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
 WARNED_BRAKES: Final = 1.0
-# Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the pedals alone. An axle
-# that brakes alone, or its share of the brakes, meets its limit at half of what the road bears.
+# Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the
+# pedals alone. An axle that brakes alone, or its share of the brakes, meets its limit at half of
+# what the road bears.
 CAREFUL: Final = 0.5
 SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
 LARGEST_STEER: Final = 0.55  # [rad]
@@ -107,7 +111,8 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 @compiled
 def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Move the route state `g` on to where the vehicle is; at the end of a lane choose the next turn by chance.
+    """Move the route state `g` on to where the vehicle is; at the end of a lane choose the next
+    turn by chance.
 
     Returns how far it still is to the next point [m], at most the distance between points.
     """
@@ -191,7 +196,9 @@ def heeds(d: FloatArray) -> bool:
 
 @compiled
 def alerted(t: float, key: Key) -> float:
-    """How hard somebody ahead makes him brake now, as a share of his budget; 0 for most of the time."""
+    """How hard somebody ahead makes him brake now, as a share of his budget; 0 for most of the
+    time.
+    """
     window = int(t / ALERT_S)
     if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:
         return 0.0
@@ -211,9 +218,11 @@ def stops(t: float, share: float, key: Key) -> bool:
 
 @compiled
 def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
-    """Square of the speed [m^2/s^2] with which he means to come to the stretch that he was warned of.
+    """Square of the speed [m^2/s^2] with which he means to come to the stretch that he was warned
+    of.
 
-    As he was told, and so that he need not brake on it for what comes next by more than he expects it to bear.
+    As he was told, and so that he need not brake on it for what comes next by more than he expects
+    it to bear.
     """
     row, _ = ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
@@ -279,7 +288,9 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as tyres and engine can."""
+    """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as
+    tyres and engine can.
+    """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
         PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
@@ -292,7 +303,9 @@ def wished_force(
 def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
-    """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
+    """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres
+    follow.
+    """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
@@ -322,10 +335,12 @@ def drive(
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Move a driver (d, g) and his route on by one sample: afterwards d[STEER], d[FORCE] are what arms and foot do.
+    """Move a driver (d, g) and his route on by one sample: afterwards d[STEER], d[FORCE] are what
+    arms and foot do.
 
-    world: lanes and friction; `w` is what the wheels did at the last sample; now: time [s], length of the sample [s]
-    and how much gravity accelerates him [m/s^2]; keys are those of his route and of his alerts.
+    world: lanes and friction; `w` is what the wheels did at the last sample; now: time [s], length
+    of the sample [s] and how much gravity accelerates him [m/s^2]; keys are those of his route and
+    of his alerts.
     """
     d, g = driver
     lanes, friction = world

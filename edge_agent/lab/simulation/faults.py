@@ -16,7 +16,8 @@ from schemas.signals import CHANNELS
 
 @dataclass(frozen=True)
 class Fault:
-    """`kind` of FAULTS on one channel (or all whose name begins so: "omega") for `start` <= t < `end` [s].
+    """`kind` of FAULTS on one channel (or all whose name begins so: "omega") for `start` <= t <
+    `end` [s].
 
     `size` is in the channel's unit; only spikes and bias steps have one.
     """

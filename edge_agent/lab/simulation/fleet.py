@@ -53,7 +53,9 @@ VEHICLE_STREAM = 0
 WINTER_STREAM = 4
 # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
 STOPS = 0.3
-TOLD_S = 1.5  # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
+# from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5
+# s)
+TOLD_S = 1.5
 GOLDEN = (
     math.sqrt(5.0) - 1.0
 ) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
@@ -61,12 +63,13 @@ GOLDEN = (
 
 @dataclass(frozen=True)
 class Truth:
-    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z).
+    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction,
+    |F|/(μ F_z).
 
-    ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre ahead.
-    theta: normalised slip of each wheel; a wheel slides beyond about 2.6.
-    abs, tcs, esc: while the controller works, of vehicles with winter equipment, else False.
-    air_temperature: outside [degrees Celsius].
+    ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre
+    ahead. theta: normalised slip of each wheel; a wheel slides beyond about 2.6. abs, tcs, esc:
+    while the controller works, of vehicles with winter equipment, else False. air_temperature:
+    outside [degrees Celsius].
     """
 
     x: FloatArray
@@ -99,9 +102,9 @@ def run(
 ) -> FloatArray:
     """Records (T, N, RECORD) of the next `steps` samples; the states are carried on in place.
 
-    states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
-    of friction and of relief; keys: of routes and of alerts (N,);
-    timing: sample period [s] and plant steps in it; `first` is the number of the first sample.
+    states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes,
+    tables of friction and of relief; keys: of routes and of alerts (N,); timing: sample period [s]
+    and plant steps in it; `first` is the number of the first sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground
@@ -140,7 +143,8 @@ def run(
 
 
 class SimulatedFleet:
-    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and in a vehicle's number alone.
+    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and in a
+    vehicle's number alone.
 
     Args:
         scenario: a key of SCENARIOS, or a Scenario.
@@ -148,8 +152,10 @@ class SimulatedFleet:
         seed: non-negative.
         rate_hz: of the samples.
         sensors: a key of SENSORS.
-        rough: share of the vehicles that are as real cars are: ROUGH_FLEET sensors, and drivers who stop now and then.
-        winter: share of the vehicles with `winter_equipped` tyres and controllers; half of them are rough if half are.
+        rough: share of the vehicles that are as real cars are: ROUGH_FLEET sensors, and drivers who
+            stop now and then.
+        winter: share of the vehicles with `winter_equipped` tyres and controllers; half of them are
+            rough if half are.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -218,7 +224,9 @@ class SimulatedFleet:
         self.truth = _truth(np.empty((0, vehicles, RECORD)), self.scenario.air_temperature)
 
     def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
-        """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then that of this block."""
+        """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then
+        that of this block.
+        """
         if steps < 1:
             raise InputError("steps", f"{steps} samples cannot be had", "give a positive number")
         network = self.scenario.network
@@ -244,7 +252,9 @@ class SimulatedFleet:
         return t, signals
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
-        """Where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart, `length` [m] or more."""
+        """Where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart,
+        `length` [m] or more.
+        """
         network = self.scenario.network
         key = self._keys[0][k]
         lane, point, way, turns = (int(value) for value in self._states[2][k])
@@ -262,7 +272,9 @@ class SimulatedFleet:
         return self.scenario.to_latlon(line[:, 0], line[:, 1])
 
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
-        """Tell the driver of vehicle k of a slippery stretch, from and to so far ahead [m]; (0, 0): there is none."""
+        """Tell the driver of vehicle k of a slippery stretch, from and to so far ahead [m]; (0,
+        0): there is none.
+        """
         d = self._states[1][k]
         if d[Driver.WARNED_END] <= 0.0:
             d[Driver.WARNED_IN] = TOLD_S
@@ -271,13 +283,17 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Which vehicles are rough, (N,): evenly spread, and vehicle k is or is not however many there are."""
+    """Which vehicles are rough, (N,): evenly spread, and vehicle k is or is not however many
+    there are.
+    """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
 
 
 def winter_ones(vehicles: int, share: float) -> BoolArray:
-    """Return which vehicles have winter equipment, (N,), by number in pairs: half of them are rough if half are."""
+    """Return which vehicles have winter equipment, (N,), by number in pairs: half of them are
+    rough if half are.
+    """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 
 
@@ -315,7 +331,9 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Vehicles where the network has them start, rolling at walking pace, each with a driver of his own."""
+    """Vehicles where the network has them start, rolling at walking pace, each with a driver of
+    his own.
+    """
     count = len(rngs)
     vehicles = np.zeros((count, STATES))
     wheels = np.zeros((count, len(Wheel), 4))

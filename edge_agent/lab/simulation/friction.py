@@ -1,7 +1,9 @@
-"""Friction of the road as a field over position and time: a background, and oriented rectangles laid upon it.
+"""Friction of the road as a field over position and time: a background, and oriented rectangles
+laid upon it.
 
-A later patch lies on top of an earlier one. Each patch says what its grip *is* (`mu`) and what a driver takes it for
-(`looks`): black ice looks like the road around it, which is why drivers respond late.
+A later patch lies on top of an earlier one. Each patch says what its grip *is* (`mu`) and what a
+driver takes it for (`looks`): black ice looks like the road around it, which is why drivers respond
+late.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-# what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of the usual ranges
+# what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of
+# the usual ranges
 DRY = 0.90
 WET = 0.60
 SNOW = 0.35
@@ -27,9 +30,9 @@ ICE = 0.18
 class Patch:
     """A rectangle of road surface.
 
-    `x, y` centre [m]; `length` along the direction `angle` [rad, counter-clockwise from x] and `width` across [m];
-    `mu` its friction; `looks` the friction a driver expects of it (None: what lies beneath);
-    present for `start` <= t < `end` [s].
+    `x, y` centre [m]; `length` along the direction `angle` [rad, counter-clockwise from x] and
+    `width` across [m]; `mu` its friction; `looks` the friction a driver expects of it (None: what
+    lies beneath); present for `start` <= t < `end` [s].
     """
 
     name: str
@@ -82,7 +85,9 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
-    """Column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that says something about it."""
+    """Column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that says something
+    about it.
+    """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]
         if t < row[PatchColumn.START] or t >= row[PatchColumn.END] or math.isnan(row[column]):

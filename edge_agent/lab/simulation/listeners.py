@@ -1,4 +1,6 @@
-"""Simulated drivers who are warned: where they will drive, what they are told, and that they slow down for it."""
+"""Simulated drivers who are warned: where they will drive, what they are told, and that they
+slow down for it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from schemas.numeric import BoolArray
 from schemas.wire.ahead import GripWarning
 
 ROUTE_M: Final = 600.0
-AROUND_M: Final = 25.0  # in which a driver stays careful: alerts are of single cells, and ice seldom ends with them
+# in which a driver stays careful: alerts are of single cells, and ice seldom ends with them
+AROUND_M: Final = 25.0
 EVERY: Final = 10  # blocks between two looks at the route
 
 
@@ -58,13 +61,17 @@ class WarnedDrivers:
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
-        """A warning for a driver; from any thread. He acts on it from the next block on, after his reaction."""
+        """A warning for a driver; from any thread. He acts on it from the next block on, after
+        his reaction.
+        """
         self._warnings.put((self._number[name], warning))
 
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """The blocks, with the drivers told between them what was heard; `hear` is called before each."""
+        """The blocks, with the drivers told between them what was heard; `hear` is called before
+        each.
+        """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
                 self.refresh()

@@ -1,7 +1,7 @@
 """The manoeuvres: what the driver of a test track does, as one table of name -> manoeuvre.
 
-A manoeuvre is a function of the moment, giving the mean road-wheel angle [rad] and the longitudinal acceleration that
-is asked for [m/s^2]. The test track starts at the origin and leads along x.
+A manoeuvre is a function of the moment, giving the mean road-wheel angle [rad] and the longitudinal
+acceleration that is asked for [m/s^2]. The test track starts at the origin and leads along x.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 @dataclass(frozen=True)
 class Moment:
-    """Knowledge of a driver: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s].
+    """Knowledge of a driver: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked
+    for [m/s].
 
-    Speed control by hub motors also knows `lost` [m], the integral of the error of speed, and `gain` [m/s^2], the
-    acceleration.
+    Speed control by hub motors also knows `lost` [m], the integral of the error of speed, and
+    `gain` [m/s^2], the acceleration.
     """
 
     t: float
@@ -54,7 +55,9 @@ class TimedFriction(NamedTuple):
 
 
 Friction = float | Callable[[float, float], float] | TimedFriction
-"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each wheel, or of time."""
+"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each
+wheel, or of time.
+"""
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,9 @@ def smooth_step(u: float) -> float:
 
 
 def lane_change_path(s: float) -> float:
-    """Lateral position [m] of a double lane change at distance s: gates like those of ISO 3888-1, 3.5 m over."""
+    """Lateral position [m] of a double lane change at distance s: gates like those of ISO
+    3888-1, 3.5 m over.
+    """
     return 3.5 * (smooth_step((s - 20.0) / 30.0) - smooth_step((s - 75.0) / 25.0))
 
 
@@ -235,7 +240,9 @@ def standing(_now: Moment) -> tuple[float, float]:
 
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
-    """Straight on for eight seconds, to a stop with 2.5 m/s^2 and at rest for six, over and over: traffic lights."""
+    """Straight on for eight seconds, to a stop with 2.5 m/s^2 and at rest for six, over and
+    over: traffic lights.
+    """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
 

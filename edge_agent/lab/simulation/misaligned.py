@@ -1,6 +1,8 @@
-"""How devices sit in real cars: tilted mounts, steering off its zero, unlike wheels, coarse counters, clocks apart.
+"""How devices sit in real cars: tilted mounts, steering off its zero, unlike wheels, coarse
+counters, clocks apart.
 
-Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place), so that none moves another)
+Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place), so that none moves
+another)
     θ, φ, ψ  pitch, roll and yaw of the inertial unit's mount [rad], to first order:
              a_x' = a_x + g θ + ψ a_y,  a_y' = a_y + g φ − ψ a_x
     δ        front wheel's angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), offset, gain, and a map that depends on angle
@@ -8,9 +10,10 @@ Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place)
     Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are counted
     τ        each device tells of the moment τ ago
 
-Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to .54 m/s^2, steering
-1 to 17 mrad, gains of steering off by 3 % at speed and 5 to 15 % at .3 to .5 rad, radii .15 to 1.6 % apart, wheel
-speeds in steps of up to 1 km/h, clocks .02 to .4 s apart, and torque in hardly any.
+Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to
+.54 m/s^2, steering 1 to 17 mrad, gains of steering off by 3 % at speed and 5 to 15 % at .3 to .5
+rad, radii .15 to 1.6 % apart, wheel speeds in steps of up to 1 km/h, clocks .02 to .4 s apart, and
+torque in hardly any.
 """
 
 from __future__ import annotations
@@ -107,7 +110,9 @@ def memory_of(rows: FloatArray, rate_hz: float) -> int:
 
 @compiled
 def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
-    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them, the first before all."""
+    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them,
+    the first before all.
+    """
     whole = math.floor(samples)
     share = samples - whole
     near = max(now - whole, 0)

@@ -1,7 +1,8 @@
 """The vehicle that is driven: a planar body on four wheels with Magic Formula tyres.
 
-It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have another shape, their
-stiffness grows less than the load, its loads follow the accelerations with a lag, it rolls, drags and resists rolling.
+It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have
+another shape, their stiffness grows less than the load, its loads follow the accelerations with a
+lag, it rolls, drags and resists rolling.
 
     m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x    v_x, v_y  speed of the centre of gravity in the body [m/s]
     m (dv_y/dt + r v_x) = ΣY + m g_y             r         yaw rate [rad/s]
@@ -11,21 +12,24 @@ stiffness grows less than the load, its loads follow the accelerations with a la
     θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s         slip (longitudinal, lateral), K its stiffness
     K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0       static load, ε how degressive the tyre is
 
-    g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to the left
+    g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to
+    the left
 
-An accelerometer feels all forces but gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where the vehicle stands. The
-load that is transferred goes by what is felt, and the loads add up to the weight's part that is normal to the road.
+An accelerometer feels all forces but gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where the
+vehicle stands. The load that is transferred goes by what is felt, and the loads add up to the
+weight's part that is normal to the road.
 
-K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed.,
-§4.2), and |F| ≤ μ F_z.
+K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle
+Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
 
-A vehicle may have tyres that relax (RELAXATION: four fifths of the slip is built up over that length) and controllers
-that work in cycles and are reported (ABS_HZ: `controllers.py`). Without them slip control is smooth, as it was before.
+A vehicle may have tyres that relax (RELAXATION: four fifths of the slip is built up over that
+length) and controllers that work in cycles and are reported (ABS_HZ: `controllers.py`). Without
+them slip control is smooth, as it was before.
 
-Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with the secant slope of
-the tyre in the denominator a wheel step is stable at any speed. The tyre's force is taken at the step's end, where the
-ground has changed its speed too; without that term a wheel would seem to have twice its inertia.
-Wheel order fl, fr, rl, rr; ISO 8855 signs.
+Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with
+the secant slope of the tyre in the denominator a wheel step is stable at any speed. The tyre's
+force is taken at the step's end, where the ground has changed its speed too; without that term a
+wheel would seem to have twice its inertia. Wheel order fl, fr, rl, rr; ISO 8855 signs.
 """
 
 from __future__ import annotations
@@ -77,7 +81,9 @@ def stiffness_per_load(slope: float, degression: float, load: float, at_rest: fl
 
 @compiled
 def allowed(slip: float, limit: float) -> float:
-    """Share of the torque that slip control lets through: all up to `limit`, nothing from twice the limit."""
+    """Share of the torque that slip control lets through: all up to `limit`, nothing from twice
+    the limit.
+    """
     return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
 
 
@@ -85,7 +91,9 @@ def allowed(slip: float, limit: float) -> float:
 def wheel_torques(
     x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
 ) -> tuple[float, float]:
-    """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its slip."""
+    """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its
+    slip.
+    """
     drive = u[Control.DRIVE, i]
     brake = u[Control.BRAKE, i]
     if p[TrueParameter.ABS_HZ] > 0.0:
@@ -107,7 +115,9 @@ def wheel_torques(
 
 @compiled
 def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Let the tyres build up slip for `dt` [s] over their relaxation length, after the wheels have turned."""
+    """Let the tyres build up slip for `dt` [s] over their relaxation length, after the wheels
+    have turned.
+    """
     for i in range(4):
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
@@ -174,7 +184,8 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
 def body_accelerations(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray
 ) -> tuple[float, float, float]:
-    """(a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw acceleration [rad/s^2].
+    """(a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw
+    acceleration [rad/s^2].
 
     `w` is filled.
     """
@@ -196,9 +207,11 @@ def turn_wheels(
     gain: float,
     yaw_acceleration: float,
 ) -> None:
-    """One linearly implicit Euler step of the wheel speeds in `x`: every torque that falls with ω damps it.
+    """One linearly implicit Euler step of the wheel speeds in `x`: every torque that falls with ω
+    damps it.
 
-    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: how the ground's speed changes under the wheels.
+    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: how the ground's speed changes under the
+    wheels.
     """
     radius = p[Parameter.RADIUS]
     for i in range(4):
@@ -227,7 +240,9 @@ def turn_wheels(
 
 @compiled
 def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope, and so are the tyres."""
+    """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope,
+    and so are the tyres.
+    """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
     along, across, share = gravity(u)
@@ -244,7 +259,9 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 
 @compiled
 def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """One step of a vehicle that is `held`: only the suspension still moves, to where the slope wants it."""
+    """One step of a vehicle that is `held`: only the suspension still moves, to where the slope
+    wants it.
+    """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
     x[Motion.OMEGA : Motion.OMEGA + 4] = 0.0
@@ -258,7 +275,9 @@ def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 def advance(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
 ) -> None:
-    """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is scratch."""
+    """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is
+    scratch.
+    """
     along, across, _ = gravity(u)
     for _ in range(substeps):
         if held(x, p, u):
@@ -289,10 +308,12 @@ def advance(
 
 @compiled
 def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
-    """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal force [N].
+    """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal
+    force [N].
 
-    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle. Where the rear wheels
-    steer too, `steer` is the angle of a car without that on the same circle: the front wheels turn more, or less.
+    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle.
+    Where the rear wheels steer too, `steer` is the angle of a car without that on the same circle:
+    the front wheels turn more, or less.
     """
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     curvature = math.tan(steer) / base
@@ -313,7 +334,9 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 
 @compiled
 def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
-    """Let engine or generator give the first part of the braking in `u`, at the driven wheels alone."""
+    """Let engine or generator give the first part of the braking in `u`, at the driven wheels
+    alone.
+    """
     total = 0.0
     for i in range(4):
         total += u[Control.BRAKE, i] / p[Parameter.RADIUS]
@@ -329,7 +352,9 @@ def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
 
 @compiled
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
-    """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw [rad])."""
+    """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw
+    [rad]).
+    """
     x[:] = 0.0
     x[Motion.VX] = speed
     x[Motion.X], x[Motion.Y], x[Motion.YAW] = place

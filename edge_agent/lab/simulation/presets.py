@@ -22,8 +22,9 @@ STIFFNESSES: Final = {"proportional-to-friction": 1.0}  # name -> TrueParameter.
 class TrueVehicle:
     """A vehicle as it is: its parameters, and what no vehicle file tells.
 
-    The tyre's shape c and curvature e give peaks between θ = 2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e .1) and a
-    falling branch; an estimator with the textbook shape is wrong about it by 5 to 15 % of the force in between.
+    The tyre's shape c and curvature e give peaks between θ = 2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e
+    .1) and a falling branch; an estimator with the textbook shape is wrong about it by 5 to 15 % of
+    the force in between.
     """
 
     vehicle: Vehicle
@@ -69,7 +70,9 @@ class TrueVehicle:
             )
 
     def row(self) -> FloatArray:
-        """The parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and `TrueParameter`."""
+        """The parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and
+        `TrueParameter`.
+        """
         drive = self.vehicle.drive_split_front
         nominal = parameter_row(
             self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive})
@@ -115,7 +118,9 @@ def car(
     radius: float,
     drive_front: float,
 ) -> Vehicle:
-    """A vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17 per radian."""
+    """A vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17 per
+    radian.
+    """
     load = mass * GRAVITY / 4.0
     return Vehicle(
         name=name,
@@ -149,7 +154,8 @@ PRESETS: Final = {
         shape=1.45,
         power=65e3,
     ),
-    "sedan": TrueVehicle(  # paper 004, table 1; stiffnesses and wheel inertia are not given there; four driven wheels
+    # paper 004, table 1; stiffnesses and wheel inertia are not given there; four driven wheels
+    "sedan": TrueVehicle(
         car(
             "sedan",
             1643.0,
@@ -213,7 +219,8 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
 
 
 def matched(vehicle: TrueVehicle) -> TrueVehicle:
-    """The vehicle without what the papers' model leaves out: drag, rolling resistance, lagging loads, degressive tyres.
+    """The vehicle without what the papers' model leaves out: drag, rolling resistance, lagging
+    loads, degressive tyres.
 
     The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
     """
@@ -223,13 +230,17 @@ def matched(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
-    """Return the `matched` vehicle with Dugoff tyres; proportional: stiffness is proportional to friction."""
+    """Return the `matched` vehicle with Dugoff tyres; proportional: stiffness is proportional to
+    friction.
+    """
     stiffness = "proportional-to-friction" if proportional else "similarity"
     return replace(matched(vehicle), curve="dugoff", stiffness=stiffness)
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
-    """What the vehicle file says: the true parameters, each off by a normal error of the size in KNOWN."""
+    """What the vehicle file says: the true parameters, each off by a normal error of the size in
+    KNOWN.
+    """
     file_values = {
         name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std))
         for name, std in KNOWN.items()
@@ -238,7 +249,9 @@ def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:
-    """Vehicle number `index` of a fleet: the presets in turn, each with its own load, tyres and suspension."""
+    """Vehicle number `index` of a fleet: the presets in turn, each with its own load, tyres and
+    suspension.
+    """
     base = list(PRESETS.values())[index % len(PRESETS)]
     extra = rng.uniform(0.0, 0.12)  # passengers and luggage
     changed = {
@@ -259,7 +272,8 @@ def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehic
 
 
 def winter_equipped(truth: TrueVehicle, rng: np.random.Generator) -> TrueVehicle:
-    """Return the vehicle with relaxing tyres, ABS in cycles, mostly traction control and ESC, and drag at lift-off.
+    """Return the vehicle with relaxing tyres, ABS in cycles, mostly traction control and ESC, and
+    drag at lift-off.
 
     A third of the vehicles regenerate as electric cars do; the others have the drag of an engine.
     """

@@ -1,4 +1,6 @@
-"""Records: the truth of one sample of one vehicle, as sensors read it and judges compare with it."""
+"""Records: the truth of one sample of one vehicle, as sensors read it and judges compare with
+it.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ RECORD: Final = 39
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (RECORD,) with the truth of this instant under the inputs `u`; fills `w` too."""
+    """Fill `record` (RECORD,) with the truth of this instant under the inputs `u`; fills `w`
+    too.
+    """
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
     record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay

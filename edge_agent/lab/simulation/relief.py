@@ -1,13 +1,16 @@
-"""Relief: how the road rises, as the gradient of one height over the plane, and the crossfall of its lanes upon it.
+"""Relief: how the road rises, as the gradient of one height over the plane, and the crossfall of
+its lanes upon it.
 
 Legend
     h       height [m] over x (east) and y (north) [m]
     ∇h      rise per metre east and north [1]; a wave of steepest slope a and length λ towards the unit vector e gives
-            a cos(2π s/λ + φ) e, with s = (x, y)·e; its limit of infinite length is one slope everywhere
+            a cos(2π s/λ + φ) e, with s = (x, y)·e; its limit of infinite length is one slope
+            everywhere
     c, b    crossfall to the right of a lane [1], and bank per curvature [m], which lowers the inside of a bend
 
-Slopes add up and are cut at STEEPEST. Positions are measured along the road, so that a metre on 8 % is a metre here
-and .997 m on a map. Sizes are those of real roads: standard deviation 3 %, hardly ever beyond 8 %, crossfall 2.5 %.
+Slopes add up and are cut at STEEPEST. Positions are measured along the road, so that a metre on 8 %
+is a metre here and .997 m on a map. Sizes are those of real roads: standard deviation 3 %, hardly
+ever beyond 8 %, crossfall 2.5 %.
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ RELIEF_STREAM: Final = 20
 
 @dataclass(frozen=True)
 class Wave:
-    """A slope that swings between -peak and peak along the direction `towards` [rad, counter-clockwise from x]."""
+    """A slope that swings between -peak and peak along the direction `towards` [rad,
+    counter-clockwise from x].
+    """
 
     peak: float
     length: float = math.inf  # [m]; infinite: one slope everywhere
@@ -48,7 +53,9 @@ class Wave:
 
 @dataclass(frozen=True)
 class Relief:
-    """What the ground is like: `waves` that add up, `crossfall` of every lane [1], `banking` per curvature [m]."""
+    """What the ground is like: `waves` that add up, `crossfall` of every lane [1], `banking` per
+    curvature [m].
+    """
 
     waves: tuple[Wave, ...] = ()
     crossfall: float = 0.0
@@ -56,7 +63,9 @@ class Relief:
 
     @property
     def table(self) -> FloatArray:
-        """Rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves with columns A."""
+        """Rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves with
+        columns A.
+        """
         table = np.zeros((1 + len(self.waves), len(WaveColumn)))
         table[0, :2] = self.crossfall, self.banking
         for row, wave in zip(table[1:], self.waves, strict=True):
@@ -85,7 +94,9 @@ class WaveColumn(IntEnum):
 
 @compiled
 def cross_slope(table: FloatArray, curvature: float) -> float:
-    """How much a lane of that `curvature` [1/m] rises to its left [1]: crossfall, and less in a bend to the left."""
+    """How much a lane of that `curvature` [1/m] rises to its left [1]: crossfall, and less in a
+    bend to the left.
+    """
     return float(table[0, 0] - table[0, 1] * curvature)
 
 
@@ -93,7 +104,9 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
 def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
-    """∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left of `heading` (cos, sin)."""
+    """∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left of
+    `heading` (cos, sin).
+    """
     east = -left * heading[1]
     north = left * heading[0]
     for k in range(1, table.shape[0]):
@@ -146,7 +159,9 @@ def banked(_seed: int) -> Relief:
 
 
 def hilly(seed: int) -> Relief:
-    """Everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean, steps, crossfall."""
+    """Everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean,
+    steps, crossfall.
+    """
     key = key_of(seed, RELIEF_STREAM)
     waves = [
         Wave(0.03 * uniform(key, 10 + k), length, 0.5 * normal(key, 20 + k), _turn(key, k))

@@ -1,9 +1,11 @@
-"""Roads as lanes: centre lines of straights and arcs, one lane each way on the right, and connectors through junctions.
+"""Roads as lanes: centre lines of straights and arcs, one lane each way on the right, and
+connectors through junctions.
 
 lane       a directed polyline, points about a metre apart, with heading and curvature
 connector  a lane through a junction, from the end of one lane to the start of one of another road
 profile    v²/q at each point [m]: the square of the speed that a driver may have there who allows himself q m/s^2
-           across and BRAKING·q along, knowing where he will turn; it scales with q, so one profile serves all
+           across and BRAKING·q along, knowing where he will turn; it scales with q, so one profile
+           serves all
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ MOST_WAYS: Final = 3
 
 @dataclass(frozen=True)
 class Road:
-    """A road between two junctions, straight from bend to bend, each bend an arc of `radius` [m]."""
+    """A road between two junctions, straight from bend to bend, each bend an arc of `radius`
+    [m].
+    """
 
     start: str
     end: str
@@ -55,11 +59,13 @@ class Road:
 
 @dataclass(frozen=True)
 class Network:
-    """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from `first[k]` on.
+    """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from
+    `first[k]` on.
 
-    `ways[k]` (MOST_WAYS,) are the lanes one may go on to, -1 where there are fewer; `spacing[k]` [m] between points.
-    Lanes before number `roads` are roads, the others connectors. `starts` (vehicles,) are the lanes at whose beginnings
-    vehicles start; None: they are spread over the roads.
+    `ways[k]` (MOST_WAYS,) are the lanes one may go on to, -1 where there are fewer; `spacing[k]`
+    [m] between points. Lanes before number `roads` are roads, the others connectors. `starts`
+    (vehicles,) are the lanes at whose beginnings vehicles start; None: they are spread over the
+    roads.
     """
 
     points: FloatArray
@@ -84,7 +90,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
     """Lanes and connectors of the roads between `junctions` (name -> (x, y) [m]).
 
     Raises:
-        InputError: a road leads to an unknown junction, or a junction leaves a lane without a way on or with too many.
+        InputError: a road leads to an unknown junction, or a junction leaves a lane without a way
+            on or with too many.
     """
     lanes: list[FloatArray] = []
     leaves: list[tuple[str, int]] = []  # junction where the lane begins, and its road
@@ -124,7 +131,9 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
 
 
 def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
-    """A line through the corners whose inner ones are arcs of `radius`, points a quarter of a metre apart, (n, 2)."""
+    """A line through the corners whose inner ones are arcs of `radius`, points a quarter of a
+    metre apart, (n, 2).
+    """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         p = np.array(corner)
@@ -163,7 +172,9 @@ def shifted_right(line: FloatArray, offset: float) -> FloatArray:
 
 
 def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
-    """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other without a kink."""
+    """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other
+    without a kink.
+    """
     p0 = arriving[-1]
     p3 = leaving[0]
     handle = HANDLE * float(np.linalg.norm(p3 - p0))
@@ -200,9 +211,11 @@ def network_of(
     """Lanes with headings, curvatures and profiles.
 
     Args:
-        lanes: equally spaced points of each, (n, 2) [m]; the first `roads` of them are roads, the others connectors.
+        lanes: equally spaced points of each, (n, 2) [m]; the first `roads` of them are roads, the
+            others connectors.
         ways: lanes that one may go on to from each; none where all drives end before it does.
-        allowed: v²/q [m] that traffic leaves at each point of each lane, (n,); None: as bends and junctions allow.
+        allowed: v²/q [m] that traffic leaves at each point of each lane, (n,); None: as bends and
+            junctions allow.
     """
     size = np.array([len(lane) for lane in lanes])
     spacing = np.array([_run(lane)[-1] / (len(lane) - 1) for lane in lanes])

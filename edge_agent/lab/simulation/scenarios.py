@@ -1,4 +1,6 @@
-"""Scenarios: a road network, the friction on it over time, and where on earth it lies, as one table."""
+"""Scenarios: a road network, the friction on it over time, and where on earth it lies, as one
+table.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ from schemas.numeric import FloatArray
 DRAWN: Final = "hills-"  # names of drawn scenarios: this and the seed
 WINTER: Final = "winter-"  # the same with winter on its roads
 WINTER_STREAM: Final = 22
-# what lies on a lane of a winter town, in an order that is drawn; where there is nothing the road is as it was
+# what lies on a lane of a winter town, in an order that is drawn; where there is nothing the road
+# is as it was
 ON_LANES: Final = (
     *("braking",) * 3,
     *("bend",) * 3,
@@ -44,7 +47,9 @@ DRAWN_STREAM: Final = 21
 
 @dataclass(frozen=True)
 class Scenario:
-    """A place to drive. `junctions` name -> (x, y) [m]; `patches` lie upon `background` friction, later ones on top."""
+    """A place to drive. `junctions` name -> (x, y) [m]; `patches` lie upon `background`
+    friction, later ones on top.
+    """
 
     name: str
     about: str
@@ -75,7 +80,8 @@ class Scenario:
 
     def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
         """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
-        # copies: numpy warns who looks whether a broadcast view may be written, and the compiler does at a first call
+        # copies: numpy warns who looks whether a broadcast view may be written, and the compiler
+        # does at a first call
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
         return look_up_many(
             self.table, int(PatchColumn.MU), t.ravel(), x.ravel(), y.ravel()
@@ -93,9 +99,11 @@ class Scenario:
 
 
 def demo() -> Scenario:
-    """Four streets from a crossing to a winding ring: dry in the north-east, wet, snow, ice, slush along one street.
+    """Four streets from a crossing to a winding ring: dry in the north-east, wet, snow, ice, slush
+    along one street.
 
-    At 70 s black ice appears on the eastern street where drivers brake before the crossing and accelerate out of it.
+    At 70 s black ice appears on the eastern street where drivers brake before the crossing and
+    accelerate out of it.
     """
     return Scenario(
         name="demo",
@@ -166,9 +174,11 @@ def hills() -> Scenario:
 
 
 def frost() -> Scenario:
-    """The town on hills in the first frost: at 35 s black ice appears at five places of its eastern half.
+    """The town on hills in the first frost: at 35 s black ice appears at five places of its eastern
+    half.
 
-    For the demonstration: every driver meets the new ice several times, so warned and unwarned ones can be compared.
+    For the demonstration: every driver meets the new ice several times, so warned and unwarned ones
+    can be compared.
     """
     town = hills()
     kept = tuple(patch for patch in town.patches if not math.isfinite(patch.start))
@@ -192,10 +202,11 @@ def frost() -> Scenario:
 
 
 def drawn(seed: int) -> Scenario:
-    """The demonstration's town with other frictions and other hills, drawn by the seed: for figures.
+    """The demonstration's town with other frictions and other hills, drawn by the seed: for
+    figures.
 
-    What is dry, wet, snow and ice there lies anywhere in the usual range of its kind; no road is one that anybody
-    tuned on, and black ice appears at 30 s.
+    What is dry, wet, snow and ice there lies anywhere in the usual range of its kind; no road is
+    one that anybody tuned on, and black ice appears at 30 s.
     """
     key = key_of(checked_seed(seed), DRAWN_STREAM)
     usual = demo()
@@ -233,8 +244,9 @@ def drawn(seed: int) -> Scenario:
 def winter(seed: int) -> Scenario:
     """Return the town `drawn` by the seed with winter on its lanes.
 
-    On each lane lies one of these: black ice where drivers brake before a junction, or in a bend; ice under the left or
-    under the right wheels alone; two ruts of slush; or nothing. No ice is seen; slush looks wet.
+    On each lane lies one of these: black ice where drivers brake before a junction, or in a bend;
+    ice under the left or under the right wheels alone; two ruts of slush; or nothing. No ice is
+    seen; slush looks wet.
     """
     town = drawn(seed)
     key = key_of(checked_seed(seed), WINTER_STREAM)
@@ -258,7 +270,9 @@ def winter(seed: int) -> Scenario:
 
 
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
-    """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place, length and friction."""
+    """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place,
+    length and friction.
+    """
     place, size, grip = numbers
     ice = 0.10 + 0.095 * grip
     slush = 0.28 + 0.12 * grip
@@ -296,7 +310,9 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
 def _lay_patch(
     name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
 ) -> Patch:
-    """Return a patch of (length, width) [m] along a lane at the point `row`, `left` [m] of its centre."""
+    """Return a patch of (length, width) [m] along a lane at the point `row`, `left` [m] of its
+    centre.
+    """
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])
     y = float(point[LanePoint.Y] + left * point[LanePoint.COS])
@@ -325,7 +341,8 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), fr
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the same in winter.
+    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the same in
+    winter.
 
     Raises:
         InputError: there is none.

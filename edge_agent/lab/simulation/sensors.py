@@ -1,8 +1,10 @@
-"""What the sensors say of a true record: white noise, constant offsets, gains, a wandering position, missing readings.
+"""What the sensors say of a true record: white noise, constant offsets, gains, a wandering
+position, missing readings.
 
-The sets that begin with "rough" are those of real cars: `misaligned.py` says what they have on top, and from where.
-Every random number is a hash of (vehicle key, sample number, channel), so a reading depends neither on how a drive is
-cut into blocks nor on the other vehicles. Only the satellite receiver's wander is carried from block to block.
+The sets that begin with "rough" are those of real cars: `misaligned.py` says what they have on top,
+and from where. Every random number is a hash of (vehicle key, sample number, channel), so a reading
+depends neither on how a drive is cut into blocks nor on the other vehicles. Only the satellite
+receiver's wander is carried from block to block.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ KeyArray: TypeAlias = NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class Sensors:
-    """Errors of a set of sensors: standard deviations of white noise, and of offsets drawn once per drive."""
+    """Errors of a set of sensors: standard deviations of white noise, and of offsets drawn once
+    per drive.
+    """
 
     acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white, offset
     yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s]
@@ -126,7 +130,9 @@ GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7
 
 
 class ErrorColumn(IntEnum):
-    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel; then the rest."""
+    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel;
+    then the rest.
+    """
 
     WHITE = 0
     OFFSET = len(CHANNELS)
@@ -156,7 +162,9 @@ def sensors_named(name: str | Sensors) -> Sensors:
 
 
 def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
-    """Errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and gain are drawn here."""
+    """Errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and gain are
+    drawn here.
+    """
     north, east = origin.per_metre
     white = np.zeros(len(CHANNELS))
     offset = np.zeros(len(CHANNELS))
@@ -190,7 +198,9 @@ def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
 
 @compiled
 def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: FloatArray) -> None:
-    """Fill `signals` (18,) with the truth of `record`; place = (lat0, lon0, deg per m north, deg per m east)."""
+    """Fill `signals` (18,) with the truth of `record`; place = (lat0, lon0, deg per m north, deg
+    per m east).
+    """
     felt = error[ErrorColumn.LEAK] > 0.0
     signals[S.AX] = record[RecordColumn.AX_FELT] if felt else record[RecordColumn.AX]
     signals[S.AY] = record[RecordColumn.AY_FELT] if felt else record[RecordColumn.AY]
@@ -213,7 +223,9 @@ def read_late(
     rate_hz: float,
     signals: FloatArray,
 ) -> None:
-    """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
+    """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which
+    row `lead` is now.
+    """
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
     for device in range(DEVICES):
@@ -227,7 +239,9 @@ def read_late(
 
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
-    """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their long-run spread."""
+    """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their
+    long-run spread.
+    """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):
         kick = error[ErrorColumn.WANDER + i] * math.sqrt(1.0 - keep * keep)
@@ -243,10 +257,11 @@ def sense(
     keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
 ) -> FloatArray:
-    """Signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were read before.
+    """Signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were read
+    before.
 
-    `wander` (N, 3) is carried on; keys: two uint64 arrays (N,), of the noise and of the dropouts; clock: number of the
-    first sample that is read, rate [Hz] and `lead`.
+    `wander` (N, 3) is carried on; keys: two uint64 arrays (N,), of the noise and of the dropouts;
+    clock: number of the first sample that is read, rate [Hz] and `lead`.
     """
     white, silence = keys
     first, rate_hz, lead = clock

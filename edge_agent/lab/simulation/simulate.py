@@ -1,4 +1,6 @@
-"""One manoeuvre of one vehicle: a signal log with truth beside it, and the vehicle file that belongs to it."""
+"""One manoeuvre of one vehicle: a signal log with truth beside it, and the vehicle file that
+belongs to it.
+"""
 
 from __future__ import annotations
 
@@ -87,9 +89,10 @@ def simulate_manoeuvre(
 ) -> tuple[pa.Table, Vehicle]:
     """Drive a manoeuvre and return (log, vehicle file).
 
-    The log has a row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing), and the truth
-    (`true_vx`, `true_mu_fl`, `true_utilisation_fl`, … in the units of the signals). The vehicle file is nominal: the
-    true vehicle differs from it by the errors in `presets.KNOWN`, except with sensors "ideal", where it is exact.
+    The log has a row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing),
+    and the truth (`true_vx`, `true_mu_fl`, `true_utilisation_fl`, … in the units of the signals).
+    The vehicle file is nominal: the true vehicle differs from it by the errors in `presets.KNOWN`,
+    except with sensors "ideal", where it is exact.
 
     Args:
         name: a key of MANOEUVRES.

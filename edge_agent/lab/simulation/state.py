@@ -40,7 +40,9 @@ STATES: Final = 38
 
 
 class TrueParameter(IntEnum):
-    """Parameters that only the true vehicle has; they continue the row of `edge_agent.dynamics.parameters.P`."""
+    """Parameters that only the true vehicle has; they continue the row of
+    `edge_agent.dynamics.parameters.P`.
+    """
 
     SHAPE = len(Parameter)  # c and e of the tyre curve
     CURVATURE = len(Parameter) + 1
@@ -85,7 +87,8 @@ class Control(IntEnum):
     DRIVE = 1  # [N·m] asked for; slip control may allow less
     BRAKE = 2  # [N·m], positive, asked for
     MU = 3  # friction under the wheel
-    TILT = 4  # rise of the road per metre ahead of the vehicle, and to its left; two numbers are of no use
+    # rise of the road per metre ahead of the vehicle, and to its left; two numbers are of no use
+    TILT = 4
 
 
 INPUTS: Final = len(Control)

@@ -1,6 +1,7 @@
 """The noise of paper 004's experiments: white, on a_x, a_y and the yaw rate, and on nothing else.
 
-Constant noise has one variance on all three. Variable noise follows table 2 on a_y alone, as the paper says.
+Constant noise has one variance on all three. Variable noise follows table 2 on a_y alone, as the
+paper says.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ def scheduled(t: FloatArray) -> FloatArray:
 
 
 def on_ay(t: FloatArray, others: float) -> FloatArray:
-    """Return variances (T, 3) of a_x, a_y and yaw rate [SI]: a_y by the SCHEDULE, the others constant."""
+    """Return variances (T, 3) of a_x, a_y and yaw rate [SI]: a_y by the SCHEDULE, the others
+    constant.
+    """
     variance = np.full((len(t), 3), others)
     variance[:, 1] = scheduled(t)
     return variance
 
 
 def add_white(signals: FloatArray, variance: FloatArray, rng: np.random.Generator) -> None:
-    """Add noise of variance (T,), or (T, 3) by channel, to the signals (T, 18) of one drive, in place."""
+    """Add noise of variance (T,), or (T, 3) by channel, to the signals (T, 18) of one drive, in
+    place.
+    """
     by_channel = variance[:, None] if variance.ndim == 1 else variance
     white = rng.normal(size=(len(variance), 3))
     signals[:, S.AX : S.AX + 3] += np.sqrt(by_channel) * white

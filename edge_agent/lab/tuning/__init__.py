@@ -1,1 +1,3 @@
-"""Tuning of the fuzzy memberships: ant colony, random control, objective, tuned files with provenance."""
+"""Tuning of the fuzzy memberships: ant colony, random control, objective, tuned files with
+provenance.
+"""

@@ -12,11 +12,12 @@ An ant walks from vertex to vertex and takes one position at each; its path is o
     A       positions that exist at the vertex          (V, K)   -
     ρ       evaporation per iteration                            -
 
-Departures from the print. The paper calls ρ the residual and uses it as evaporation in (32); here (32) stands, and
-its .284 is read as what remains, so that ρ = .716: with few iterations the colony must learn fast.
-Pheromone lies on (vertex, position), not on edges: the objective depends on positions, not on their succession.
-Deposits go by rank and to the best path so far, and pheromone stays inside bounds, so that the scale of the
-objective does not matter and the colony cannot stagnate (rank-based, elitist and max-min ant systems).
+Departures from the print. The paper calls ρ the residual and uses it as evaporation in (32); here
+(32) stands, and its .284 is read as what remains, so that ρ = .716: with few iterations the colony
+must learn fast. Pheromone lies on (vertex, position), not on edges: the objective depends on
+positions, not on their succession. Deposits go by rank and to the best path so far, and pheromone
+stays inside bounds, so that the scale of the objective does not matter and the colony cannot
+stagnate (rank-based, elitist and max-min ant systems).
 """
 
 from collections.abc import Callable, Sequence
@@ -73,9 +74,11 @@ def transition_probabilities(
 
 
 def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
-    """Lower bound (V, 1) for which a converged colony repeats its best path with probability `retrace`.
+    """Lower bound (V, 1) for which a converged colony repeats its best path with probability
+    `retrace`.
 
-    Per vertex the best position then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min), solved for τ_min.
+    Per vertex the best position then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min),
+    solved for τ_min.
     """
     vertices = len(reachable)
     p = retrace ** (1.0 / vertices)
@@ -115,7 +118,9 @@ def _walk(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 
 def _weights(ants: int, habits: Habits) -> FloatArray:
-    """Deposits (P,) of the best ants of an iteration by rank; with the best path so far they sum to ρ."""
+    """Deposits (P,) of the best ants of an iteration by rank; with the best path so far they sum
+    to ρ.
+    """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)
     weights: FloatArray = (1.0 - habits.memory) * habits.evaporation * ranks / ranks.sum()
@@ -134,8 +139,9 @@ def optimise(
 ) -> Result:
     """Search the vector with the largest objective.
 
-    visibility: per vertex the preference η > 0 of each position, all alike if absent. The objective is called at most
-    ants·iterations times, once per vector. Raises InputError for empty choices, no ants or no iterations.
+    visibility: per vertex the preference η > 0 of each position, all alike if absent. The objective
+    is called at most ants·iterations times, once per vector. Raises InputError for empty choices,
+    no ants or no iterations.
     """
     habits = habits or Habits()
     graph = Graph.of(problem.choices)

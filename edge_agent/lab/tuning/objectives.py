@@ -7,13 +7,14 @@ Legend
     l_v         -1/2 (v' S^-1 v + ln det 2 pi S), summed over updates, per second of driving [nat/s]
     NIS         v' S^-1 v over its expectation [1]
 
-The first two are proper scores: in expectation nothing beats stating the truth, so none is won by inflating R, as
-paper 004's equation 33 (variance mismatch) and errors against truth are. IS is the score of Gneiting and Raftery
-(JASA 2007). The innovations need no truth, but they look one update ahead and are blind to errors that last: R shrinks
-to white noise, and friction intervals become too narrow; `predictive` charges them for that by how far NIS is from its
-expectation. README has figures. Drives are rough: misaligned devices, slopes, clocks apart, half of the towns' cars
-without torque.
-Drives that a search sees and drives that judge it share no seed, no vehicle file and no pair of manoeuvre and vehicle.
+The first two are proper scores: in expectation nothing beats stating the truth, so none is won by
+inflating R, as paper 004's equation 33 (variance mismatch) and errors against truth are. IS is the
+score of Gneiting and Raftery (JASA 2007). The innovations need no truth, but they look one update
+ahead and are blind to errors that last: R shrinks to white noise, and friction intervals become too
+narrow; `predictive` charges them for that by how far NIS is from its expectation. README has
+figures. Drives are rough: misaligned devices, slopes, clocks apart, half of the towns' cars without
+torque. Drives that a search sees and drives that judge it share no seed, no vehicle file and no
+pair of manoeuvre and vehicle.
 """
 
 from __future__ import annotations
@@ -109,7 +110,9 @@ class TuningSet:
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships on drives; the first two are NaN where nobody knows the true friction."""
+    """Scores of memberships on drives; the first two are NaN where nobody knows the true
+    friction.
+    """
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
@@ -127,7 +130,9 @@ class TuningScores:
 
 
 def detection_cost(scores: TuningScores) -> float:
-    """Return the interval score with prices on false and on missed ice: neither may be bought with the other."""
+    """Return the interval score with prices on false and on missed ice: neither may be bought
+    with the other.
+    """
     false_ice = max(scores.false_ice - MOST_FALSE_ICE, 0.0)
     return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
 
@@ -243,7 +248,9 @@ def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> Tu
 def detection_scores(
     lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray
 ) -> dict[str, float]:
-    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N); NaN where no sample decides."""
+    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N); NaN where no
+    sample decides.
+    """
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
     called = upper < SLIPPERY_MU
@@ -283,7 +290,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Candidate positions of every vertex and noise scale: evenly over the bounds, the default among them."""
+    """Candidate positions of every vertex and noise scale: evenly over the bounds, the default
+    among them.
+    """
     default = Memberships().to_vector()
     found = []
     for value, lower, upper in zip(default, *Memberships.bounds(), strict=True):

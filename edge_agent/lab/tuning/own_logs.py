@@ -1,4 +1,6 @@
-"""Recorded drives as a search takes them: without a truth, so that only what was measured next can judge."""
+"""Recorded drives as a search takes them: without a truth, so that only what was measured next
+can judge.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
 def own_drives(
     logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Recordings cut into parts of `duration_s` [s]: those to search on, and the last third of them, to judge by.
+    """Recordings cut into parts of `duration_s` [s]: those to search on, and the last third of
+    them, to judge by.
 
     Recordings may have any rate; parts have as many samples as the slowest gives in that time.
 

@@ -1,7 +1,8 @@
 """What the two searches share: a graph of positions, a result, a history.
 
-A search looks for the best vector of one value per vertex, each from its own short list of positions.
-It knows nothing of filters: the objective is any function of that vector, larger is better.
+A search looks for the best vector of one value per vertex, each from its own short list of
+positions. It knows nothing of filters: the objective is any function of that vector, larger is
+better.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +22,8 @@ def everything(_vector: FloatArray) -> bool:
     return True
 
 
-# Draws before an ant accepts a path that was already walked; a converged colony would else draw for ever.
+# Draws before an ant accepts a path that was already walked; a converged colony would else draw for
+# ever.
 REDRAWS = 32
 
 
@@ -42,9 +44,9 @@ Progress = Callable[[Iteration], None]
 class Problem:
     """What is to be maximised, over which vectors.
 
-    objective: value of a vector (V,). choices: per vertex its positions, ascending. start (V,): the first vector
-    evaluated, so that the result is never worse than it. admissible: vectors that may be evaluated; others are drawn
-    again.
+    objective: value of a vector (V,). choices: per vertex its positions, ascending. start (V,): the
+    first vector evaluated, so that the result is never worse than it. admissible: vectors that may
+    be evaluated; others are drawn again.
     """
 
     objective: Objective
@@ -69,14 +71,18 @@ class Result:
 
 @dataclass(frozen=True)
 class Graph:
-    """V vertices with up to K positions each, as rectangles: `positions` (V, K) and `reachable` (V, K)."""
+    """V vertices with up to K positions each, as rectangles: `positions` (V, K) and `reachable`
+    (V, K).
+    """
 
     positions: FloatArray
     reachable: BoolArray
 
     @classmethod
     def of(cls, choices: Sequence[FloatArray]) -> "Graph":
-        """Build from one array of positions per vertex; raises InputError where a vertex has none."""
+        """Build from one array of positions per vertex; raises InputError where a vertex has
+        none.
+        """
         if not choices or any(len(choice) == 0 for choice in choices):
             raise InputError(
                 "choices", "a vertex has no position", "give every vertex at least one"
@@ -94,7 +100,9 @@ class Graph:
 
 @dataclass
 class Ledger:
-    """Remembers every walked path, so that no evaluation is spent twice and the best is never lost."""
+    """Remembers every walked path, so that no evaluation is spent twice and the best is never
+    lost.
+    """
 
     objective: Objective
     graph: Graph
@@ -105,7 +113,9 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """An admissible path from `sample`, a new one if the draws allow; InputError if none is admissible."""
+        """An admissible path from `sample`, a new one if the draws allow; InputError if none is
+        admissible.
+        """
         fallback: IntArray | None = None
         for _ in range(REDRAWS):
             path = sample()
@@ -120,7 +130,9 @@ class Ledger:
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
-        """The objective at a path, asked for once; a value that is not a number counts as the worst."""
+        """The objective at a path, asked for once; a value that is not a number counts as the
+        worst.
+        """
         key = path.tobytes()
         if key not in self.values:
             value = float(self.objective(self.graph.vector(path)))

@@ -149,7 +149,10 @@ def comparison_markdown(figures: Sequence[Figure]) -> str:
     lines = [
         "# Searches with equal budgets on the filter of paper 004",
         "",
-        "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is better.",
+        (
+            "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is "
+            "better."
+        ),
         "",
         "| sets | drives searched on | held out |",
         "|---|---|---|",

@@ -1,9 +1,11 @@
-"""The study of paper 004's tuning: its filter, its noise, R right and wrong; untuned, random search, ant colony.
+"""The study of paper 004's tuning: its filter, its noise, R right and wrong; untuned, random
+search, ant colony.
 
-The filter is `paper-aco-fckf` as in the paper's experiments: white noise on a_x, a_y and r alone, exact inputs, start
-at the truth, so that R is a number that can be right, ten times too small or ten times too large. The objective is the
-mean log-likelihood of the innovations over all conditions [nat/s], which no inflation of R wins; the paper's own (33)
-is won by it. Drives that judge share neither seed nor manoeuvre with those that are searched on.
+The filter is `paper-aco-fckf` as in the paper's experiments: white noise on a_x, a_y and r alone,
+exact inputs, start at the truth, so that R is a number that can be right, ten times too small or
+ten times too large. The objective is the mean log-likelihood of the innovations over all conditions
+[nat/s], which no inflation of R wins; the paper's own (33) is won by it. Drives that judge share
+neither seed nor manoeuvre with those that are searched on.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """How R stands to the noise: the filter's R over VARIANCE, and whether the noise follows the paper's schedule."""
+    """How R stands to the noise: the filter's R over VARIANCE, and whether the noise follows the
+    paper's schedule.
+    """
 
     scale: float
     schedule: bool = False
@@ -82,7 +86,9 @@ HELD_OUT: Final = (
 
 @dataclass(frozen=True)
 class StudySet:
-    """Drives side by side: t (T, N) [s], signals (T, N, 18) by condition, truth (T, N, 3) of v_x, v_y, yaw rate."""
+    """Drives side by side: t (T, N) [s], signals (T, N, 18) by condition, truth (T, N, 3) of
+    v_x, v_y, yaw rate.
+    """
 
     vehicles: tuple[Vehicle, ...]
     t: FloatArray

@@ -1,4 +1,6 @@
-"""The study as figures, a table, a plot and a tuned file: several searches each way, all judged on held-out drives."""
+"""The study as figures, a table, a plot and a tuned file: several searches each way, all judged
+on held-out drives.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ SHOWN: Final = (*GIVEN, *WAYS)
 
 @dataclass
 class Study:
-    """Results of every repeat of every way, and what the found memberships are worth on held-out drives."""
+    """Results of every repeat of every way, and what the found memberships are worth on held-out
+    drives.
+    """
 
     train: StudySet
     held_out: StudySet
@@ -76,7 +80,9 @@ def run(
     duration_s: float,
     reporter: Callable[[str], Progress],
 ) -> Study:
-    """Search with every seed in every way; `reporter` makes the progress of a search from its name."""
+    """Search with every seed in every way; `reporter` makes the progress of a search from its
+    name.
+    """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     for seed in seeds:
         for way in WAYS:
@@ -94,7 +100,9 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Per way: each condition on held-out drives, the objective on both sets, and how the searches came there."""
+    """Per way: each condition on held-out drives, the objective on both sets, and how the
+    searches came there.
+    """
     listed = []
     overalls: dict[str, list[float]] = {}
     for way in SHOWN:
@@ -140,7 +148,9 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
 
 
 def markdown(listed: Sequence[Figure]) -> str:
-    """The table: a row per condition and measure, a column per way; made from the figures and nothing else."""
+    """The table: a row per condition and measure, a column per way; made from the figures and
+    nothing else.
+    """
     values = {figure.name: figure.value for figure in listed}
 
     def cell(name: str) -> str:
@@ -164,7 +174,9 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """What the file of tuned memberships says of a way: over all conditions, on both sets of drives."""
+    """What the file of tuned memberships says of a way: over all conditions, on both sets of
+    drives.
+    """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
         intervals = [study.interval(done.best(way), recorded, name) for name in CONDITIONS]
@@ -179,7 +191,9 @@ def scores(done: Study, way: str) -> dict[str, Score]:
 
 
 def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
-    """Plot the best value so far over evaluations, mean and one standard deviation over the searches."""
+    """Plot the best value so far over evaluations, mean and one standard deviation over the
+    searches.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")

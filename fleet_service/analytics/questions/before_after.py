@@ -1,4 +1,5 @@
-"""`before-after`: change of grip at a moment, in the same cells, with an interval that accounts for biased vehicles.
+"""`before-after`: change of grip at a moment, in the same cells, with an interval that accounts for
+biased vehicles.
 
 Legend
     y    a value of mu in cell c, period p (before, after), by vehicle v
@@ -21,7 +22,9 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return one row: cells, vehicles, values, means of both periods, difference and its standard deviation."""
+    """Return one row: cells, vehicles, values, means of both periods, difference and its
+    standard deviation.
+    """
     t = t.filter(value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
     place = ["cell", "sector"]
@@ -53,7 +56,8 @@ def expression(t: Table, at_s: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return two rows, before and after: mu, its difference with interval, and the cells, vehicles and values used.
+    """Return two rows, before and after: mu, its difference with interval, and the cells, vehicles
+    and values used.
 
     Raises:
         InputError: no moment is given, or no cell was measured in both periods.

@@ -1,8 +1,8 @@
 """`calibration`: how often later values lay in the interval that the map had published.
 
-A value is compared with the snapshots of the map in the HORIZON_S before it. `held`: the value itself lies inside. Its
-own error is part of this figure, so a calibrated 90 % map stays slightly below 0.9. `compatible`: its interval
-overlaps.
+A value is compared with the snapshots of the map in the HORIZON_S before it. `held`: the value
+itself lies inside. Its own error is part of this figure, so a calibrated 90 % map stays slightly
+below 0.9. `compatible`: its interval overlaps.
 """
 
 from __future__ import annotations

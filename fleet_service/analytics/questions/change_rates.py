@@ -1,6 +1,8 @@
-"""`change-rates`: how fast roads become slippery or recover, by temperature and by hour, from the archive's values.
+"""`change-rates`: how fast roads become slippery or recover, by temperature and by hour, from the
+archive's values.
 
-Two successive values of a cell, by different vehicles, show whether the road was slippery at both times. After a time Δ
+Two successive values of a cell, by different vehicles, show whether the road was slippery at both
+times. After a time Δ
 
     P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
 
@@ -8,9 +10,10 @@ Two successive values of a cell, by different vehicles, show whether the road wa
     e   probability that two readings of the same road differ because of errors
     m   probability that readings of two roads differ; π is the share of slippery ones in the class
 
-which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e maximise the likelihood over bins
-of Δ. Roads of a region change together, so pairs are not independent. Days are, and the 90 % interval is that of days
-drawn with replacement. With fewer than LEAST_DAYS there is none.
+which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e maximise the
+likelihood over bins of Δ. Roads of a region change together, so pairs are not independent. Days
+are, and the 90 % interval is that of days drawn with replacement. With fewer than LEAST_DAYS there
+is none.
 """
 
 from __future__ import annotations
@@ -49,7 +52,8 @@ BANDS: Final = (
 
 
 def expression(t: Table) -> Table:
-    """Return pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values among both, `seconds`.
+    """Return pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values
+    among both, `seconds`.
 
     Args:
         t: observations with `temperature` of the air [°C], null if unknown.
@@ -89,9 +93,11 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return one row per band of road temperature and per part of the day: rate per hour, its interval, and its basis.
+    """Return one row per band of road temperature and per part of the day: rate per hour, its
+    interval, and its basis.
 
-    Temperatures are those of the nearest station if `stations` is given, else those that vehicles reported.
+    Temperatures are those of the nearest station if `stations` is given, else those that vehicles
+    reported.
 
     Raises:
         InputError: the table of stations cannot be used.
@@ -177,7 +183,8 @@ BEGINS: Final = tuple(
 
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
-    """Return λ [1/s] and e of the largest likelihood; NaN if no pair differs, or all roads are alike.
+    """Return λ [1/s] and e of the largest likelihood; NaN if no pair differs, or all roads are
+    alike.
 
     Args:
         counts: (bins, 4) pairs, unlike ones, slippery values, seconds between.

@@ -1,10 +1,11 @@
 """`contract`: per link of a road network, whether the agreed grip was kept, and the longest breach.
 
-A link is evaluated in pieces of PIECE_M, and is as good as its worst piece, so that ice on a tenth is not averaged
-away. Values are collected in slots of SLOT_S, per vehicle first: a car that passes ten times is one witness. A slot is
-certainly below the level if the 90 % interval of its mean lies below, and certainly kept if it lies above. A breach
-begins with a slot below and ends with the next one that is not. `least_s` is the time certainly below. `most_s` runs
-from the last slot that was certainly kept to the next one. Unmeasured time is unknown, and never counts as kept.
+A link is evaluated in pieces of PIECE_M, and is as good as its worst piece, so that ice on a tenth
+is not averaged away. Values are collected in slots of SLOT_S, per vehicle first: a car that passes
+ten times is one witness. A slot is certainly below the level if the 90 % interval of its mean lies
+below, and certainly kept if it lies above. A breach begins with a slot below and ends with the next
+one that is not. `least_s` is the time certainly below. `most_s` runs from the last slot that was
+certainly kept to the next one. Unmeasured time is unknown, and never counts as kept.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from schemas.thresholds import Z_95
 SLOT_S: Final = 1800
 PIECE_M: Final = 50.0  # as long as what a driver slides over before the car stands, in a town
 LEAST_SHARE: Final = 0.8  # of a link's length measured, below which nobody can say that it was kept
-GAP_S: Final = 7200  # two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
+# two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
+GAP_S: Final = 7200
 INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
 # of one vehicle's error that its own interval does not know: its tyres, its calibration
 LEAST_STD: Final = 0.05
@@ -54,7 +56,8 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Return the mean of each vehicle's values per piece of a link and slot, with the mean of its reported variances.
+    """Return the mean of each vehicle's values per piece of a link and slot, with the mean of its
+    reported variances.
 
     Args:
         t: observations.
@@ -75,7 +78,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return one row per measured link and direction, the worst first.
 
     Raises:
-        InputError: the table of roads, the level, or the time within which it must be restored is missing.
+        InputError: the table of roads, the level, or the time within which it must be restored is
+            missing.
     """
     if options.roads is None:
         raise InputError(
@@ -98,7 +102,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slots(found: pa.Table) -> dict[str, FloatArray]:
-    """Return mean and 90 % interval per slot from those of its vehicles, as columns with the slot's first row.
+    """Return mean and 90 % interval per slot from those of its vehicles, as columns with the slot's
+    first row.
 
     The error of a mean is the larger of the vehicles' spread and their own intervals.
     """
@@ -124,13 +129,15 @@ def breach(
     level: float,
     span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
-    """Return the longest breach of one link [s]: by the means, certain, and possible; and its begin (0 for none).
+    """Return the longest breach of one link [s]: by the means, certain, and possible; and its begin
+    (0 for none).
 
     Args:
         slot: (n,) numbers of slots, ascending.
         lower, mu, upper: (n,) interval and mean of each.
         level: agreed grip.
-        span: begin and end [s] of all measurements; outside it nothing is known, so slots are cut to it.
+        span: begin and end [s] of all measurements; outside it nothing is known, so slots are cut
+            to it.
     """
     begins = np.maximum(slot * SLOT_S, span[0])
     closes = np.minimum((slot + 1) * SLOT_S, span[1])
@@ -147,8 +154,8 @@ def breach(
 
 
 def _runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return the first positions of runs of true values, and the positions after their last; a run ends where the next
-    slot is far."""
+    """Return the first positions of runs of true values, and the positions after their last; a run
+    ends where the next slot is far."""
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)
     new = np.append(True, np.diff(number[at]) != 0)[: len(at)]

@@ -1,4 +1,6 @@
-"""`grip`: percentiles of mu per cell and day, and coverage: cells with values, with bounds only, or without visits."""
+"""`grip`: percentiles of mu per cell and day, and coverage: cells with values, with bounds only,
+or without visits.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,8 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 
 def expression(t: Table) -> Table:
-    """Return one row per day, cell and sector. Without a value there are no percentiles: mu is at least
-    `utilised_max`."""
+    """Return one row per day, cell and sector. Without a value there are no percentiles: mu is at
+    least `utilised_max`."""
     reported = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(
         "day",
@@ -39,8 +41,8 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression`; report the coverage of the network (every cell and sector seen in these days)
-    per day."""
+    """Return the rows of `expression`; report the coverage of the network (every cell and sector
+    seen in these days) per day."""
     found = engine.answer(expression(engine.observations()))
     for line in coverage(found):
         options.report(line)
@@ -48,7 +50,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def coverage(found: pa.Table) -> list[str]:
-    """Return a line per day: shares of the network with a value, with a bound only, without a visit."""
+    """Return a line per day: shares of the network with a value, with a bound only, without a
+    visit.
+    """
     key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
     network = len(np.unique(key))
     days = found["day"].cast(pa.date32()).cast(pa.int32()).to_numpy()

@@ -25,7 +25,8 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
+    """Return the cells of the map at `at`, or of each frame from the part's begin to its end;
+    `frame` is its time.
 
     Raises:
         InputError: the step is not valid, or makes too many frames.
@@ -61,13 +62,15 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             due += step
             frames.append(_frame(engine, fusion, due))
             options.report(
-                f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} cells"
+                f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} "
+                "cells"
             )
     return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
 
 
 def _begin(engine: QueryEngine, first: int, step: int) -> int:
-    """Return the begin of the frames [ns]: that of the part, or just before the first row if the part begins earlier.
+    """Return the begin of the frames [ns]: that of the part, or just before the first row if the
+    part begins earlier.
 
     Raises:
         InputError: there would be too many frames.

@@ -1,7 +1,8 @@
 """`spells`: begin and duration of slippery spells, and the time until an alert of two vehicles.
 
-A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time. It ends with the first value of
-grip, and at least `least_vehicles` reported it. The alert is the first value of a second vehicle, as in the service.
+A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time. It ends with
+the first value of grip, and at least `least_vehicles` reported it. The alert is the first value of
+a second vehicle, as in the service.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return one row per spell; if it `lasts` at the end of the data, `end` is null and `duration_s` a minimum."""
+    """Return one row per spell; if it `lasts` at the end of the data, `end` is null and
+    `duration_s` a minimum.
+    """
     t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
     place = ["cell", "sector"]
     order = ["time", "vehicle", "boot", "seq", "row"]

@@ -1,4 +1,6 @@
-"""`vehicles`: deviation of a vehicle's values from those of others in the same cell and hour; its sensors' health."""
+"""`vehicles`: deviation of a vehicle's values from those of others in the same cell and hour;
+its sensors' health.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ HOUR_S = 3600
 def expression(t: Table) -> Table:
     """Return one row per vehicle; `bias` is null if it never met another one.
 
-    `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its standard error, `z` the
-    size of their ratio.
+    `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its
+    standard error, `z` the size of their ratio.
     """
     reported = value(t)
     mine = t.group_by("vehicle").aggregate(

@@ -34,8 +34,8 @@ def nearest_readings(t: Table, path: Path) -> Table:
 
 
 def expression(t: Table, stations: Table, readings: Table) -> Table:
-    """Return one row per band of temperature [temperature, temperature + BAND): values, percentiles, share of slippery
-    ones.
+    """Return one row per band of temperature [temperature, temperature + BAND): values,
+    percentiles, share of slippery ones.
 
     Args:
         t: observations.
@@ -112,7 +112,10 @@ def read(path: Path) -> tuple[pa.Table, pa.Table]:
         numbers = {name: table[name].cast(pa.float64()) for name in NEEDED[2:]}
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         problem = f"{path.name} has a value that is none ({str(error).splitlines()[0][:100]})"
-        fix = "write times like 2026-01-31T07:00:00, numbers with a point, and leave empty what is not known"
+        fix = (
+            "write times like 2026-01-31T07:00:00, numbers with a point, and leave empty what is "
+            "not known"
+        )
         raise InputError("stations", problem, fix) from error
     for name, column in numbers.items():
         table = table.set_column(table.schema.get_field_index(name), name, column)

@@ -1,4 +1,6 @@
-"""`worst`: slippery cells, merged with their neighbours into stretches with length, exposure and confidence."""
+"""`worst`: slippery cells, merged with their neighbours into stretches with length, exposure and
+confidence.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +42,17 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return stretches, the worst first: score = length times the lower bound of the share of slippery values."""
+    """Return stretches, the worst first: score = length times the lower bound of the share of
+    slippery values.
+    """
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return stretches(cells)
 
 
 def stretches(cells: pa.Table) -> pa.Table:
-    """Return cells of one sector that touch as one row each; `members` are the cells, the box surrounds them."""
+    """Return cells of one sector that touch as one row each; `members` are the cells, the box
+    surrounds them.
+    """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _touching(column["cell"], column["sector"].astype(np.int64))
     count = int(label.max(initial=-1)) + 1

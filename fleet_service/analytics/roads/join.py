@@ -1,7 +1,9 @@
-"""Assignment of cells and sectors to links: no matching of trips, a join that is made once per network.
+"""Assignment of cells and sectors to links: no matching of trips, a join that is made once per
+network.
 
-A place belongs to the link that is nearest in metres and in heading. A cell in which one link ends and the next begins
-belongs to both, because no join could separate them. `make roads-bench` measures how often it is right.
+A place belongs to the link that is nearest in metres and in heading. A cell in which one link ends
+and the next begins belongs to both, because no join could separate them. `make roads-bench`
+measures how often it is right.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
-REACH_M: Final = 25.0  # from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
+# from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
+REACH_M: Final = 25.0
 # per radian between the road and the sector's axis: a parallel road a lane away is nearer
 TURN_M: Final = 8.0
 MOST_TURN: Final = np.radians(
@@ -57,8 +60,8 @@ class _Marks(NamedTuple):
 
 
 def join_roads(network: RoadNetwork) -> pa.Table:
-    """Return one row per cell and sector on a link; the reference "Columns of the ten questions" explains the
-    columns."""
+    """Return one row per cell and sector on a link; the reference "Columns of the ten questions"
+    explains the columns."""
     lengths, marks = _marks(network.links)
     tree = cKDTree(_conformal(marks.latitude, marks.longitude))
     scale = np.cos(np.radians(marks.latitude))
@@ -196,13 +199,17 @@ def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
 
 
 def _ends(links: list[DirectedLink]) -> FloatArray:
-    """Return the first and last points of the links in turn, (2 n, 2) [deg], to a tenth of a metre."""
+    """Return the first and last points of the links in turn, (2 n, 2) [deg], to a tenth of a
+    metre.
+    """
     ends = [(at.latitude[k], at.longitude[k]) for at in links for k in (0, -1)]
     return np.asarray(np.round(np.array(ends), 6), np.float64)
 
 
 def _conformal(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-    """Return points in Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it in all directions."""
+    """Return points in Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it in all
+    directions.
+    """
     radius = np.degrees(METRES_PER_DEGREE)
     y = np.arcsinh(np.tan(np.radians(latitude)))
     return np.asarray(radius * np.column_stack([np.radians(longitude), y]))

@@ -1,4 +1,6 @@
-"""Directed links of a road network: from an extract of OpenStreetMap, or from any file of lines with ids."""
+"""Directed links of a road network: from an extract of OpenStreetMap, or from any file of lines
+with ids.
+"""
 
 from __future__ import annotations
 
@@ -62,16 +64,18 @@ class RoadNetwork(NamedTuple):
 
 
 def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNetwork:
-    """Return the links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file (GeoPackage, GeoJSON
-    …).
+    """Return the links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file
+    (GeoPackage, GeoJSON …).
 
     Args:
         path: of the file.
         identity: column of the id, for a file of lines.
-        name: column of the road's name there; optional, like `oneway` (forward, backward, yes, no) and `kind`.
+        name: column of the road's name there; optional, like `oneway` (forward, backward, yes, no)
+            and `kind`.
 
     Raises:
-        InputError: it cannot be read, has no such column, or holds no road; or a reader is not installed.
+        InputError: it cannot be read, has no such column, or holds no road; or a reader is not
+            installed.
     """
     if not path.is_file():
         raise InputError(
@@ -140,7 +144,10 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
             geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
         )
     except Exception as error:  # each of its readers raises its own
-        problem = f"{path.name} cannot be read ({(str(error) or 'no reason given').splitlines()[0][:100]})"
+        problem = (
+            f"{path.name} cannot be read "
+            f"({(str(error) or 'no reason given').splitlines()[0][:100]})"
+        )
         raise InputError("extract", problem, "name a file of lines") from error
     if identity not in frame.columns:
         raise InputError(

@@ -1,4 +1,6 @@
-"""Export of parts of the archive as GeoParquet, GeoJSON or CSV, selected by the ending of the name."""
+"""Export of parts of the archive as GeoParquet, GeoJSON or CSV, selected by the ending of the
+name.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """Return a table with nulls in the columns `names` where nothing was measured, so that no bound gets a colour."""
+    """Return a table with nulls in the columns `names` where nothing was measured, so that no
+    bound gets a colour.
+    """
     for name in names:
         column = table[name]
         held: pa.ChunkedArray[Any] = pc.if_else(
@@ -132,7 +136,8 @@ def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
 
 
 def write(table: pa.Table, path: Path) -> None:
-    """Write a GeoParquet table in the format of the name's ending; CSV omits binary and nested columns.
+    """Write a GeoParquet table in the format of the name's ending; CSV omits binary and nested
+    columns.
 
     Raises:
         InputError: the ending is unknown, or the file cannot be written.
@@ -147,7 +152,9 @@ def write(table: pa.Table, path: Path) -> None:
 
 
 def features(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are omitted."""
+    """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are
+    omitted.
+    """
     flat = _flat(table)
     for geometry, *values in zip(
         geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True

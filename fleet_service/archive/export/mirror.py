@@ -1,4 +1,6 @@
-"""Mirror of compacted files, snapshots and roll-ups on another file system: a folder, S3, GCS, HDFS."""
+"""Mirror of compacted files, snapshots and roll-ups on another file system: a folder, S3, GCS,
+HDFS.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,8 @@ _CHUNK: Final = 1 << 22
 def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     """Copy new and rewritten files; return their number.
 
-    Files that were retired here stay in the mirror. A file appears under its name when it is complete. Files in `again`
-    are copied whatever their size.
+    Files that were retired here stay in the mirror. A file appears under its name when it is
+    complete. Files in `again` are copied whatever their size.
 
     Raises:
         InputError: the destination cannot be used.

@@ -21,7 +21,8 @@ ROW_GROUP: Final = 128 * 1024  # rows: 5 MB, which is what a query reads at the 
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of a table; DuckDB, pandas, polars and every Spark in use read plain encodings and zstd.
+    """Encoding of a table; DuckDB, pandas, polars and every Spark in use read plain encodings and
+    zstd.
 
     Attributes:
         dictionary: columns with repeated values; elsewhere dictionaries cost size and time.
@@ -40,11 +41,12 @@ _REPEATED: Final = ("vehicle", "estimator", "boot", "region", "health", "receive
 _STEPPED: Final = tuple(
     f.name for f in (*tables.OBSERVATION, *tables.STATE) if f.step and f.type == tables.F32
 )
-# A segment lives until it is compacted and is then read whole: level 1 takes 4 % more bytes and .2 us less a row.
+# A segment lives until it is compacted and is then read whole: level 1 takes 4 % more bytes and .2
+# us less a row.
 SEGMENT: Final = Encoding(_REPEATED, level=1)
-# Measured on 388 000 rows of simulated vehicles with the real estimator, bytes a row: single-precision steps 1.3 with
-# and 1.7 without a dictionary, times 4.8 as differences and 5.2 plain, likelihoods 15.7 as they are; as 32 columns they
-# took 25.
+# Measured on 388 000 rows of simulated vehicles with the real estimator, bytes a row:
+# single-precision steps 1.3 with and 1.7 without a dictionary, times 4.8 as differences and 5.2
+# plain, likelihoods 15.7 as they are; as 32 columns they took 25.
 COMPACTED: Final = Encoding(
     ("vehicle", "estimator", "boot", "sector", "row", "health", "weight", *_STEPPED),
     ("enter_time", "leave_time", "time", "received_at"),
@@ -67,7 +69,8 @@ def write_table(
     *,
     named: bool = True,
 ) -> None:
-    """Write a Parquet file that is complete and durable when this returns; on failure nothing changes.
+    """Write a Parquet file that is complete and durable when this returns; on failure nothing
+    changes.
 
     Args:
         table: the rows.
@@ -129,7 +132,8 @@ def sync_tree(root: Path, folders: Iterable[Path]) -> None:
 
 
 def lock_archive(root: Path) -> BinaryIO:
-    """Lock the archive for this process; the lock is released when the file is closed or the process ends.
+    """Lock the archive for this process; the lock is released when the file is closed or the
+    process ends.
 
     Raises:
         InputError: another service holds it, or the folder cannot be created.
@@ -156,7 +160,8 @@ def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
     """Lock a file for as long as the handle is open.
 
     Raises:
-        InputError: another process holds it (with `problem` and `fix`), or the file cannot be created.
+        InputError: another process holds it (with `problem` and `fix`), or the file cannot be
+            created.
     """
     try:
         file = path.open("ab")

@@ -1,4 +1,5 @@
-"""GeoParquet 1.1 with pyarrow alone: WKB geometries, a bounding box per row, and the `geo` key of the footer.
+"""GeoParquet 1.1 with pyarrow alone: WKB geometries, a bounding box per row, and the `geo` key of
+the footer.
 
 Source: GeoParquet specification 1.1.0 (OGC), and the OGC simple features' well-known binary.
 Axis order is longitude, latitude; a file without `crs` is OGC:CRS84 by the specification.
@@ -33,14 +34,16 @@ Pieces = Sequence[Sequence[int]]
 def with_cells(table: pa.Table) -> pa.Table:
     """Return a table with a column `cell` as a GeoParquet table with the cells' polygons.
 
-    If it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline), so that no row hides another.
+    If it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline), so that no
+    row hides another.
     """
     x, y = _outlines(table, table["cell"].to_numpy())
     return _marked(table, _binary(_polygons(x, y)), "Polygon", _extremes(x, y))
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
-    """Return a table whose rows consist of several cells as a GeoParquet table with one multi-polygon per row.
+    """Return a table whose rows consist of several cells as a GeoParquet table with one
+    multi-polygon per row.
 
     With a column `sector`, the polygons are the quarters of that sector.
     """
@@ -86,7 +89,9 @@ def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _rings(wkb: bytes, count: int, begin: int) -> list[Any]:
-    """Return the rings of `count` polygons with one ring and equally many corners, from a byte on."""
+    """Return the rings of `count` polygons with one ring and equally many corners, from a byte
+    on.
+    """
     corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
     rings: list[Any] = np.frombuffer(wkb, _ring(corners), count, begin)["xy"][:, None].tolist()
     return rings
@@ -99,7 +104,9 @@ def _ring(corners: int) -> np.dtype[Any]:
 def _outlines(
     table: pa.Table, cells: IntArray, count: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number of cells per row."""
+    """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number
+    of cells per row.
+    """
     if "sector" not in table.schema.names:
         return grid.outline(cells)
     sector = table["sector"].to_numpy()

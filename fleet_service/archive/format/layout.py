@@ -7,9 +7,9 @@
     requests/…                                                  see `erasure_requests`
     drafts/                                                     files being written; nothing there counts
 
-The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds. If services
-succeed each other by a lease, the epoch of the compacting service follows SHARD: two services that compact at once,
-because one was frozen, never write the same name.
+The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file
+holds. If services succeed each other by a lease, the epoch of the compacting service follows SHARD:
+two services that compact at once, because one was frozen, never write the same name.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ FIRST_TIME: Final = {
 CHECKPOINTS: Final = "checkpoints"  # a folder
 EPOCH_FILE: Final = "term"  # holds the epoch of the service that owns the folder
 DAY_NS: Final = 86_400_000_000_000
-# Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
+# Days of observations that show in the map, and of batches that may come again
+# (ServiceConfig.oldest_s is 30 days).
 MAP_DAYS: Final = 31
 _EPOCH: Final = date(1970, 1, 1)
 _TERM: Final = re.compile(r"\.\d{10}$")
@@ -55,7 +56,9 @@ _DAY: Final = re.compile(
 
 
 class Cut(NamedTuple):
-    """Position in the log: everything up to this segment. Names only increase, independent of the clock."""
+    """Position in the log: everything up to this segment. Names only increase, independent of
+    the clock.
+    """
 
     epoch: int
     number: int
@@ -68,7 +71,9 @@ class Partition(NamedTuple):
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return its folder. The letter before the zone keeps readers from parsing it as a number."""
+        """Return its folder. The letter before the zone keeps readers from parsing it as a
+        number.
+        """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
 
@@ -142,23 +147,24 @@ def segment_name(prefix: str, number: int) -> str:
 
 
 def with_term(name: str, term: int) -> str:
-    """Return the first part of a file's name with the writer's term instead of a former one, so that it replaces no
-    other file; 0 without terms."""
+    """Return the first part of a file's name with the writer's term instead of a former one, so
+    that it replaces no other file; 0 without terms."""
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
 
 def compacted_name(name: str, term: int) -> str:
-    """Return the name of a compacted file from its newest segment and the term of the compacting service; 0 without
-    terms."""
+    """Return the name of a compacted file from its newest segment and the term of the compacting
+    service; 0 without terms."""
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
 
 
 def term_of(name: str) -> int | None:
-    """Return the epoch of the service that made an object of an archive's copy; None if its name has none.
+    """Return the epoch of the service that made an object of an archive's copy; None if its name
+    has none.
 
-    Segments, checkpoints, weather and vehicle identities have the epoch of their service; compacted files and their
-    roll-ups that of the compacting service.
+    Segments, checkpoints, weather and vehicle identities have the epoch of their service; compacted
+    files and their roll-ups that of the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:
@@ -168,7 +174,9 @@ def term_of(name: str) -> int | None:
 
 
 def age(name: str) -> tuple[int, int, str]:
-    """Return a sort key of segments, and of files with their rows, from old to new: epoch, number, shard."""
+    """Return a sort key of segments, and of files with their rows, from old to new: epoch,
+    number, shard.
+    """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard
 

@@ -1,8 +1,8 @@
 """Reading of one file of the archive, verified, with the columns that this version knows.
 
-A missing column is null, and an unknown one is ignored. A file is damaged if a checksum, a digest or a text is wrong.
-The service that writes the archive, and its compaction, set a damaged file aside. Readers skip it with a warning and
-change nothing.
+A missing column is null, and an unknown one is ignored. A file is damaged if a checksum, a digest
+or a text is wrong. The service that writes the archive, and its compaction, set a damaged file
+aside. Readers skip it with a warning and change nothing.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def skip_damaged(path: Path, problem: str) -> None:
 
 
 def set_aside(path: Path, problem: str) -> None:
-    """Rename a damaged file so that it is not read again, and log a warning; for the writer of the archive."""
+    """Rename a damaged file so that it is not read again, and log a warning; for the writer of
+    the archive.
+    """
     log.warning("%s is damaged and set aside: %s", path, problem)
     with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
         path.rename(path.with_name(path.name + BAD))
@@ -125,8 +127,9 @@ def load_groups(
 ) -> bool:
     """Read a file like `load`, passing the rows to `take` one row group at a time.
 
-    A complete file takes several times the memory of its rows while it is read. Of a row group without a match only the
-    columns of `where` are read. The result is False if the file is damaged; discard the rows taken from it.
+    A complete file takes several times the memory of its rows while it is read. Of a row group
+    without a match only the columns of `where` are read. The result is False if the file is
+    damaged; discard the rows taken from it.
 
     Raises:
         as `load`.

@@ -1,8 +1,10 @@
-"""Reading of an archive: every row once, from the inbox or a compacted file, also during a compaction.
+"""Reading of an archive: every row once, from the inbox or a compacted file, also during a
+compaction.
 
-The inbox is read first and completely; if a compaction deletes segments meanwhile, the reader starts again. Then the
-compacted files are listed once. Rows of a segment are skipped if a listed file holds them. A file that appears later is
-not read, because its rows were read from the inbox. The order of these steps is what makes the result correct.
+The inbox is read first and completely; if a compaction deletes segments meanwhile, the reader
+starts again. Then the compacted files are listed once. Rows of a segment are skipped if a listed
+file holds them. A file that appears later is not read, because its rows were read from the inbox.
+The order of these steps is what makes the result correct.
 """
 
 from __future__ import annotations
@@ -25,16 +27,19 @@ from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
 
-# Key in the footer: the segments that the rows come from, as JSON [[SHARD-EPOCH, first number, last number], …].
+# Key in the footer: the segments that the rows come from, as JSON [[SHARD-EPOCH, first number, last
+# number], …].
 SOURCES: Final = b"gripmap.sources"
 _TURNS: Final = 100  # a reader that is overtaken by so many compactions has another trouble
 
 
 class Wanted(NamedTuple):
-    """Selection of rows: columns (None for all), filter, days of measurement (both included), position in the log.
+    """Selection of rows: columns (None for all), filter, days of measurement (both included),
+    position in the log.
 
-    It may yield more than was written after the position: the rest of a compacted file. It yields nothing of the inbox
-    written after `until`, and only compacted files of zones that touch a box [deg].
+    It may yield more than was written after the position: the rest of a compacted file. It yields
+    nothing of the inbox written after `until`, and only compacted files of zones that touch a box
+    [deg].
     """
 
     columns: Sequence[str] | None = None
@@ -45,7 +50,9 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a segment, or a file named by its newest segment, was written after the position."""
+        """Return True if a segment, or a file named by its newest segment, was written after the
+        position.
+        """
         return self.after is None or layout.age(path.name)[:2] > self.after
 
 
@@ -87,7 +94,8 @@ def read_wanted(
 
 
 class Listing:
-    """Rows of an archive at one moment: the inbox, and the list of compacted files, which are read later.
+    """Rows of an archive at one moment: the inbox, and the list of compacted files, which are read
+    later.
 
     Args:
         as of `read`.
@@ -125,7 +133,9 @@ class Listing:
             return False
 
     def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
-        """Return the rows of one file that also match this filter; None if it is damaged, or its day was retired."""
+        """Return the rows of one file that also match this filter; None if it is damaged, or its
+        day was retired.
+        """
         both = [*(self._wanted.where or ()), *(where or ())]
         try:
             return load(path, self._schema, self._names, both or None, damaged=self._damaged)
@@ -192,7 +202,8 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
 
 
 def sources_of(path: Path) -> set[str]:
-    """Return the segments whose rows of its partition a compacted file holds; empty if it is missing or damaged.
+    """Return the segments whose rows of its partition a compacted file holds; empty if it is
+    missing or damaged.
 
     Raises:
         InputError: it is of a newer major version.

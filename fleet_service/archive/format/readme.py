@@ -1,4 +1,6 @@
-"""The README of every archive: folders, and every column with unit and meaning, from the contract."""
+"""The README of every archive: folders, and every column with unit and meaning, from the
+contract.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,8 @@ def _cell(value: str) -> str:
 
 
 def keep(root: Path) -> None:
-    """Write the page into an archive if it is missing or outdated. A foreign page of that name stays.
+    """Write the page into an archive if it is missing or outdated. A foreign page of that name
+    stays.
 
     Raises:
         OSError: it cannot be written.

@@ -1,7 +1,8 @@
-"""Row filter by the range of a column, which a file's statistics can evaluate before anything is read.
+"""Row filter by the range of a column, which a file's statistics can evaluate before anything is
+read.
 
-Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their scan holds several
-complete row groups in memory.
+Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their
+scan holds several complete row groups in memory.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ Bound = int | float | str | None
 
 
 class ValueRange(NamedTuple):
-    """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are whole microseconds. A
-    row without a value is not selected."""
+    """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are
+    whole microseconds. A row without a value is not selected."""
 
     column: str
     least: Bound = None

@@ -3,7 +3,8 @@
     inbox/SHARD-EPOCH-SEQ.parquet          observations
     inbox/states/SHARD-EPOCH-SEQ.parquet   states
 
-EPOCH grows with every start of the service and SEQ with every segment, so that a name is never used twice.
+EPOCH grows with every start of the service and SEQ with every segment, so that a name is never used
+twice.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ class Writer:
         }:  # a folder that power loss forgets takes its segments along
             sync_directory(parent)
         self._unsynced: set[Path] = set()
-        # Compacted rows are known by the names of their segments, so that these may not be used again either.
+        # Compacted rows are known by the names of their segments, so that these may not be used
+        # again either.
         named = [
             path
             for kind in SCHEMAS
@@ -114,8 +116,8 @@ class Writer:
 
 
 def round_to_steps(rows: Rows) -> Rows:
-    """Return rows with floats at multiples of their column's step and times in microseconds: the fusion uses what is
-    stored."""
+    """Return rows with floats at multiples of their column's step and times in microseconds: the
+    fusion uses what is stored."""
     out = {
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c
         for name, c in rows.items()
@@ -151,13 +153,15 @@ def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
-    """Return which rows give a value of mu and not only a bound, (n,): they used EXCITED_SHARE of it. NaN gives
-    nothing."""
+    """Return which rows give a value of mu and not only a bound, (n,): they used EXCITED_SHARE of
+    it. NaN gives nothing."""
     return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 
 
 def rows_of(table: pa.Table) -> Rows:
-    """Return the columns of a table as `Writer.write` takes them; times are int64, and null becomes the default."""
+    """Return the columns of a table as `Writer.write` takes them; times are int64, and null
+    becomes the default.
+    """
     rows: Rows = {}
     for f in table.schema:
         column = table.column(f.name).combine_chunks()

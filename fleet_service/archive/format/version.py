@@ -7,9 +7,10 @@
 | 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` is null where only bounds are known |
 | 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
 
-A minor version adds columns: older readers ignore them, newer readers read null. A major version changes the meaning of
-a column: older readers refuse the file. The digest is computed in the same way in all versions, so that damage differs
-from another version. Parquet's page checksums cover the values, but not the names and types of the columns.
+A minor version adds columns: older readers ignore them, newer readers read null. A major version
+changes the meaning of a column: older readers refuse the file. The digest is computed in the same
+way in all versions, so that damage differs from another version. Parquet's page checksums cover the
+values, but not the names and types of the columns.
 """
 
 from __future__ import annotations
@@ -58,14 +59,18 @@ class DamagedError(Exception):
 
 
 def footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return key-value pairs for the footer of a file: `entries`, a version if they have none, and the digest."""
+    """Return key-value pairs for the footer of a file: `entries`, a version if they have none,
+    and the digest.
+    """
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}
     return own | {DIGEST: digest(schema, own)}
 
 
 def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
-    """Return this project's key-value pairs of a file; undecodable ones are damage, which the digest shows."""
+    """Return this project's key-value pairs of a file; undecodable ones are damage, which the
+    digest shows.
+    """
     return {
         key.decode(errors="replace"): value.decode(errors="replace")
         for key, value in (metadata or {}).items()
@@ -109,7 +114,9 @@ def parse_version(text: str) -> Version:
 
 
 def digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
-    """Return the hash (16 hexadecimal digits) of names and types of columns, and of key-value pairs."""
+    """Return the hash (16 hexadecimal digits) of names and types of columns, and of key-value
+    pairs.
+    """
     state = _columns(tuple(schema.names), tuple(schema.types)).copy()
     for key in sorted(entries):
         state.update(f"\n{key}={entries[key]}".encode())
@@ -123,7 +130,9 @@ def _columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> blake2b:
 
 
 def _type(kind: pa.DataType) -> str:
-    """Return the name of a type; that of a list's values differs between versions of Arrow and is omitted."""
+    """Return the name of a type; that of a list's values differs between versions of Arrow and
+    is omitted.
+    """
     if pa.types.is_list(kind):
         return f"list<{_type(kind.value_type)}>"
     if pa.types.is_struct(kind):

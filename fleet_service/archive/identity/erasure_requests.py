@@ -1,9 +1,11 @@
-"""Requests of the archive's owner to the service that runs on it, as files: erasure, which only the service may do.
+"""Requests of the archive's owner to the service that runs on it, as files: erasure, which only the
+service may do.
 
     requests/NAME.json           the request: a month, and a vehicle or none
     requests/NAME.answer.json    the result, or the reason of refusal; the request is removed then
 
-Everybody who may write into the archive may make a request. A request outlives the service: the next one finds it.
+Everybody who may write into the archive may make a request. A request outlives the service: the
+next one finds it.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ def answer_to(question: Path) -> dict[str, Any] | None:
 
 
 def open_requests(root: Path) -> list[Path]:
-    """Return the requests without an answer, oldest first; remove answers that were not collected for a day."""
+    """Return the requests without an answer, oldest first; remove answers that were not
+    collected for a day.
+    """
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
         if time.time() - path.stat().st_mtime > _KEPT_S:
             path.unlink()

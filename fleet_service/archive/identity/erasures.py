@@ -3,9 +3,10 @@
     keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
     keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with the month's key
 
-Without the month's key nobody can tell which batches were received, so a repeated batch would count twice. If the rows
-of a vehicle were removed, nothing proves either that they were received. UNTIL is the end of the month. In the current
-month it is the newest measurement in the archive, so no clock is needed.
+Without the month's key nobody can tell which batches were received, so a repeated batch would count
+twice. If the rows of a vehicle were removed, nothing proves either that they were received. UNTIL
+is the end of the month. In the current month it is the newest measurement in the archive, so no
+clock is needed.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ def span_of(month: str) -> Span:
 
 
 def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
-    """Refuse from now on measurements of a month, or of one vehicle in it, up to `newest` [ns], the newest in the
-    archive. The record is durable when this returns.
+    """Refuse from now on measurements of a month, or of one vehicle in it, up to `newest` [ns], the
+    newest in the archive. The record is durable when this returns.
 
     Raises:
         OSError: the disk is full or broken.

@@ -1,8 +1,8 @@
 """Pseudonyms: keyed hashes of vehicle names and of their starts, with one key per month.
 
-Destroying a month's key makes its rows anonymous. The number of a start differs per month too, because a start that
-lasts over midnight would otherwise link the pseudonyms of two months. The month is that of a batch's first record, so a
-repeated batch has the same pseudonym.
+Destroying a month's key makes its rows anonymous. The number of a start differs per month too,
+because a start that lasts over midnight would otherwise link the pseudonyms of two months. The
+month is that of a batch's first record, so a repeated batch has the same pseudonym.
 """
 
 from __future__ import annotations
@@ -110,7 +110,8 @@ def _checked(path: Path) -> bytes:
     """Return a verified key; keys of a former version have no digest.
 
     Raises:
-        OSError: it is damaged; other pseudonyms would result, and every batch would be accepted again.
+        OSError: it is damaged; other pseudonyms would result, and every batch would be accepted
+            again.
     """
     data = path.read_bytes()
     key = data[:KEY_BYTES]

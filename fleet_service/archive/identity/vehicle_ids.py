@@ -1,13 +1,14 @@
-"""Vehicle numbers of the map: one number per vehicle for ever, while the archive has one pseudonym per month.
+"""Vehicle numbers of the map: one number per vehicle for ever, while the archive has one pseudonym
+per month.
 
     keys/witness.key            of the service: a vehicle's number is the keyed hash of its name
     keys/2026-01.witnesses      number of each pseudonym of the month; removed with the month's key
     keys/2026-01.TERM.witnesses the same, of a service that succeeds others: each writes a file of its own
 
-One car must not become two witnesses because a month ended, or because it claims so. The second file is for restarts
-and replays, which see pseudonyms. A lost or damaged line makes one vehicle two there, and has no other effect. A
-service therefore checks the lines when it starts, counts damaged ones and removes them. The vehicle's next batch writes
-its line again.
+One car must not become two witnesses because a month ended, or because it claims so. The second
+file is for restarts and replays, which see pseudonyms. A lost or damaged line makes one vehicle two
+there, and has no other effect. A service therefore checks the lines when it starts, counts damaged
+ones and removes them. The vehicle's next batch writes its line again.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class VehicleIds:
         self._unsynced: set[Path] = set()
 
     def id_of(self, vehicle: str, month: str, pseudonym: int) -> int:
-        """Return the number of a vehicle, which has this pseudonym in this month (2026-01); durable after `sync`.
+        """Return the number of a vehicle, which has this pseudonym in this month (2026-01); durable
+        after `sync`.
 
         Raises:
             OSError: the key can neither be read nor written, or the line cannot be written.
@@ -128,7 +130,9 @@ def _whole(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
-    """Return the numbers of pseudonyms (n,) by the result of `read`; an unknown pseudonym is its own number."""
+    """Return the numbers of pseudonyms (n,) by the result of `read`; an unknown pseudonym is its
+    own number.
+    """
     if not known or not len(pseudonyms):
         return pseudonyms
     distinct, index = np.unique(pseudonyms, return_inverse=True)

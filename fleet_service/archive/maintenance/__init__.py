@@ -1,1 +1,3 @@
-"""Work on the files of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk space."""
+"""Work on the files of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk
+space.
+"""

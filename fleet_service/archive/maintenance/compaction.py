@@ -6,8 +6,9 @@ A round takes the oldest segments and only adds:
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
-It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted if
-a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
+It may die between any two of these steps and need not be finished afterwards. A row of a segment
+counts as compacted if a file of its partition names the segment, so that `reading` sees it once,
+and the next round takes what is left.
 """
 
 from __future__ import annotations
@@ -87,8 +88,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
             done = reading.compacted_partitions(
                 layout.compacted_files(root, kind), {path.name for path in waiting}
             )
-            # A run that died, or found the disk full, may have left its files in place with their names not yet synced:
-            # the segments that they stand for may only be deleted when power loss can no longer forget them.
+            # A run that died, or found the disk full, may have left its files in place with their
+            # names not yet synced: the segments that they stand for may only be deleted when power
+            # loss can no longer forget them.
             sync_tree(
                 root,
                 {
@@ -104,7 +106,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments that wait, oldest first, and the partitions to which an earlier run moved some of their rows."""
+    """Segments that wait, oldest first, and the partitions to which an earlier run moved some of
+    their rows.
+    """
 
     root: Path
     kind: Kind
@@ -146,8 +150,8 @@ def _round(rest: _Rest, most: int) -> CompactionResult:
 def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
     """Join rows of segments of several versions.
 
-    The result has the known columns, null where a segment has none. Columns that only a newer version knows follow, so
-    that a downgrade loses nothing.
+    The result has the known columns, null where a segment has none. Columns that only a newer
+    version knows follow, so that a downgrade loses nothing.
     """
     others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
     schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
@@ -170,7 +174,9 @@ def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[s
 
 
 def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
+    """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH,
+    first, last.
+    """
     out: list[tuple[str, int, int]] = []
     for name in names:
         prefix = Path(name).stem.rpartition("-")[0]

@@ -1,4 +1,6 @@
-"""Reserve on the archive's disk: retention and compaction use it to make room when the disk is full."""
+"""Reserve on the archive's disk: retention and compaction use it to make room when the disk is
+full.
+"""
 
 from __future__ import annotations
 

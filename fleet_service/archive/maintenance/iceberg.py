@@ -1,7 +1,7 @@
 """Iceberg tables of the compacted files: registered without copying; the inbox is never registered.
 
-There is one registrar per table. Before retention and erasure remove or rewrite files, these files leave the tables
-(`unregister`), because a table that names a missing file cannot be read.
+There is one registrar per table. Before retention and erasure remove or rewrite files, these files
+leave the tables (`unregister`), because a table that names a missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ Table: TypeAlias = Any
 RECORD: Final = "iceberg.json"  # in the archive: where its files are registered
 NAMESPACE: Final = "gripmap"
 PROPERTIES: Final = {
-    "write.metadata.metrics.column.vehicle": "counts",  # no pseudonym stays in the table's own files
+    # no pseudonym stays in the table's own files
+    "write.metadata.metrics.column.vehicle": "counts",
     "write.metadata.delete-after-commit.enabled": "true",
     "write.metadata.previous-versions-max": "20",
     "commit.retry.num-retries": "10",  # of several registrars, each of an archive of its own
@@ -39,7 +40,8 @@ class Place(NamedTuple):
     """Registration of an archive.
 
     Attributes:
-        catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
+        catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue
+            (`sqlite:////var/lib/tables.db`).
         namespace: of the tables `observations` and `states`.
         at: URL at which readers of the tables find the archive's folder, its mirror or its copy.
     """
@@ -50,7 +52,9 @@ class Place(NamedTuple):
 
 
 class RegistrationResult(NamedTuple):
-    """Result: files added to the tables, files removed from them, and rows of the archive in them."""
+    """Result: files added to the tables, files removed from them, and rows of the archive in
+    them.
+    """
 
     added: int
     dropped: int
@@ -63,7 +67,8 @@ def register(root: Path, place: Place) -> RegistrationResult:
     Files of other archives in the same tables stay.
 
     Raises:
-        InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at `place.at`.
+        InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at
+            `place.at`.
         OSError: the archive cannot be read or written.
     """
     total = RegistrationResult(0, 0, 0)
@@ -82,7 +87,8 @@ def unregister(root: Path, paths: Sequence[Path]) -> None:
     """Remove files from the tables before they are removed or rewritten on disk.
 
     Raises:
-        InputError: the archive is registered and pyiceberg is not installed, or the catalogue refuses.
+        InputError: the archive is registered and pyiceberg is not installed, or the catalogue
+            refuses.
     """
     place = place_of(root)
     if place is None or not paths:
@@ -100,7 +106,8 @@ def place_of(root: Path) -> Place | None:
     """Return the registration of an archive, if it has one.
 
     Raises:
-        InputError: the record cannot be read; it must not be ignored, because tables may name files.
+        InputError: the record cannot be read; it must not be ignored, because tables may name
+            files.
     """
     path = root / RECORD
     try:
@@ -114,14 +121,19 @@ def place_of(root: Path) -> Place | None:
 
 
 def _remember(root: Path, place: Place) -> None:
-    """Record the registration before it happens, so that no registered file is removed unnoticed."""
+    """Record the registration before it happens, so that no registered file is removed
+    unnoticed.
+    """
     path = root / RECORD
     try:
         before = place_of(root)
     except InputError:  # a damaged one is written anew
         before = None
     if before is not None and before != place:
-        problem = f"this archive is registered at {before.catalog}, namespace {before.namespace}, files at {before.at}"
+        problem = (
+            f"this archive is registered at {before.catalog}, namespace {before.namespace}, "
+            f"files at {before.at}"
+        )
         raise InputError(
             "catalog", problem, f"give these; or drop those tables, then remove {path}"
         )

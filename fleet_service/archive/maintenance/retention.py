@@ -1,4 +1,5 @@
-"""Removal of data: raw rows after a number of days, when their roll-ups stay; and the rows of one vehicle.
+"""Removal of data: raw rows after a number of days, when their roll-ups stay; and the rows of one
+vehicle.
 
 Only these two rewrite or remove compacted files, one file for one.
 """
@@ -32,7 +33,8 @@ from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
-# A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.
+# A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that
+# it was there before.
 LEAST_DAYS: Final = 31
 # vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
 ANONYMOUS: Final = 5
@@ -103,8 +105,9 @@ def forget_period(root: Path, month: str) -> None:
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """Destroy the key like `forget_period`, for a caller that holds the archive and has no data of the month in memory.
-    Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted again.
+    """Destroy the key like `forget_period`, for a caller that holds the archive and has no data of
+    the month in memory. Measurements of the month up to `newest` [ns], the newest in the archive,
+    are not accepted again.
 
     Raises:
         InputError: there is no such key.
@@ -120,8 +123,8 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
 def _newest(
     root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
 ) -> int:
-    """Return the newest first time of a record of these days [ns], -1 if there is none; one not before `until` is
-    enough."""
+    """Return the newest first time of a record of these days [ns], -1 if there is none; one not
+    before `until` is enough."""
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
         for table in reading.read(root, kind, [name, *(one.column for one in where)], where, days):
@@ -142,11 +145,13 @@ class ErasureResult(NamedTuple):
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
     """Remove the rows of one vehicle in one month, and everything derived that could reveal them.
 
-    That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints. Roll-ups are computed
-    again. Its measurements of that month up to the newest removed row are not accepted again.
+    That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints.
+    Roll-ups are computed again. Its measurements of that month up to the newest removed row are not
+    accepted again.
 
     Raises:
-        InputError: the month's key does not exist, or a service runs on the archive (it has more in memory).
+        InputError: the month's key does not exist, or a service runs on the archive (it has more in
+            memory).
         OSError: a file cannot be read or written.
     """
     with lock_archive(root):
@@ -158,8 +163,8 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
 
 @contextmanager
 def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
-    """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it removes only those that
-    exist at the begin. Nothing is compacted before the block ends.
+    """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it
+    removes only those that exist at the begin. Nothing is compacted before the block ends.
 
     Raises:
         as `forget_vehicle`, except for a running service.
@@ -212,7 +217,9 @@ def _pseudonym(root: Path, vehicle: str, month: str) -> str:
 
 
 def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
-    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return True if there were any."""
+    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return
+    True if there were any.
+    """
     found = content(path, _refuse_damaged)
     if found is None or not cells:
         return False
@@ -301,7 +308,7 @@ def key_of(root: Path, month: str) -> Path:
 
 
 def _days(month: str) -> tuple[int, int]:
-    """Return the days of a month and the one after it: a batch has the pseudonym of its first record and may end a day
-    later."""
+    """Return the days of a month and the one after it: a batch has the pseudonym of its first
+    record and may end a day later."""
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

@@ -1,9 +1,11 @@
-"""Roll-up: additive statistics per cell, sector and hour, which stay when their source rows are retired.
+"""Roll-up: additive statistics per cell, sector and hour, which stay when their source rows are
+retired.
 
     rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
 
-There is one file (a part) per compacted file, with the same name. An hour's statistics are the sum over all parts, so a
-missing part can be computed at any time, and again when its rows were rewritten.
+There is one file (a part) per compacted file, with the same name. An hour's statistics are the sum
+over all parts, so a missing part can be computed at any time, and again when its rows were
+rewritten.
 
 Legend of the merging (columns of `tables.CELL_HOUR`)
     sums, counts     add
@@ -44,7 +46,9 @@ _BITS: Final = 64
 
 
 def part_of(path: Path, below: Path | None = None) -> Path:
-    """Return the path of the part of a compacted file of observations; below another folder on request."""
+    """Return the path of the part of a compacted file of observations; below another folder on
+    request.
+    """
     root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 

@@ -1,4 +1,6 @@
-"""AMQP 1.0 link to an interchange: messages out until each is accepted, and messages in, on a thread of their own."""
+"""AMQP 1.0 link to an interchange: messages out until each is accepted, and messages in, on a
+thread of their own.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""DENM of low adhesion (ETSI EN 302 637-3, cause code 6): a record, its bytes by unaligned PER, and back. Pure."""
+"""DENM of low adhesion (ETSI EN 302 637-3, cause code 6): a record, its bytes by unaligned PER,
+and back. Pure.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ class Denm:
         station, sequence: identity of the event: originating station and its number there.
         sender: station that sends this message.
         detected, referenced: time of detection, and of this version [ns since 1970, UTC].
-        termination: isCancellation by the originating station, isNegation by another one; None while the event lasts.
+        termination: isCancellation by the originating station, isNegation by another one; None
+            while the event lasts.
         position: latitude and longitude [deg].
         position_std: [m].
         validity_s: after `detected`, for how long the event is taken for present.

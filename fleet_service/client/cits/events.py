@@ -1,7 +1,9 @@
-"""Events of one originating station: which stretch under alert has which number, and what must be sent when. Pure.
+"""Events of one originating station: which stretch under alert has which number, and what must be
+sent when. Pure.
 
-A stretch is one event from its first to its last cell, also over restarts: the book is kept in a file and continued.
-An event is sent when it begins, when it changes, before its validity ends, and once more when it is over.
+A stretch is one event from its first to its last cell, also over restarts: the book is kept in a
+file and continued. An event is sent when it begins, when it changes, before its validity ends, and
+once more when it is over.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ class OpenEvent:
         sequence: number of the event.
         detected, sent: first detection, and time of the last message [ns UTC].
         state: what the last message said, to see changes.
-        position: latitude and longitude [deg] of the event; stays, so that an update refers to the same place.
+        position: latitude and longitude [deg] of the event; stays, so that an update refers to the
+            same place.
         ended: [ns UTC], 0 while it lasts.
     """
 

@@ -1,6 +1,8 @@
-"""Foreign DENM as reports of one witness, so that the fusion weighs and trusts them like a vehicle of that name. Pure.
+"""Foreign DENM as reports of one witness, so that the fusion weighs and trusts them like a vehicle
+of that name. Pure.
 
-All reports of one interchange have one name. An alert needs two sources, so they raise nothing alone.
+All reports of one interchange have one name. An alert needs two sources, so they raise nothing
+alone.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from fleet_service.client.cits.denm import ADHESION, BLACK_ICE, HEAVY_FROST, ICE
 from schemas import grid, keys
 from schemas.thresholds import NS
 
-# Friction that a sub-cause means: middle and bounds. Snow and ice as in the tyres' table of the simulator; frost and
-# unknown causes between. A salted road is no warning of low friction.
+# Friction that a sub-cause means: middle and bounds. Snow and ice as in the tyres' table of the
+# simulator; frost and unknown causes between. A salted road is no warning of low friction.
 GRIP: Final = {
     HEAVY_FROST: (0.3, 0.15, 0.45),
     SNOW: (0.3, 0.2, 0.45),
@@ -30,7 +32,8 @@ POSITION_STD: Final = 10.0  # [m] where a message does not say
 
 
 def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[tuple[str, bytes]]:
-    """Return key and JSON of a batch for each region of an event; none if it says nothing about grip here and now.
+    """Return key and JSON of a batch for each region of an event; none if it says nothing about
+    grip here and now.
 
     Args:
         denm: received.

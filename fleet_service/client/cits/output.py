@@ -1,4 +1,6 @@
-"""Alerts as DENM at an interchange: what must be sent is on disk before it is sent, until it is accepted."""
+"""Alerts as DENM at an interchange: what must be sent is on disk before it is sent, until it is
+accepted.
+"""
 
 from __future__ import annotations
 

@@ -46,8 +46,9 @@ class Originator:
 def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
     """Return the properties by which subscribers select.
 
-    The quadtree has the keys of all points of the event, each between commas, so that `quadTree LIKE '%,120002%'`
-    selects all events within a square. Its digits are those of this project's cells and regions.
+    The quadtree has the keys of all points of the event, each between commas, so that `quadTree
+    LIKE '%,120002%'` selects all events within a square. Its digits are those of this project's
+    cells and regions.
     """
     return {
         "messageType": "DENM",
@@ -61,7 +62,8 @@ def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
         "timestamp": its_time(denm.referenced),
         "causeCode": denm.cause,
         "subCauseCode": denm.sub_cause,
-        "serviceType": "HLN-WCW",  # C-ROADS: hazardous location notification, weather condition warning
+        # C-ROADS: hazardous location notification, weather condition warning
+        "serviceType": "HLN-WCW",
         "shardId": 1,
         "shardCount": 1,
     }

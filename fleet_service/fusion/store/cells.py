@@ -24,8 +24,8 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """What is known of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns (n,) of
-    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4)."""
+    """What is known of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns
+    (n,) of `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4)."""
 
     belief: PackedArray
     key: IntArray
@@ -50,7 +50,9 @@ def cells_of(rows: Rows) -> Cells:
 
 
 def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
-    """Zeros (rows, *shape) that begin where a LINE does, so that a row of 64 bytes costs one read of memory."""
+    """Zeros (rows, *shape) that begin where a LINE does, so that a row of 64 bytes costs one
+    read of memory.
+    """
     size = rows * kind.itemsize * int(np.prod(shape, dtype=np.int64))
     memory = np.zeros(size + LINE, np.uint8)
     begin = -memory.ctypes.data % LINE
@@ -74,7 +76,9 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """What is known of a slot, from one row to another; not where its window and its reporters lie."""
+    """What is known of a slot, from one row to another; not where its window and its reporters
+    lie.
+    """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]
     window = target.cells[to].window

@@ -1,4 +1,6 @@
-"""What a vehicle reported in a cell before: its linked entries in the window, and the record of what is older."""
+"""What a vehicle reported in a cell before: its linked entries in the window, and the record of
+what is older.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """What an entry reported becomes what its vehicle reported before the checkpoint; later entries stand alone."""
+    """What an entry reported becomes what its vehicle reported before the checkpoint; later
+    entries stand alone.
+    """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
     pairs[pair].time[kind] = entries[entry].time // NS
@@ -96,7 +100,9 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
-    """Move the pairs that reported since `least` [s] to another table; returns the places of the others."""
+    """Move the pairs that reported since `least` [s] to another table; returns the places of the
+    others.
+    """
     dropped = np.empty(len(old), np.int64)
     count = 0
     for begin in range(0, len(old), AHEAD):

@@ -1,7 +1,9 @@
-"""The records of a fusion: what belongs together lies together in memory. Kernels see a row as an object.
+"""The records of a fusion: what belongs together lies together in memory. Kernels see a row as an
+object.
 
-Record arrays and not columns: a visit to a cell that was not lately in use then costs two reads of memory and not one
-for every column, and handing a kernel a few arrays of records costs nothing, where dozens of columns would.
+Record arrays and not columns: a visit to a cell that was not lately in use then costs two reads of
+memory and not one for every column, and handing a kernel a few arrays of records costs nothing,
+where dozens of columns would.
 """
 
 from __future__ import annotations
@@ -23,8 +25,9 @@ NOBODY: Final = -1  # no vehicle
 GRIP = 0
 ICE = 1
 SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
-# What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,
-# and below 4 all. In the window as before the checkpoint, so that it does not matter which of the two is asked.
+# What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16
+# bits: parts of 1/FINE, and below 4 all. In the window as before the checkpoint, so that it does
+# not matter which of the two is asked.
 FINE: Final = 16384.0
 AGED: Final = 4096.0  # likewise; never more than FORGET_S
 USED: Final = 100.0
@@ -39,23 +42,26 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot: one cell and sector that somebody visited. Its belief is a row of its own, see `belief.unpack`.
+    """A slot: one cell and sector that somebody visited. Its belief is a row of its own, see
+    `belief.unpack`.
 
     Attributes:
         key: cell · 4 + sector.
         time: last observation that is in the belief [ns]; 0 before the first.
         first: first one [ns].
-        returned: a bit for each remainder of the vehicles whose visits were forgotten, so that who comes back is not
-            counted as another.
+        returned: a bit for each remainder of the vehicles whose visits were forgotten, so that who
+            comes back is not counted as another.
         visits: observations.
         vehicles: distinct vehicles.
         values: votes with a value, fractions of repeated ones summed.
         window: row of the slot's window, or NONE.
-        reporters: row of its recent reporters, or NONE where nobody gave a value or corroborated anything lately.
+        reporters: row of its recent reporters, or NONE where nobody gave a value or corroborated
+            anything lately.
         aged: time before `time` that the belief has not forgotten yet, in parts of 1/AGED s.
         used: grip used by who gave values, mean by weight; in parts of 1/USED.
         shared: relative standard deviation that their values share, likewise; in parts of 1/SHARED.
-        untrusted: bounds and values of vehicles that are not trusted, as far as not renewed; in parts of 1/UNTRUSTED.
+        untrusted: bounds and values of vehicles that are not trusted, as far as not renewed; in
+            parts of 1/UNTRUSTED.
         manoeuvres: weight of the values by manoeuvre, see `shared`; in parts of 1/WEIGHT.
     """
 
@@ -76,7 +82,8 @@ class CellRecord:
 
 
 class EntryRecord:
-    """One observation in one cell, younger than the checkpoint. What a commit reads lies in the first line of two.
+    """One observation in one cell, younger than the checkpoint. What a commit reads lies in the
+    first line of two.
 
     Attributes:
         previous, following: entries of the slot's window, in order of time.
@@ -85,15 +92,18 @@ class EntryRecord:
         vehicle: index of the vehicle.
         kind: BOUND or VALUE.
         fresh: whether the vehicle reported nothing here lately.
-        last_mean, last_std, spent: what the vehicle has reported here, this entry included; in parts of 1/FINE.
+        last_mean, last_std, spent: what the vehicle has reported here, this entry included; in
+            parts of 1/FINE.
         time: end of the visit [ns].
         weight: trust in the vehicle.
         share: P(the vehicle was in this cell).
         power: how much of the vote is new.
         mean, std, slippery: of the vote.
-        number, boot, sequence: order entries of equal times: the vehicle's number, its start, the row in its stream.
+        number, boot, sequence: order entries of equal times: the vehicle's number, its start, the
+            row in its stream.
         evidence: likelihood in steps, see `likelihoods.evidence`.
-        used, shared: grip used, and what its value shares with others, in parts of 1/USED and 1/SHARED.
+        used, shared: grip used, and what its value shares with others, in parts of 1/USED and
+            1/SHARED.
         manoeuvre: see `shared`.
         late: whether it came after the checkpoint, and is compared with nobody.
     """
@@ -127,8 +137,9 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The window of a slot: its first and last entry, whether the live row waits to be computed anew, the first entry's
-    time [ns], how many entries are values. A window that is not in use has slot NONE."""
+    """The window of a slot: its first and last entry, whether the live row waits to be computed
+    anew, the first entry's time [ns], how many entries are values. A window that is not in use has
+    slot NONE."""
 
     slot: np.int32
     head: np.int32
@@ -139,7 +150,8 @@ class WindowRecord:
 
 
 class PairRecord:
-    """What a vehicle last reported in a cell before the checkpoint. Half a line, so that none lies in two.
+    """What a vehicle last reported in a cell before the checkpoint. Half a line, so that none lies
+    in two.
 
     Attributes:
         slot, vehicle: whose; a free place has slot NONE.
@@ -168,8 +180,8 @@ class SourcesRecord:
 
 
 class ReportersRecord:
-    """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the checkpoint, when [s] and
-    what, and the grip used; and the corroborating sources."""
+    """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the
+    checkpoint, when [s] and what, and the grip used; and the corroborating sources."""
 
     reporter: Annotated[Int32Array, c.REPORTERS]
     time: Annotated[UIntArray, c.REPORTERS]
@@ -181,9 +193,9 @@ class ReportersRecord:
 
 
 class PeersRecord:
-    """Vehicles with which a vehicle was compared: the other, the rank of their pair, agreement and comparisons, summed;
-    squares of the differences of its own use between two visits to one cell, and their products with those of its
-    values, by weight."""
+    """Vehicles with which a vehicle was compared: the other, the rank of their pair, agreement and
+    comparisons, summed; squares of the differences of its own use between two visits to one cell,
+    and their products with those of its values, by weight."""
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
@@ -210,14 +222,17 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """Beliefs of slots (n, 32), their records (n,) and, by rows of their own, their reporters or only sources."""
+    """Beliefs of slots (n, 32), their records (n,) and, by rows of their own, their reporters or
+    only sources.
+    """
 
     belief: PackedArray
     cells: RecordArray
     reporters: RecordArray
 
 
-# Places of `State.used`: how many windows and entries are free, how many pairs and rows of reporters are in use.
+# Places of `State.used`: how many windows and entries are free, how many pairs and rows of
+# reporters are in use.
 FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED = range(4)
 
 
@@ -226,7 +241,8 @@ class State(NamedTuple):
 
     Attributes:
         live: the slots as they are now.
-        base: row by row of `windows`, the slots as they were before the window; of the reporters only the sources.
+        base: row by row of `windows`, the slots as they were before the window; of the reporters
+            only the sources.
         windows, entries: pools.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that holds its records.

@@ -106,10 +106,12 @@ class Store:
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
-        """Windows with entries before `before` [ns]: those without a value, and those with one in the order of cells.
+        """Windows with entries before `before` [ns]: those without a value, and those with one in
+        the order of cells.
 
-        Values that pass the checkpoint are compared with others, which is what reputation is made of; so their order
-        may not depend on who came first. All else is done in the order of memory.
+        Values that pass the checkpoint are compared with others, which is what reputation is made
+        of; so their order may not depend on who came first. All else is done in the order of
+        memory.
         """
         plain, valued = due(self.state.windows, before)
         return plain, valued[
@@ -198,8 +200,9 @@ class Store:
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles reported FORGOTTEN_S
-        before it (`votes.discount`), reporters and sources of an hour before it (`trust.compare`, `Fusion.sources`)."""
+        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles
+        reported FORGOTTEN_S before it (`votes.discount`), reporters and sources of an hour before
+        it (`trust.compare`, `Fusion.sources`)."""
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
             self.hour = hour
@@ -207,7 +210,9 @@ class Store:
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Slots (size,) whose last visit was before a time [ns], and which nothing else points at."""
+        """Slots (size,) whose last visit was before a time [ns], and which nothing else points
+        at.
+        """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
         found = (cells["time"] < before) & (cells["window"] == NONE) & (cells["reporters"] == NONE)
@@ -215,7 +220,9 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Drop slots (size,) that are `untouched`; returns where each slot went, NONE for those that are gone."""
+        """Drop slots (size,) that are `untouched`; returns where each slot went, NONE for those
+        that are gone.
+        """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
         place[stay] = np.arange(len(stay))
@@ -286,7 +293,9 @@ def no_peers(vehicles: int) -> RecordArray:
 
 
 def distinct(values: IntArray) -> IntArray:
-    """Each value once, ascending; by sorting, which for numbers of this kind is several times faster than a set."""
+    """Each value once, ascending; by sorting, which for numbers of this kind is several times
+    faster than a set.
+    """
     ordered = np.sort(values)
     return np.asarray(
         ordered[np.append(np.ones(len(ordered[:1]), bool), ordered[1:] != ordered[:-1])]
@@ -309,7 +318,9 @@ def _longer(old: Array, rows: int) -> Array:
 
 
 def _restacked(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
-    """Free rows of a grown pool: those of the old one, and the new ones; counted in `used[which]`."""
+    """Free rows of a grown pool: those of the old one, and the new ones; counted in
+    `used[which]`.
+    """
     count = int(used[which])
     more = rows - len(old)
     new = np.zeros(rows, np.int32)

@@ -1,11 +1,11 @@
-"""Open-addressing hash tables: arrays of row numbers whose keys lie in the rows themselves. Compiled; at least one
-place must be free.
+"""Open-addressing hash tables: arrays of row numbers whose keys lie in the rows themselves.
+Compiled; at least one place must be free.
 
-A place holds the row in its lower half and some of the key's hash in the upper one, so that a row of another key is
-hardly ever looked at: that would be a wait for memory.
+A place holds the row in its lower half and some of the key's hash in the upper one, so that a row
+of another key is hardly ever looked at: that would be a wait for memory.
 
-A key's place is its hash as a share of the table: any length will do, and a longer table holds its rows in the same
-order, so that it is filled from one end to the other."""
+A key's place is its hash as a share of the table: any length will do, and a longer table holds its
+rows in the same order, so that it is filled from one end to the other."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ ROWS_MOST: Final = 0.8
 PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
-AHEAD: Final = 128  # rows whose memory is prefetched before they are worked on, so that it comes for all at once
+# rows whose memory is prefetched before they are worked on, so that it comes for all at once
+AHEAD: Final = 128
 
 
 @refcount_free_inlined
 def _mixed(key: int | np.int64) -> np.uint64:
-    """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves all."""
+    """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves
+    all.
+    """
     h = np.uint64(key)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -92,7 +95,9 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 
 @compiled
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
-    """Slot of each key, (n,), and how many are used then; an unknown key begins the next. Room must be there."""
+    """Slot of each key, (n,), and how many are used then; an unknown key begins the next. Room
+    must be there.
+    """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate(table, live.cells, wanted[i])
@@ -108,7 +113,9 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
 def numbered(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:
-    """Row of each key, (n,), and how many are used then; an unknown key is written to the next of `rows`."""
+    """Row of each key, (n,), and how many are used then; an unknown key is written to the next
+    of `rows`.
+    """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate(table, rows, wanted[i])
@@ -135,7 +142,9 @@ def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
+    """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE)
+    where it belongs.
+    """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
         pairs[place].slot != slot or pairs[place].vehicle != vehicle
@@ -152,7 +161,9 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Places for so many entries, and for a third more until a share `most` is taken: an hour after three, of pairs."""
+    """Places for so many entries, and for a third more until a share `most` is taken: an hour
+    after three, of pairs.
+    """
     return max(LEAST, int(1.35 * entries / most))
 
 

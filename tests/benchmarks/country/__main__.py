@@ -1,7 +1,8 @@
-"""`make country-bench`: a city on SUMO's routes, then a country of a hundred thousand vehicles for ten minutes.
+"""`make country-bench`: a city on SUMO's routes, then a country of a hundred thousand vehicles for
+ten minutes.
 
-Writes `.country/figures.json`, `.country/country.png`, and prints the table. `--city DIR` takes the observations of a
-city that was driven before.
+Writes `.country/figures.json`, `.country/country.png`, and prints the table. `--city DIR` takes the
+observations of a city that was driven before.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""A city: vehicles with the default estimator on SUMO's routes, their observations fused beside the truth."""
+"""A city: vehicles with the default estimator on SUMO's routes, their observations fused beside
+the truth.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Memory cost per vehicle, per cell, and per cell of a vehicle, with an engine in a process of its own.
+"""Memory cost per vehicle, per cell, and per cell of a vehicle, with an engine in a process of its
+own.
 
-The same number of observations goes through it each time, as do the same messages but for what is varied, so that the
-window of late observations is alike.
+The same number of observations goes through it each time, as do the same messages but for what is
+varied, so that the window of late observations is alike.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def coefficients() -> Coefficients:
 
 
 def _measured(kind: str) -> tuple[float, float, float]:
-    """Bytes that the stream added, cells at the end, and bytes of the table of pairs for each of them, by a process."""
+    """Bytes that the stream added, cells at the end, and bytes of the table of pairs for each of
+    them, by a process.
+    """
     command = [sys.executable, "-m", "tests.benchmarks.country.coefficients", kind]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     grown, cells, pair = done.stdout.split()[-3:]

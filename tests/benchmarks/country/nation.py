@@ -1,7 +1,9 @@
-"""A country's stream into several services at once: how far behind they are, what grows, and who does how much.
+"""A country's stream into several services at once: how far behind they are, what grows, and who
+does how much.
 
-Router, services and the vehicles' sender are processes of their own, on the machine's two cores together; what
-another machine would do (router and sender of a fleet) is told apart by processor time.
+Router, services and the vehicles' sender are processes of their own, on the machine's two cores
+together; what another machine would do (router and sender of a fleet) is told apart by processor
+time.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from tests.benchmarks.country.sender import EVERY_S as SAYS_S
 from tests.faults.processes import Part
 from tests.faults.soak import memory_mb, slope
 
-WARM_S: Final = 660.0  # all have been everywhere, the window is full, and two checkpoints have given their memory back
+# all have been everywhere, the window is full, and two checkpoints have given their memory back
+WARM_S: Final = 660.0
 MEASURED_S: Final = 600.0
 EVERY_S: Final = 5.0
 MEMORY_S: Final = 0.25
@@ -39,9 +42,9 @@ _TICKS: Final = os.sysconf("SC_CLK_TCK")
 
 
 class Look(NamedTuple):
-    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's (the least since the look
-    before: a segment takes and gives back twenty), and processor time [s]; of each service cells, rows admitted,
-    messages that wait."""
+    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's (the
+    least since the look before: a segment takes and gives back twenty), and processor time [s]; of
+    each service cells, rows admitted, messages that wait."""
 
     time: float
     memory: list[float]
@@ -266,7 +269,9 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
 
 
 def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
-    """Return the growth of the services' memory over the ten minutes, and the part due to new cells."""
+    """Return the growth of the services' memory over the ten minutes, and the part due to new
+    cells.
+    """
     time_s = np.array([look.time for look in looks])
     late = (time_s >= WARM_S) & (
         time_s < WARM_S + MEASURED_S

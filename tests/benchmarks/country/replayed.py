@@ -6,7 +6,8 @@
                those of one town with one drive are spread evenly over it
     reports    each sends ROWS visits every PERIOD_S, in turn; they take that long: traffic is slow
 
-The same for who sends it and for who looks at it; nothing but the seed and the city's observations is needed.
+The same for who sends it and for who looks at it; nothing but the seed and the city's observations
+is needed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ PERIOD_S: Final = VEHICLES * ROWS / RATE
 ZONES: Final = (17, 17, 16)  # regions in each
 TOWNS: Final = ((2, 2), (9, 2), (2, 9), (9, 9))  # tiles from a region's corner
 ALIKE: Final = 8  # vehicles that share a drive in one town
-LOOP: Final = 3  # batches of a piece: a vehicle has soon been everywhere, and what grows afterwards is no new place
+# batches of a piece: a vehicle has soon been everywhere, and what grows afterwards is no new place
+LOOP: Final = 3
 _TILES: Final = 1 << (grid.TILE_ZOOM - grid.REGION_ZOOM)  # of a region's side
 _REGIONS: Final = 1 << (grid.REGION_ZOOM - grid.ZONE_ZOOM)  # of a zone's side
 _CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # of a tile's side
@@ -41,7 +43,8 @@ class Chunk(NamedTuple):
 
     Attributes:
         message: its batch, all but who, where and when.
-        x, y: of the positions, columns and rows of cells from the north-western tile of the town, with their fractions.
+        x, y: of the positions, columns and rows of cells from the north-western tile of the town,
+            with their fractions.
         cell_x, cell_y: of the cells that were named, likewise.
         enter, leave: before the last, as a share of the time that all of them took.
     """
@@ -139,7 +142,9 @@ def _shares(count: int) -> FloatArray:
 
 
 def _chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
-    """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are less, are left out."""
+    """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are
+    less, are left out.
+    """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]
     return [

@@ -1,4 +1,6 @@
-"""The country's vehicles: a process that sends what they report, and knows how long each batch waited for its ack."""
+"""The country's vehicles: a process that sends what they report, and knows how long each batch
+waited for its ack.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ _BLOCK: Final = zenoh.CongestionControl.BLOCK
 
 
 class Waits:
-    """When each vehicle's batches were put and acknowledged [s], each (turns, vehicles); NaN: not yet."""
+    """When each vehicle's batches were put and acknowledged [s], each (turns, vehicles); NaN:
+    not yet.
+    """
 
     def __init__(self, session: zenoh.Session, vehicles: int, turns: int) -> None:
         self.put, self.acked = np.full((2, turns, vehicles), np.nan)
@@ -39,7 +43,9 @@ class Waits:
                 self.acked[first - 1 : last, vehicle] = now
 
     def line(self, since: float) -> dict[str, float]:
-        """Return the batches sent and waiting, and the 99 % quantile of finished waits since then [s]."""
+        """Return the batches sent and waiting, and the 99 % quantile of finished waits since
+        then [s].
+        """
         # a copy: it is written meanwhile
         put = self.put
         acked = self.acked.copy()

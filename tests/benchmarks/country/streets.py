@@ -1,7 +1,9 @@
-"""SUMO's traffic as lanes for our own plant: each vehicle has a lane of its own, with the speeds that it had there.
+"""SUMO's traffic as lanes for our own plant: each vehicle has a lane of its own, with the speeds
+that it had there.
 
-SUMO gives routes and speeds, no more: what the tyres do on the way is the plant's. A driver keeps SUMO's speed where he
-believes the road dry, and less where he does not; where SUMO has him wait, he creeps.
+SUMO gives routes and speeds, no more: what the tyres do on the way is the plant's. A driver keeps
+SUMO's speed where he believes the road dry, and less where he does not; where SUMO has him wait, he
+creeps.
 """
 
 from __future__ import annotations
@@ -97,7 +99,9 @@ def _drive(rows: pd.DataFrame) -> Drive | None:
 
 
 def town(found: list[Drive], seed: int) -> Streets:
-    """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and there on a way."""
+    """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and
+    there on a way.
+    """
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed

@@ -1,4 +1,6 @@
-"""`python -m tests.benchmarks.iov [--only denm|routes] [--out DIR] [--quick]`: figures of the interfaces."""
+"""`python -m tests.benchmarks.iov [--only denm|routes] [--out DIR] [--quick]`: figures of the
+interfaces.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""DENM of many events through an interchange: validity by a second decoder, identity over restarts, and rate."""
+"""DENM of many events through an interchange: validity by a second decoder, identity over
+restarts, and rate.
+"""
 
 from __future__ import annotations
 

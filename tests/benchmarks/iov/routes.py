@@ -1,7 +1,7 @@
 """Routes of Valhalla around ice in a street network, with the costs that `export valhalla` writes.
 
-The Python package of Valhalla needs Python 3.12. Its wheel also has Valhalla's own programs, which start
-without Python.
+The Python package of Valhalla needs Python 3.12. Its wheel also has Valhalla's own programs, which
+start without Python.
 """
 
 from __future__ import annotations

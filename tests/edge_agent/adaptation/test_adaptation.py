@@ -1,4 +1,6 @@
-"""The fuzzy adaptation grows R when innovations are too large, within bounds, by tables that refuse nonsense."""
+"""The fuzzy adaptation grows R when innovations are too large, within bounds, by tables that
+refuse nonsense.
+"""
 
 from __future__ import annotations
 

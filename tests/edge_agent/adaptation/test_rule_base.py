@@ -1,4 +1,6 @@
-"""The rules: memberships rise between foot and peak, and each rule does what its line in the table says."""
+"""The rules: memberships rise between foot and peak, and each rule does what its line in the
+table says.
+"""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,6 @@
-"""`edge-agent run --ahead` from the outside: warnings as JSON lines, the route heeded, the counts at the end."""
+"""`edge-agent run --ahead` from the outside: warnings as JSON lines, the route heeded, the
+counts at the end.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The horizon: metres to cells, unknown that stays unknown, fading, the cache, and the safe speed."""
+"""The horizon: metres to cells, unknown that stays unknown, fading, the cache, and the safe
+speed.
+"""
 
 from __future__ import annotations
 
@@ -222,7 +224,9 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
-    """It has heard only of what it asked for, and what lies behind that it must ask for before it comes there."""
+    """It has heard only of what it asked for, and what lies behind that it must ask for before
+    it comes there.
+    """
     road = keys_on(1500.0)
     cache = LocalMap()
     asked = RequestLog()

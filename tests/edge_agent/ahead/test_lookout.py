@@ -1,4 +1,6 @@
-"""Listening cars over real sessions: warned by alerts and by the map, through a lost router, by nobody's lies."""
+"""Listening cars over real sessions: warned by alerts and by the map, through a lost router, by
+nobody's lies.
+"""
 
 from __future__ import annotations
 
@@ -339,7 +341,9 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Answers for the map with one thing after the other that cannot be, and with a tile of no cells."""
+    """Answers for the map with one thing after the other that cannot be, and with a tile of no
+    cells.
+    """
 
     said = 0
 

@@ -1,4 +1,6 @@
-"""The map as a prior: expected at entry, gone again when it is wrong, and never in what is published."""
+"""The map as a prior: expected at entry, gone again when it is wrong, and never in what is
+published.
+"""
 
 from __future__ import annotations
 

@@ -53,7 +53,9 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
-    """Their vehicle files are pipes: a drive waits there until something is written, or the writer leaves."""
+    """Their vehicle files are pipes: a drive waits there until something is written, or the
+    writer leaves.
+    """
     tasks = [
         task._replace(vehicle=tmp_path / task.vehicle.name)
         for task in tasks_of(logs(drives), None, tmp_path)

@@ -1,4 +1,6 @@
-"""The pipeline and the live loop: visits closed at the end, real time kept or its loss counted, stopped when told."""
+"""The pipeline and the live loop: visits closed at the end, real time kept or its loss counted,
+stopped when told.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +124,9 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Hand-made: the first car brakes with ABS now and then, the second one's lamp always burns, the third has none."""
+    """Hand-made: the first car brakes with ABS now and then, the second one's lamp always burns,
+    the third has none.
+    """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):
         abs_active = np.full(block.t.shape, np.nan)
@@ -156,7 +160,10 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
         if "counts as unknown" in record.getMessage()
     ]
     assert told == [
-        "vehicle 1: abs_active has been on since the start: it counts as unknown; correct the profile"
+        (
+            "vehicle 1: abs_active has been on since the start: it counts as unknown; correct the "
+            "profile"
+        )
     ]
     for name in plain.taken[0].columns.keys() - {"abs_active", "air_temperature"}:
         one, other = (b.column(Kind.OBSERVATION, name) for b in (plain, basket))

@@ -1,4 +1,6 @@
-"""`make spark-test`: drives that are estimated on Spark give the bytes that this machine gives, whatever dies."""
+"""`make spark-test`: drives that are estimated on Spark give the bytes that this machine gives,
+whatever dies.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A live trip: nothing is published before the doctor has passed, and what a trip teaches holds in the next."""
+"""A live trip: nothing is published before the doctor has passed, and what a trip teaches holds
+in the next.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tuned files: they say where they come from, and a broken one is refused by the name of its field."""
+"""Tuned files: they say where they come from, and a broken one is refused by the name of its
+field.
+"""
 
 import json
 from collections.abc import Callable

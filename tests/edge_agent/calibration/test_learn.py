@@ -1,4 +1,6 @@
-"""Calibration: what was put into a simulated car's devices comes out of its drives, and mends them."""
+"""Calibration: what was put into a simulated car's devices comes out of its drives, and mends
+them.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +94,9 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
 
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
-    """On the same drives a file that does not say which axle drives is wrong about radii, and knows it."""
+    """On the same drives a file that does not say which axle drives is wrong about radii, and
+    knows it.
+    """
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
     assert drive.vehicle.drive_split_front == 0.0
     unsaid = drive.vehicle.model_copy(update={"drive_split_front": None})

@@ -19,7 +19,9 @@ OMEGA = slice(S.OMEGA, S.OMEGA + 4)
 def drive(
     name: str, mu: float | None, seed: int = 1, seconds: float | None = None
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """t (T,) [s], signals (T, 18), nominal vehicle of a manoeuvre with ordinary sensors; its own friction if None."""
+    """t (T,) [s], signals (T, 18), nominal vehicle of a manoeuvre with ordinary sensors; its own
+    friction if None.
+    """
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
     return (
         log["t"].to_numpy(),
@@ -41,7 +43,8 @@ def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, 
 
 
 def jointed() -> tuple[FloatArray, FloatArray, Vehicle]:
-    """A gentle pull over joints in a dry motorway, without torque: the wheels of an axle jump by 3 to 4 % for 50 ms.
+    """A gentle pull over joints in a dry motorway, without torque: the wheels of an axle jump by 3
+    to 4 % for 50 ms.
 
     As in the minute of tests/data/rav4.blf, at 1.7 and 38.4 s.
     """

@@ -1,4 +1,6 @@
-"""Promises of every estimator of the bank: causality, bit-equality, honesty without excitation, no NaN."""
+"""Promises of every estimator of the bank: causality, bit-equality, honesty without excitation,
+no NaN.
+"""
 
 from __future__ import annotations
 
@@ -265,7 +267,9 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
 
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
 def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
-    """Four wheels that slide a little would explain the slip as well, with a stiffness or an offset to match."""
+    """Four wheels that slide a little would explain the slip as well, with a stiffness or an
+    offset to match.
+    """
     for seed in range(6):
         t, signals, vehicle = drive(name, 0.9, seed)
         reported = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])

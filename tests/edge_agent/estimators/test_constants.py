@@ -1,4 +1,6 @@
-"""Every constant of the default's table moves what it is for, in the direction and by the size that its reason says."""
+"""Every constant of the default's table moves what it is for, in the direction and by the size
+that its reason says.
+"""
 
 from __future__ import annotations
 
@@ -224,7 +226,9 @@ def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 
 def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Drives that no plant makes: a stop on slipping wheels, a car that stands, side force that nothing turns."""
+    """Drives that no plant makes: a stop on slipping wheels, a car that stands, side force that
+    nothing turns.
+    """
     t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))
     if name == "stopping":

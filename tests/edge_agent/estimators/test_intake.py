@@ -1,4 +1,6 @@
-"""Samples made fit for the papers' filters: the grip used in the last second, and the steering's cosines."""
+"""Samples made fit for the papers' filters: the grip used in the last second, and the steering's
+cosines.
+"""
 
 from __future__ import annotations
 

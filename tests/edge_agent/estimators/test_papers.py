@@ -1,4 +1,6 @@
-"""The papers' estimators: the interface, causality, no NaN, and what each of them does on a short drive."""
+"""The papers' estimators: the interface, causality, no NaN, and what each of them does on a
+short drive.
+"""
 
 from __future__ import annotations
 

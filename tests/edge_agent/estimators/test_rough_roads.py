@@ -1,4 +1,6 @@
-"""Promises of the default estimator on roads and in cars that are not level, aligned or synchronous."""
+"""Promises of the default estimator on roads and in cars that are not level, aligned or
+synchronous.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The one way of the papers' filters through their samples: it is compiled once for all processes."""
+"""The one way of the papers' filters through their samples: it is compiled once for all
+processes.
+"""
 
 from __future__ import annotations
 

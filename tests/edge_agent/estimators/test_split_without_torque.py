@@ -1,4 +1,6 @@
-"""Roads with unlike sides in a car that records no wheel torque: the yaw balance tells which side is slippery."""
+"""Roads with unlike sides in a car that records no wheel torque: the yaw balance tells which
+side is slippery.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ SNOW = 0.3
 
 
 def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
-    """Return true v_x (T,) and the estimates of a stop on a split road without torque; mirrored: snow on the left."""
+    """Return true v_x (T,) and the estimates of a stop on a split road without torque; mirrored:
+    snow on the left.
+    """
     log, vehicle = simulate_manoeuvre("split-braking", seed=seed)
     signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
     signals[:, TORQUE] = np.nan

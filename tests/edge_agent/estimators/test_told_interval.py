@@ -45,7 +45,9 @@ def _tell(
 def told(
     weight: FloatArray, patch: float = 0.0, likeness: float = 0.0
 ) -> tuple[float, float, float]:
-    """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so like its file."""
+    """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so
+    like its file.
+    """
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
     return _tell(

@@ -1,4 +1,6 @@
-"""Strain tells a car that is as its file says from one that is not; contradiction is of the axles, and not of ice."""
+"""Strain tells a car that is as its file says from one that is not; contradiction is of the
+axles, and not of ice.
+"""
 
 from __future__ import annotations
 

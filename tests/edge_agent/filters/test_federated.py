@@ -69,7 +69,9 @@ def test_fusing_adds_information() -> None:
 
 
 def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filter() -> None:
-    """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the textbook filter."""
+    """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the
+    textbook filter.
+    """
     rng = np.random.default_rng(3)
     n = 3
     f = np.eye(n) + 0.1 * rng.normal(size=(n, n))

@@ -187,7 +187,9 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
 def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """One turn of the cubature filter with whole covariances, for the pendulum of the test below."""
+    """One turn of the cubature filter with whole covariances, for the pendulum of the test
+    below.
+    """
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)
     cov = (points - mean).T @ (points - mean) / len(points) + q

@@ -1,4 +1,6 @@
-"""Cholesky factors, and updates of a square root by one scalar after the other, against textbook and orthogonal."""
+"""Cholesky factors, and updates of a square root by one scalar after the other, against textbook
+and orthogonal.
+"""
 
 from __future__ import annotations
 

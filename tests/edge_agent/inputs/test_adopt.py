@@ -1,4 +1,6 @@
-"""Corrections that a replay takes from the signal doctor: late devices, a locked rear axle, radii of the axles."""
+"""Corrections that a replay takes from the signal doctor: late devices, a locked rear axle,
+radii of the axles.
+"""
 
 from __future__ import annotations
 

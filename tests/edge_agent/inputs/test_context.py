@@ -1,4 +1,6 @@
-"""Context signals: each kind of source fills them, old logs stay as they were, and what is too old is unknown."""
+"""Context signals: each kind of source fills them, old logs stay as they were, and what is too
+old is unknown.
+"""
 
 from __future__ import annotations
 
@@ -221,7 +223,9 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
-    """Context (T, 5) of live rows of a source that speaks at 50 Hz, and tells `values` each `every` messages."""
+    """Context (T, 5) of live rows of a source that speaks at 50 Hz, and tells `values` each
+    `every` messages.
+    """
     clock = Steered()
     feed = Scripted("bus", clock)
     told = iter(range(100_000))

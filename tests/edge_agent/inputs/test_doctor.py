@@ -1,4 +1,6 @@
-"""The signal doctor: planted mistakes are named, sound drives and the real minute pass, corrections correct."""
+"""The signal doctor: planted mistakes are named, sound drives and the real minute pass,
+corrections correct.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`edge-agent import`: one drive in every format is one log, clocks are merged, and foreign fingers break nothing."""
+"""`edge-agent import`: one drive in every format is one log, clocks are merged, and foreign
+fingers break nothing.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Live sources: what they send comes in, on one clock; what they lose is told, and nothing falls over."""
+"""Live sources: what they send comes in, on one clock; what they lose is told, and nothing falls
+over.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Live rows: one clock for all sources, linear between readings, late fixes moved, lost sources opened anew."""
+"""Live rows: one clock for all sources, linear between readings, late fixes moved, lost sources
+opened anew.
+"""
 
 from __future__ import annotations
 

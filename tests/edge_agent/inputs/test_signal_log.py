@@ -1,4 +1,6 @@
-"""Reading a signal log: what is needed, what may be missing, and one line that names what is wrong."""
+"""Reading a signal log: what is needed, what may be missing, and one line that names what is
+wrong.
+"""
 
 from __future__ import annotations
 

@@ -68,7 +68,9 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
 
 
 def test_an_observation_tells_its_visit() -> None:
-    """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the second visit."""
+    """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the
+    second visit.
+    """
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
@@ -154,7 +156,9 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_before() -> None:
-    """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of the ice."""
+    """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of
+    the ice.
+    """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
@@ -174,7 +178,9 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
 
 
 def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and feels `observed` (T,) g."""
+    """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and
+    feels `observed` (T,) g.
+    """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
     reported = estimates(len(east), 1, used=0.9)
@@ -189,7 +195,9 @@ def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
 
 
 def test_grip_that_was_felt_at_the_border_of_a_cell_may_be_of_the_cell_beside() -> None:
-    """Braking at the border, as far as a fix may be wrong, is told of neither cell; further inside of its own."""
+    """Braking at the border, as far as a fix may be wrong, is told of neither cell; further
+    inside of its own.
+    """
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
@@ -217,8 +225,8 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_of_the_lesser(
     cut: int | None,
 ) -> None:
-    """From ice to dry road within the second visit: it was one or the other, and no more than the ice is told as used,
-    though the brakes took .7 before the change was seen."""
+    """From ice to dry road within the second visit: it was one or the other, and no more than the
+    ice is told as used, though the brakes took .7 before the change was seen."""
     samples = 40
     east = np.arange(samples)[:, None] * 0.5
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
@@ -267,7 +275,9 @@ def test_without_position_there_is_no_state() -> None:
 
 
 def test_an_observation_tells_what_controllers_and_surroundings_said_in_its_visit() -> None:
-    """East through cells at 10 m/s; the first visit has an intervention, the second hardly any reading."""
+    """East through cells at 10 m/s; the first visit has an intervention, the second hardly any
+    reading.
+    """
     samples = 40
     east = np.arange(samples)[:, None] * 1.0
     block = ground(east, np.zeros_like(east), np.zeros_like(east))

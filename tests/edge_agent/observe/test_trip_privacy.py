@@ -1,4 +1,6 @@
-"""Trip ends: nothing is told of where a trip began and ended, and everything of what lies between."""
+"""Trip ends: nothing is told of where a trip began and ended, and everything of what lies
+between.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The outbox: named densely, on disk first, settled by ranges, resent with patience, bounded, one agent only."""
+"""The outbox: named densely, on disk first, settled by ranges, resent with patience, bounded,
+one agent only.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The publisher on real sessions: everything arrives under its own name, once it can, and is settled by answers."""
+"""The publisher on real sessions: everything arrives under its own name, once it can, and is
+settled by answers.
+"""
 
 from __future__ import annotations
 

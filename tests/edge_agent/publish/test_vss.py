@@ -1,4 +1,6 @@
-"""The friction here as VSS signals: percent, clipped, absent where unknown; over a real session and by the command."""
+"""The friction here as VSS signals: percent, clipped, absent where unknown; over a real session
+and by the command.
+"""
 
 from __future__ import annotations
 

@@ -60,7 +60,9 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
 
 
 def roads_along(cells: IntArray) -> pa.Table:
-    """Links of forty cells along every row of cells, and one where nobody was, as `fleet-service roads` writes them."""
+    """Links of forty cells along every row of cells, and one where nobody was, as `fleet-service
+    roads` writes them.
+    """
     x, y = grid.deinterleave(cells)
     found = []
     for line in np.unique(y):

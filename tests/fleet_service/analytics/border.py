@@ -1,4 +1,6 @@
-"""An archive whose roads cross the border of two zones, with a third zone far away; for rebuilding by zone."""
+"""An archive whose roads cross the border of two zones, with a third zone far away; for
+rebuilding by zone.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ def rebuilt_map(out: Path) -> pa.Table:
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
-    """The largest difference of a number of two maps; infinite where their cells, or what is null, are not the same."""
+    """The largest difference of a number of two maps; infinite where their cells, or what is
+    null, are not the same.
+    """
     if not all(
         ours[name].equals(theirs[name])
         for name in ("cell", "sector", "basis", "first_time", "last_time")

@@ -1,4 +1,6 @@
-"""Rates of change: the fit finds those of a known process, its interval holds, pairs are counted right."""
+"""Rates of change: the fit finds those of a known process, its interval holds, pairs are counted
+right.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,9 @@ def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.Da
 
 
 def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
-    """The synthetic roads freeze at four and thaw at eight: below freezing, not in the afternoon."""
+    """The synthetic roads freeze at four and thaw at eight: below freezing, not in the
+    afternoon.
+    """
     for options in ({}, {"stations": stations}):
         found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])
         assert found.loc[("hour of the day (UTC)", "06-12"), "unlike"] > 5

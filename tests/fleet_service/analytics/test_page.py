@@ -1,4 +1,6 @@
-"""The pages as a person meets them: opened in a real browser, pointed at, touched and walked by keyboard."""
+"""The pages as a person meets them: opened in a real browser, pointed at, touched and walked by
+keyboard.
+"""
 
 from __future__ import annotations
 

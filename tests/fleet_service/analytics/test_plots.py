@@ -1,4 +1,6 @@
-"""Pictures of answers say what a reader acts on: roads, days, moments, names, and the line that was promised."""
+"""Pictures of answers say what a reader acts on: roads, days, moments, names, and the line that
+was promised.
+"""
 
 from __future__ import annotations
 

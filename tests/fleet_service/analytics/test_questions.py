@@ -1,4 +1,6 @@
-"""Each question against an oracle in pandas or plain Python, and against what was planted in the synthetic archive."""
+"""Each question against an oracle in pandas or plain Python, and against what was planted in the
+synthetic archive.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""An archive rebuilt zone by zone is what a replay of everything gives, and its roll-ups are those that it has."""
+"""An archive rebuilt zone by zone is what a replay of everything gives, and its roll-ups are
+those that it has.
+"""
 
 from __future__ import annotations
 

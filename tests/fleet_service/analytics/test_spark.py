@@ -1,4 +1,6 @@
-"""`make spark-test`: Spark reads the archive, and answers every question as DuckDB does. Takes a Java and a minute."""
+"""`make spark-test`: Spark reads the archive, and answers every question as DuckDB does. Takes a
+Java and a minute.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`make spark-test`: what is rebuilt on Spark is, byte for byte, what is rebuilt here, whatever dies on the way."""
+"""`make spark-test`: what is rebuilt on Spark is, byte for byte, what is rebuilt here, whatever
+dies on the way.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""An alert that stands is told again: who was away, or behind a router that was restarted, hears it."""
+"""An alert that stands is told again: who was away, or behind a router that was restarted, hears
+it.
+"""
 
 from __future__ import annotations
 

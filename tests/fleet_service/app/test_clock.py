@@ -1,4 +1,6 @@
-"""Jumps of the system's clock: honest vehicles are not refused for them, before and after a restart."""
+"""Jumps of the system's clock: honest vehicles are not refused for them, before and after a
+restart.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Acknowledged means two places: a disk that is lost, a bucket that is away, and a service killed between the two."""
+"""Acknowledged means two places: a disk that is lost, a bucket that is away, and a service
+killed between the two.
+"""
 
 from __future__ import annotations
 
@@ -166,7 +168,9 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
 def service(
     router: ZenohSettings, folder: Path, bucket: BucketServer
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """A service process with a copy that is ready, and its health's address; it is gone after the block."""
+    """A service process with a copy that is ready, and its health's address; it is gone after
+    the block.
+    """
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
     told = {

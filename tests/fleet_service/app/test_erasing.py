@@ -1,4 +1,6 @@
-"""A vehicle is erased beside a service that runs, and drives on: nothing of it is left, nothing of others is lost."""
+"""A vehicle is erased beside a service that runs, and drives on: nothing of it is left, nothing
+of others is lost.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The past is rebuilt in a process of its own, from as many rows as are asked for, or not at all."""
+"""The past is rebuilt in a process of its own, from as many rows as are asked for, or not at
+all.
+"""
 
 from __future__ import annotations
 

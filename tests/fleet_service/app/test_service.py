@@ -225,7 +225,9 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Moments a second apart, as vehicles that follow each other come by; the last is not yet in the future."""
+    """Moments a second apart, as vehicles that follow each other come by; the last is not yet in
+    the future.
+    """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 
 

@@ -1,13 +1,14 @@
-"""An archive to keep: every kind of file that a service writes, small, and the map that it stood for when it was made.
+"""An archive to keep: every kind of file that a service writes, small, and the map that it stood
+for when it was made.
 
     python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of today
 
-`data/v1.0` was made so by commit 1f90692, before any file had a version. What is kept is never made again: it is what
-later code must go on reading.
+`data/v1.0` was made so by commit 1f90692, before any file had a version. What is kept is never made
+again: it is what later code must go on reading.
 
-Eight vehicles in two zones, around a midnight: compacted rows with their roll-ups and a snapshot, a checkpoint, and
-segments that came after it; dry road and ice, rows with a value, with a bound only, and too late ones; one weather
-report; states.
+Eight vehicles in two zones, around a midnight: compacted rows with their roll-ups and a snapshot, a
+checkpoint, and segments that came after it; dry road and ice, rows with a value, with a bound only,
+and too late ones; one weather report; states.
 """
 
 from __future__ import annotations
@@ -62,7 +63,9 @@ def now_of(turn: int) -> int:
 
 
 def observed(turn: int, vehicle: int) -> Batch:
-    """Return the reports of a vehicle in a round: ice in every second cell, bounds from every third vehicle."""
+    """Return the reports of a vehicle in a round: ice in every second cell, bounds from every
+    third vehicle.
+    """
     rng = np.random.default_rng([turn, vehicle])
     latitude, longitude = PLACES[vehicle % 2]
     step = int(rng.integers(0, 4))
@@ -132,7 +135,9 @@ def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
 
 
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
-    """The map at a time: every cell's line as the contract has it, and its belief; by cell and sector."""
+    """The map at a time: every cell's line as the contract has it, and its belief; by cell and
+    sector.
+    """
     fusion = engine.state.fusion
     slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
     lines = cell_table(fusion, slots, at).select(COLUMNS).to_pylist()

@@ -1,6 +1,8 @@
-"""The tools that people read an archive with, each as a function: rows, mean of mu, rows with a likelihood, zones.
+"""The tools that people read an archive with, each as a function: rows, mean of mu, rows with a
+likelihood, zones.
 
-A reader that is not installed is left out. Spark has a test of its own, for it takes a Java and twenty seconds.
+A reader that is not installed is left out. Spark has a test of its own, for it takes a Java and
+twenty seconds.
 """
 
 from __future__ import annotations

@@ -18,7 +18,9 @@ PLACES = ((57.7, 11.97), (48.1, 11.6))  # in two zones
 
 
 def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
-    """Rows over twenty minutes around a midnight, in cells of two zones; (vehicle, seq, row) is unique per seed."""
+    """Rows over twenty minutes around a midnight, in cells of two zones; (vehicle, seq, row) is
+    unique per seed.
+    """
     rng = np.random.default_rng(seed)
     place = np.array(PLACES)[rng.integers(0, 2, count)] + rng.normal(0.0, 1e-4, (count, 2))
     rows: Rows = {}

@@ -193,7 +193,10 @@ def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
     engine.settlement.flush()
     pattern = str(tmp_path / "inbox" / "*.parquet")
     with duckdb.connect() as db:
-        query = "select count(*), count(distinct vehicle), count(log_likelihood), min(mu) from read_parquet(?)"
+        query = (
+            "select count(*), count(distinct vehicle), count(log_likelihood), min(mu) from "
+            "read_parquet(?)"
+        )
         assert db.execute(query, [pattern]).fetchone() == (4, 2, 2, pytest.approx(0.7, abs=1e-3))
     (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
     assert list(pd.read_parquet(path).columns) == tables.OBSERVATION_ARCHIVE.names

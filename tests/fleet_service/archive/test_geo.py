@@ -38,7 +38,9 @@ def a_map(cells: int = 300) -> pa.Table:
 
 
 def failures(path: Path) -> list[str]:
-    """Identities of the abstract tests that a file fails; those that must apply are seen to apply."""
+    """Identities of the abstract tests that a file fails; those that must apply are seen to
+    apply.
+    """
     report = geoparquet_validator.check(str(path))
     passed = [outcome["id"] for outcome in report["outcomes"] if outcome["status"] == "pass"]
     assert len([name for name in passed if "/core/" in name]) > 8

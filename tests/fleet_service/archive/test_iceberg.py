@@ -1,4 +1,6 @@
-"""Iceberg tables over the archive: every compacted row once, as pyiceberg and DuckDB see it, whatever goes."""
+"""Iceberg tables over the archive: every compacted row once, as pyiceberg and DuckDB see it,
+whatever goes.
+"""
 
 from __future__ import annotations
 

@@ -170,7 +170,9 @@ def rows_kept(root: Path) -> int:
 
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
+    """Nobody can tell any more that a batch was there before; a spool may hold it, for its
+    acknowledgement was lost.
+    """
     old = batch("car-001", 1, NOON, [0.8])
     away = batch("car-002", 1, NOON - DAY, [0.8])
     after = NOON + 3 * DAY

@@ -1,4 +1,6 @@
-"""Versions of files: what is kept stays readable, other versions are no damage, and who only reads changes nothing."""
+"""Versions of files: what is kept stays readable, other versions are no damage, and who only
+reads changes nothing.
+"""
 
 from __future__ import annotations
 
@@ -51,9 +53,11 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """The map is the one that is kept beside, to what single precision and another machine's logarithm leave.
+    """The map is the one that is kept beside, to what single precision and another machine's
+    logarithm leave.
 
-    Its beliefs are what this fusion makes of the archive: one that thinks otherwise writes them anew, and says why."""
+    Its beliefs are what this fusion makes of the archive: one that thinks otherwise writes them
+    anew, and says why."""
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
     for now, line in zip(found["cells"], made["cells"], strict=True):

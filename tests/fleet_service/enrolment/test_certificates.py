@@ -133,7 +133,8 @@ def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> N
         at(folder).enrol(enrolment())
 
 
-# A name with a wrong letter near its end: a pattern that can read the letters before in many ways tries them all.
+# A name with a wrong letter near its end: a pattern that can read the letters before in many ways
+# tries them all.
 LONG = "a" * 62 + "_b"
 
 

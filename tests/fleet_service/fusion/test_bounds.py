@@ -1,4 +1,6 @@
-"""The lower end exceeds what somebody used by no more than its own error, by whatever path and however many."""
+"""The lower end exceeds what somebody used by no more than its own error, by whatever path and
+however many.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,9 @@ def east(steps: int, north: int = 0) -> int:
 
 
 def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
-    """A fusion after the visits (n, 32) to cells so many steps east of CELL, each by vehicles of its own."""
+    """A fusion after the visits (n, 32) to cells so many steps east of CELL, each by vehicles of
+    its own.
+    """
     fusion = Fusion(120.0)
     for steps, said in found.items():
         tell(fusion, east(steps), said, sector)

@@ -1,4 +1,6 @@
-"""Order and replay: within the lateness window no order of arrival matters, and a replay gives the same map."""
+"""Order and replay: within the lateness window no order of arrival matters, and a replay gives
+the same map.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What vehicles of one place have in common: no number of them averages it out, other manoeuvres do."""
+"""What vehicles of one place have in common: no number of them averages it out, other manoeuvres
+do.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,9 @@ VEHICLES = 30
 
 
 def acquainted(slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False) -> Fusion:
-    """A fleet with gain errors after forty minutes in ten cells; a value is too low by `slope` for each μ left."""
+    """A fleet with gain errors after forty minutes in ten cells; a value is too low by `slope`
+    for each μ left.
+    """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
     gain = gain_std * rng.normal(size=VEHICLES)
@@ -55,7 +57,9 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """Between vehicles such errors look like a slope of cov(value, use)/var(use) ≥ .3; within one they cancel."""
+    """Between vehicles such errors look like a slope of cov(value, use)/var(use) ≥ .3; within
+    one they cancel.
+    """
     assert learned(acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
@@ -87,7 +91,9 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """A service that knows nobody doubts a gentle value more before an alarm; one that knows its fleet hardly."""
+    """A service that knows nobody doubts a gentle value more before an alarm; one that knows its
+    fleet hardly.
+    """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
     fusion = acquainted(0.0)
@@ -124,7 +130,9 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Count the sources of ice after one vehicle's value of `mu`, with a likelihood of `tail` on dry road."""
+    """Count the sources of ice after one vehicle's value of `mu`, with a likelihood of `tail` on
+    dry road.
+    """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))
     o = observations([0.0], [1], tailed)

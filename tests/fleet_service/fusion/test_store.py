@@ -1,4 +1,6 @@
-"""Room for the fusion: tables of any length find what was put in, and what nobody asks for any more is given back."""
+"""Room for the fusion: tables of any length find what was put in, and what nobody asks for any
+more is given back.
+"""
 
 from __future__ import annotations
 

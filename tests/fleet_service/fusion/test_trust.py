@@ -16,7 +16,9 @@ LIARS = np.arange(100, 108)
 
 
 def driven(private: int = 0) -> Fusion:
-    """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in `private` others."""
+    """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in
+    `private` others.
+    """
     rng = np.random.default_rng(4)
     fusion = Fusion(120.0)
     for minute in range(30):

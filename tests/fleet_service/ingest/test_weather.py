@@ -1,4 +1,6 @@
-"""Weather in: from a file and over Zenoh, refused with a reason, archived, and the same after a restart."""
+"""Weather in: from a file and over Zenoh, refused with a reason, archived, and the same after a
+restart.
+"""
 
 from __future__ import annotations
 

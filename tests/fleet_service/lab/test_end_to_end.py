@@ -1,4 +1,6 @@
-"""End-to-end drives: what the vehicles write is what the campaign reads and sets beside the truth."""
+"""End-to-end drives: what the vehicles write is what the campaign reads and sets beside the
+truth.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A dry road does not stay dry: the longer ago, and the nearer to freezing, the less is vouched for."""
+"""A dry road does not stay dry: the longer ago, and the nearer to freezing, the less is vouched
+for.
+"""
 
 from __future__ import annotations
 

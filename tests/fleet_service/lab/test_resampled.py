@@ -19,7 +19,9 @@ MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
-    """Excited and gentle visits in turn, of vehicles that read `low` times the road, (vehicles,)."""
+    """Excited and gentle visits in turn, of vehicles that read `low` times the road,
+    (vehicles,).
+    """
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]
     reports = SimulatedReports(

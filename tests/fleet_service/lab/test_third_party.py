@@ -1,4 +1,6 @@
-"""A fleet that is not ours: its error model is as stated, and its figures are true of what a map says."""
+"""A fleet that is not ours: its error model is as stated, and its figures are true of what a map
+says.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A crossing of two streets that six cars drove: dry, snow, ice, and a part that was only passed."""
+"""A crossing of two streets that six cars drove: dry, snow, ice, and a part that was only
+passed.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ MIDDLE: Final = tuple(int(v) for v in grid.deinterleave(CELL))
 
 
 class Part(NamedTuple):
-    """Cells of a street, the headings they are driven in, and what is found there; None: they are only passed."""
+    """Cells of a street, the headings they are driven in, and what is found there; None: they
+    are only passed.
+    """
 
     dx: range
     dy: range
@@ -57,7 +61,9 @@ def put(
     first_seq: int = 1,
     cars: Sequence[str] = CARS,
 ) -> int:
-    """Let cars drive over parts, there and back, the last visit `now` [ns], and report; returns the next free seq."""
+    """Let cars drive over parts, there and back, the last visit `now` [ns], and report; returns
+    the next free seq.
+    """
     place, heading, mu = _drive([PARTS[name] for name in parts])
     time = now - (len(place) - 1 - np.arange(len(place))) * VISIT_NS
     for car in cars:

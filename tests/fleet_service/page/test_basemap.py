@@ -1,4 +1,6 @@
-"""Tiles below the cells from a file of the operator's own: what is read, what is refused, what a person sees."""
+"""Tiles below the cells from a file of the operator's own: what is read, what is refused, what a
+person sees.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,9 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
-    """Further in than the file goes its deepest tiles are drawn larger; far out none is asked for."""
+    """Further in than the file goes its deepest tiles are drawn larger; far out none is asked
+    for.
+    """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,
         opened(address) as seen,
@@ -115,7 +119,8 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(
         seen.page.wait_for_selector(READY, state="attached")
         go = "([x, y, zoom]) => gripmap.view.go(gripmap.view.x = x, gripmap.view.y = y, zoom)"
         x, y = seen.page.evaluate(
-            "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / Math.PI) / 2]",
+            "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / "
+            "Math.PI) / 2]",
             AT,
         )
         for zoom in (12.0, 18.0):

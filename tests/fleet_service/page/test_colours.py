@@ -44,7 +44,9 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_lightness_is_the_order_of_danger(sight: str) -> None:
-    """On light ground the most dangerous is the darkest, on dark ground the lightest; grey paper shows the same."""
+    """On light ground the most dangerous is the darkest, on dark ground the lightest; grey paper
+    shows the same.
+    """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
         light = [sign * float(lab(colour, sight)[0]) for colour in ladder]
         assert min(b - a for a, b in pairwise(light)) >= STEP

@@ -22,7 +22,8 @@ from tests.fleet_service.page.test_server import ask
 from tests.waiting import until
 
 ITEMS = "/collections/grip/items"
-# In a process of their own: GDAL keeps the interpreter while it waits for the page, which is in this one.
+# In a process of their own: GDAL keeps the interpreter while it waits for the page, which is in
+# this one.
 READERS = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
     "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",

@@ -155,7 +155,8 @@ def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive)
             near(seen, cell_of("ice"), zoom)
             waits(
                 seen,
-                f"document.body.dataset.level === '{level}' && document.body.dataset.kinds.split(',')[0] > 0",
+                f"document.body.dataset.level === '{level}' && "
+                "document.body.dataset.kinds.split(',')[0] > 0",
             )
             waits(
                 seen, f"[...gripmap.now.tiles.values()].every(tile => tile.block.level === {level})"
@@ -175,7 +176,8 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
             triples,
         )
         hollow = seen.page.evaluate(
-            "async () => { const { kindOf } = await import('/static/colours.js'); return kindOf(0, 160, 150, 170) }"
+            "async () => { const { kindOf } = await import('/static/colours.js'); return kindOf(0, "
+            "160, 150, 170) }"
         )
     names = [*palette.FOUR, *palette.TWO, palette.LITTLE]
     assert [names[k] for k in there] == [
@@ -366,7 +368,8 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     with shown(page, link.removeprefix(page.address)) as again:
         waits(again, "gripmap.chosen")
         state: dict[str, Any] = again.page.evaluate(
-            "({ x: gripmap.view.x, zoom: gripmap.view.zoom, tab: gripmap.tab, bounds: gripmap.show.bounds,"
+            "({ x: gripmap.view.x, zoom: gripmap.view.zoom, tab: gripmap.tab, bounds: "
+            "gripmap.show.bounds,"
             " cell: gripmap.chosen.tile * 16384 + gripmap.chosen.local })"
         )
         assert state["cell"] == cell_of("ice")

@@ -1,4 +1,6 @@
-"""The page as it is used beside the desk: a night played, a sound, on paper, on a wall, a dropped route, read aloud."""
+"""The page as it is used beside the desk: a night played, a sound, on paper, on a wall, a
+dropped route, read aloud.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,10 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
         near(seen, cell_of("ice"))
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         seen.page.evaluate(
-            "() => { globalThis.played = []; new MutationObserver(() => played.push([document.body.dataset.at, "
-            "document.body.dataset.kinds])).observe(document.body, { attributeFilter: ['data-at'] }) }"
+            "() => { globalThis.played = []; new MutationObserver(() => "
+            "played.push([document.body.dataset.at, "
+            "document.body.dataset.kinds])).observe(document.body, { attributeFilter: ['data-at'] "
+            "}) }"
         )
         assert page.service is not None
         page.service.end()  # no further moment comes while it is played
@@ -140,7 +144,8 @@ def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         waits(seen, f"document.getElementById('map').width > {WALL['width'] // 2}")
         size = seen.page.evaluate(
-            "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, gripmap.view.width,"
+            "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, "
+            "gripmap.view.width,"
             " gripmap.view.height, parseFloat(getComputedStyle(document.body).fontSize)]"
         )
         assert size[0] <= WALL["width"]

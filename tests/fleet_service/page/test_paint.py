@@ -1,4 +1,6 @@
-"""Painted points: the unknown share, seams, guesses, a route, the world before any service answered."""
+"""Painted points: the unknown share, seams, guesses, a route, the world before any service
+answered.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from tests.fleet_service.page.test_page import (
 )
 
 PLACES: Final = 12
-# Squares of known ground in a row, of two tiles; says how many points of each colour there are in the row's middle.
+# Squares of known ground in a row, of two tiles; says how many points of each colour there are in
+# the row's middle.
 _ROW: Final = """async ([side, first, unknown]) => {
   const { Pixels } = await import("/static/pixels.js");
   const { setColours, kindOf } = await import("/static/colours.js");
@@ -84,9 +87,11 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
             "[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)"
         )
         seen.page.evaluate(
-            "() => { globalThis.dashed = []; const real = CanvasRenderingContext2D.prototype.stroke;"
+            "() => { globalThis.dashed = []; const real = "
+            "CanvasRenderingContext2D.prototype.stroke;"
             " CanvasRenderingContext2D.prototype.stroke = function () {"
-            " if (this.getLineDash().length) dashed.push(this.lineWidth); return real.apply(this, arguments); } }"
+            " if (this.getLineDash().length) dashed.push(this.lineWidth); return real.apply(this, "
+            "arguments); } }"
         )
         seen.page.locator("#tab-legend").click()
         seen.page.locator("#show-borrowed").click()
@@ -107,11 +112,13 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
             near(seen, cell_of("ice", 2), zoom)
             waits(
                 seen,
-                f"document.body.dataset.alerts === '1' && gripmap.view.zoom === {zoom} && !gripmap.frame",
+                f"document.body.dataset.alerts === '1' && gripmap.view.zoom === {zoom} && "
+                "!gripmap.frame",
             )
             before = seen.page.evaluate(_POINTS, ice)
             seen.page.evaluate(
-                "async ends => { await gripmap.setRoute(ends); gripmap.alerts = []; gripmap.drawNow() }",
+                "async ends => { await gripmap.setRoute(ends); gripmap.alerts = []; "
+                "gripmap.drawNow() }",
                 ends,
             )
             dots = 2 * 100  # at its ends

@@ -1,4 +1,6 @@
-"""The page's server: what it refuses, what it says on connect, how many watch, who is told to reload."""
+"""The page's server: what it refuses, what it says on connect, how many watch, who is told to
+reload.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The page's own files, as text: words in one table, modules that are short, sent as one, from nowhere else."""
+"""The page's own files, as text: words in one table, modules that are short, sent as one, from
+nowhere else.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
 
 
 def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
-    """Imports become what a module gave; a name that two modules have for themselves is two things."""
+    """Imports become what a module gave; a name that two modules have for themselves is two
+    things.
+    """
     modules = {
         "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',
         "a": "const own = 1;\nexport const ONE = own;\nexport function add(x, y) { return x + y; }\n"
@@ -48,9 +52,11 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
         "b": 'import { ONE } from "./a.js";\nconst own = 41;\nexport const two = () => own + ONE;\n',
     }
     assert bundle_modules(modules, "main") == (
-        "const from_a = (() => {\nconst own = 1;\nconst ONE = own;\nfunction add(x, y) { return x + y; }\n"
+        "const from_a = (() => {\nconst own = 1;\nconst ONE = own;\nfunction add(x, y) { return x "
+        "+ y; }\n"
         "class Not {}\nreturn { ONE, add };\n})();\n"
-        "const from_b = (() => {\nconst { ONE } = from_a;\nconst own = 41;\nconst two = () => own + ONE;\n"
+        "const from_b = (() => {\nconst { ONE } = from_a;\nconst own = 41;\nconst two = () => own "
+        "+ ONE;\n"
         "return { two };\n})();\n"
         "const { add: sum, ONE } = from_a;\nconst { two } = from_b;\nsay(sum(two(), ONE));\n"
     )

@@ -1,4 +1,6 @@
-"""Vector tiles: numbers of PMTiles as its own library has them, a file read back, and tiles that the page can draw."""
+"""Vector tiles: numbers of PMTiles as its own library has them, a file read back, and tiles that
+the page can draw.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_tile_is_the_bytes_of_the_specification() -> None:
-    """The example of section 4.3.5 of the specification: a point at (25, 17), a line and a polygon."""
+    """The example of section 4.3.5 of the specification: a point at (25, 17), a line and a
+    polygon.
+    """
     point = encode_tile({"p": [TileShape(POINT, [[(25, 17)]], {})]})
     assert bytes([9, 50, 34]) in point
     line = encode_tile({"l": [TileShape(LINE, [[(2, 2), (2, 10), (10, 10)]], {})]})

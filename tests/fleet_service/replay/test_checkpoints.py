@@ -1,4 +1,6 @@
-"""Checkpoints: a restart from one is a restart from the whole log, and costs only what came since."""
+"""Checkpoints: a restart from one is a restart from the whole log, and costs only what came
+since.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A service that is gone, frozen or cut off is followed by another; what it acknowledged is there, once."""
+"""A service that is gone, frozen or cut off is followed by another; what it acknowledged is
+there, once.
+"""
 
 from __future__ import annotations
 
@@ -203,7 +205,8 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     assert not acknowledges(one)
     before = rows_in(two.root, Kind.OBSERVATION)
     assert len(before) == 15
-    # It wakes amid of everything: a segment, a compaction that is put, the deletes of what was compacted.
+    # It wakes amid of everything: a segment, a compaction that is put, the deletes of what was
+    # compacted.
     one.write(3)
     assert not acknowledges(one)
     compact(one.root)

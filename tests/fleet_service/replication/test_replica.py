@@ -1,4 +1,6 @@
-"""The second place: what is settled is there, what goes here goes there, and an empty disk has it all again."""
+"""The second place: what is settled is there, what goes here goes there, and an empty disk has
+it all again.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,9 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """A cell that these vehicles called icy, one after the other; and whether each of them raised an alert."""
+    """A cell that these vehicles called icy, one after the other; and whether each of them
+    raised an alert.
+    """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
     raised = []
@@ -113,7 +115,9 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
 def called(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
-    """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it was under an alert."""
+    """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it
+    was under an alert.
+    """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
     under = []

@@ -1,4 +1,6 @@
-"""Two vehicles alone raise alerts on idle roads only in a few places; traffic and a third vehicle lift the limit."""
+"""Two vehicles alone raise alerts on idle roads only in a few places; traffic and a third
+vehicle lift the limit.
+"""
 
 from __future__ import annotations
 

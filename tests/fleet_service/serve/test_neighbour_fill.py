@@ -19,8 +19,8 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """Return the beliefs that thirty cells in a row borrow, in all tiles, when three vehicles gave a value of some of
-    them."""
+    """Return the beliefs that thirty cells in a row borrow, in all tiles, when three vehicles gave
+    a value of some of them."""
     fusion = Fusion(120.0)
     for place, mu in visited.items():
         o = observations(

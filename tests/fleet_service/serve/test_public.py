@@ -140,7 +140,9 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """The vehicles that make a cell public are those of the last hours, in answers, routes, snapshots and tiles."""
+    """The vehicles that make a cell public are those of the last hours, in answers, routes,
+    snapshots and tiles.
+    """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
     names = [f"sim-{k:03}" for k in range(6)]

@@ -108,7 +108,9 @@ def nothing(
 def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
-    """The heavy answer does not end before the light one has come; many tiles of a cell each are heavy too."""
+    """The heavy answer does not end before the light one has come; many tiles of a cell each are
+    heavy too.
+    """
     key = keys.map_key(TILE)
     counts = Counter[str]()
     light_came = threading.Event()

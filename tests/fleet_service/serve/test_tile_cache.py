@@ -1,4 +1,6 @@
-"""A tile is shown again while it is good: a second at the most, and never without what was acknowledged or alerted."""
+"""A tile is shown again while it is good: a second at the most, and never without what was
+acknowledged or alerted.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Rounds of tiles: on a grid, each tile in turn, and never more of a turn of the worker than its share."""
+"""Rounds of tiles: on a grid, each tile in turn, and never more of a turn of the worker than its
+share.
+"""
 
 from __future__ import annotations
 

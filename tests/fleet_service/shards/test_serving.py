@@ -1,4 +1,6 @@
-"""A region is served or it is not, and everyone knows: three services side by side, one of which goes."""
+"""A region is served or it is not, and everyone knows: three services side by side, one of which
+goes.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import SECOND, batch, send
 from tests.waiting import until
 
-# Three regions side by side, and a street that begins in the east, so that no order of tiles is its own.
+# Three regions side by side, and a street that begins in the east, so that no order of tiles is its
+# own.
 MIDDLE = int(grid.region_of(int(grid.cell_of(57.7, 11.97))))
 COLUMN, ROW = (int(one) for one in grid.deinterleave(MIDDLE))
 REGIONS = grid.interleave(np.array([COLUMN - 1, COLUMN, COLUMN + 1]), np.array([ROW] * 3)).tolist()

@@ -1,4 +1,6 @@
-"""The compiled reader beside the protobuf module: what it understands it reads as the module does, to the last bit."""
+"""The compiled reader beside the protobuf module: what it understands it reads as the module
+does, to the last bit.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobu
 
 
 def agrees(kind: Kind, payload: bytes) -> bool:
-    """Return True if the scanner understands the bytes; fail if it then reads something else than the library."""
+    """Return True if the scanner understands the bytes; fail if it then reads something else
+    than the library.
+    """
     data = np.frombuffer(payload, np.uint8)
     found = walk(kind, data, np.array([len(payload)]))
     if not found.understood[0]:

@@ -1,4 +1,6 @@
-"""A file is there whole or as it was; permissions from its first byte on; folders that power loss does not forget."""
+"""A file is there whole or as it was; permissions from its first byte on; folders that power
+loss does not forget.
+"""
 
 from __future__ import annotations
 

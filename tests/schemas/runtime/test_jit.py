@@ -64,7 +64,9 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("place", ["/proc/nowhere", ""])
 def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, place: str) -> None:
-    """A service account without a home, a read-only container: no traceback, and nothing left in places of others."""
+    """A service account without a home, a read-only container: no traceback, and nothing left in
+    places of others.
+    """
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()
     (tmp_path / "kernels" / "outer.py").write_text(CALLER)

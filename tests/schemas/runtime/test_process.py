@@ -67,7 +67,8 @@ def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
 
 def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
     words = (
-        "import sys; from schemas.runtime.process import trim_memory, limit_memory; limit_memory('scipy')\n"
+        "import sys; from schemas.runtime.process import trim_memory, limit_memory; "
+        "limit_memory('scipy')\n"
         "import numpy as np; from fleet_service.fusion.normal import distribution\n"
         "assert abs(distribution(np.array([1.0]))[0] - 0.8413447) < 1e-6\n"
         "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); trim_memory()"

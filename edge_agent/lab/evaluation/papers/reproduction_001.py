@@ -111,7 +111,8 @@ NOTES: Final = (
     ),
     "The gap in v_y and β is not reproduced.",
     (
-        "Friction is set by hand in the paper and here. On realistic drives it is set to .85, which is the truth there."
+        "Friction is set by hand in the paper and here. On realistic drives it is set to .85, "
+        "which is the truth there."
     ),
     "β is printed in degrees; that of the printed v_y is in radians.",
 )

@@ -1,4 +1,6 @@
-"""The detection judge: definitions on made-up drives, and one small town through the whole pipeline."""
+"""The detection judge: definitions on made-up drives, and one small town through the whole
+pipeline.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
 
 
 def drive_saying(lower: float, upper: float) -> DetectionDrive:
-    """Return a drive of one car over ice, and an estimator that always reports the same interval."""
+    """Return a drive of one car over ice, and an estimator that always reports the same
+    interval.
+    """
     ones = np.ones((SAMPLES, 1), np.float32)
     mu = 0.9 * ones
     theta = np.zeros((SAMPLES, 1, 4), np.float32)

@@ -1,4 +1,6 @@
-"""The campaign: names and bars as asked, measures that mean what they say, a report made from figures alone."""
+"""The campaign: names and bars as asked, measures that mean what they say, a report made from
+figures alone.
+"""
 
 from __future__ import annotations
 

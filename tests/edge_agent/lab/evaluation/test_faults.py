@@ -1,4 +1,6 @@
-"""The table of sensor faults: no estimate is lost, health says what happened, the default's interval stays honest."""
+"""The table of sensor faults: no estimate is lost, health says what happened, the default's
+interval stays honest.
+"""
 
 from __future__ import annotations
 

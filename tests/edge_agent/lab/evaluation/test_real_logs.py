@@ -32,7 +32,9 @@ def judge(
     health: int = 0,
     used: float = 0.0,
 ) -> LogFigures:
-    """Ten seconds at 20 m/s with an interval from .4 to .8 after a wide first one; NaN: friction is not measured."""
+    """Ten seconds at 20 m/s with an interval from .4 to .8 after a wide first one; NaN: friction
+    is not measured.
+    """
     t = np.arange(0.0, 10.0, 0.01)
     signals = np.full((len(t), len(CHANNELS)), np.nan)
     signals[:, S.OMEGA : S.OMEGA + 4] = SPEED / CAR.wheel_radius

@@ -143,7 +143,9 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """The file's radius is most of what he misses of the speed; friction he finds to a few hundredths."""
+    """The file's radius is most of what he misses of the speed; friction he finds to a few
+    hundredths.
+    """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)
     (frictions, expected) = oracle.friction(seeds)

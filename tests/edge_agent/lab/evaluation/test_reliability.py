@@ -1,4 +1,6 @@
-"""Reliability and consistency mean what they say: on answers whose error is known, and on the banks themselves."""
+"""Reliability and consistency mean what they say: on answers whose error is known, and on the
+banks themselves.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
 def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(
     turning: DriveSet,
 ) -> None:
-    """The ends are told at the levels at which they hold, and patches of ice lower the lower one."""
+    """The ends are told at the levels at which they hold, and patches of ice lower the lower
+    one.
+    """
     reported, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),

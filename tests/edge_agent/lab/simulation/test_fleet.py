@@ -1,4 +1,6 @@
-"""Fleets: the same whatever their number and their blocks; on the road for ever; excited where it matters."""
+"""Fleets: the same whatever their number and their blocks; on the road for ever; excited where
+it matters.
+"""
 
 from __future__ import annotations
 

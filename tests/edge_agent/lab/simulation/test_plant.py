@@ -225,7 +225,9 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
-    """J ω̇ = T − R F_x, which is how an estimator gets the force: the integrator must not add to J, even when slow."""
+    """J ω̇ = T − R F_x, which is how an estimator gets the force: the integrator must not add to
+    J, even when slow.
+    """
     vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     for speed in (4.0, 20.0):
         x, p, u = rolling(speed, 0.9, vehicle)

@@ -165,7 +165,9 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
 def test_vehicles_start_on_the_lanes_that_are_given_and_keep_the_speed_that_traffic_leaves_them() -> (
     None
 ):
-    """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a driver of 5 m/s²."""
+    """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a
+    driver of 5 m/s².
+    """
     x = np.arange(0.0, 400.0)
     lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]
     allowed = [np.full(400, speed**2 / 5.0) for speed in (13.0, 6.0)]

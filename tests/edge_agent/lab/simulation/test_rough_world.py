@@ -1,4 +1,6 @@
-"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then what the sensors make of it."""
+"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then what the
+sensors make of it.
+"""
 
 from __future__ import annotations
 
@@ -260,7 +262,9 @@ ONLY = {
 def two(
     manoeuvre: str, mounted: Misalignment
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
-    """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their row."""
+    """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their
+    row.
+    """
     exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
     reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
     named = [{name: column(log, name) for name in CHANNELS} for log in (exact, reported)]

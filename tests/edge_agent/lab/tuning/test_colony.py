@@ -1,4 +1,6 @@
-"""The colony as a search: its equations, its bounds, and whether it is worth its name beside chance."""
+"""The colony as a search: its equations, its bounds, and whether it is worth its name beside
+chance.
+"""
 
 from collections.abc import Callable
 
@@ -26,13 +28,17 @@ CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 
 def bowl(seed: int) -> Objective:
-    """Separable: a parabola per vertex, its top at a position drawn from the seed; the maximum is 0."""
+    """Separable: a parabola per vertex, its top at a position drawn from the seed; the maximum
+    is 0.
+    """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
     return lambda vector: -float(np.sum((vector - top) ** 2))
 
 
 def decoy(seed: int) -> Objective:
-    """Deceptive: at every vertex the slope leads away from the one best position; the maximum is VERTICES."""
+    """Deceptive: at every vertex the slope leads away from the one best position; the maximum is
+    VERTICES.
+    """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
 
     def value(vector: FloatArray) -> float:

@@ -1,4 +1,6 @@
-"""The objective: proper, finite, on drives that the judge does not share; and the command from end to end."""
+"""The objective: proper, finite, on drives that the judge does not share; and the command from
+end to end.
+"""
 
 import argparse
 from dataclasses import astuple, replace
@@ -91,7 +93,9 @@ def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
 
 
 def test_interval_score_is_least_at_the_true_quantiles() -> None:
-    """A proper score: neither a wider nor a narrower interval does better on draws from a known distribution."""
+    """A proper score: neither a wider nor a narrower interval does better on draws from a known
+    distribution.
+    """
     draws = np.random.default_rng(1).normal(size=200_000)
     scores = {
         z: float(interval_score(np.full(1, -z), np.full(1, z), draws).mean())
@@ -101,7 +105,9 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
-    """R times 4.5 makes the innovations less likely than R as it is, however seldom it is surprised."""
+    """R times 4.5 makes the innovations less likely than R as it is, however seldom it is
+    surprised.
+    """
     usual, inflated = (
         scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)
     )
@@ -194,7 +200,8 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         assert gain >= OBJECTIVES[objective](TuningScores(**scores["default"].train.model_dump()))
     assert (
         provenance.command
-        == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --repeats 1 --objective {objective} --quick"
+        == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --repeats 1 --objective {objective} "
+        "--quick"
     )
     assert (
         max(scores, key=lambda way: tune._worth(scores[way].held_out, objective))

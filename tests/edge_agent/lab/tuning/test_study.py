@@ -1,4 +1,6 @@
-"""The study of paper 004's tuning: its conditions, its objective, and the command from end to end."""
+"""The study of paper 004's tuning: its conditions, its objective, and the command from end to
+end.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`contract`: how long grip was not kept, at the least and at the most; what nobody measured is never kept."""
+"""`contract`: how long grip was not kept, at the least and at the most; what nobody measured is
+never kept.
+"""
 
 from __future__ import annotations
 
@@ -186,7 +188,9 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """Half an hour of reports that begins in the middle of a slot: no breach is older or longer than the reports."""
+    """Half an hour of reports that begins in the middle of a slot: no breach is older or longer
+    than the reports.
+    """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)
     by_mean, least, most, since = measured((100, 0.2), (101, 0.2), span=span)

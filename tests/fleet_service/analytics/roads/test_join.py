@@ -1,4 +1,6 @@
-"""Cells and sectors on links: the nearest of those that go the same way; both where one ends and the next begins."""
+"""Cells and sectors on links: the nearest of those that go the same way; both where one ends and
+the next begins.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Directed links from an extract of OpenStreetMap and from files of lines; what is none is said by name."""
+"""Directed links from an extract of OpenStreetMap and from files of lines; what is none is said
+by name.
+"""
 
 from __future__ import annotations
 

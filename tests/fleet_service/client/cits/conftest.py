@@ -1,4 +1,6 @@
-"""Leave out the tests of C-ITS where the extra `cits` is missing: python-qpid-proton needs a C compiler to install."""
+"""Leave out the tests of C-ITS where the extra `cits` is missing: python-qpid-proton needs a C
+compiler to install.
+"""
 
 from __future__ import annotations
 

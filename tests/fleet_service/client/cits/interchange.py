@@ -1,4 +1,6 @@
-"""An AMQP interchange in the test's process: accepts what is sent to it, and hands out what a test gives it."""
+"""An AMQP interchange in the test's process: accepts what is sent to it, and hands out what a
+test gives it.
+"""
 
 from __future__ import annotations
 

@@ -127,7 +127,9 @@ def stretch(
 
 
 class Run:
-    """An output with a clock of its own; `sent` are its messages, `settles` whether the interchange accepts them."""
+    """An output with a clock of its own; `sent` are its messages, `settles` whether the
+    interchange accepts them.
+    """
 
     def __init__(self, path: Path, settles: bool = True) -> None:
         self.now = START
