@@ -20,7 +20,11 @@ from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.drive_split import front_share
+from edge_agent.estimators.friction_mixture.drive_split import (
+    BRAKES_FRONT,
+    ENGINE_BRAKE,
+    front_share,
+)
 from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
 from edge_agent.estimators.friction_mixture.trust import strained_noise
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
@@ -107,8 +111,10 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
     block = memory.block
     ax = mean_or(block, S.AX, math.nan)
     front, front_std = front_share(row, memory.drive_odds, features.change)
+    lone = lone_axle(memory, features)
+    brakes = lone >= 0 and brakes_untold(memory, features, lone)
     for wheel in range(4):
-        torque = mean_or(block, S.TORQUE + wheel, math.nan)
+        torque = math.nan if brakes else mean_or(block, S.TORQUE + wheel, math.nan)
         if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
             force = force_from_torque(
                 torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS]
@@ -127,12 +133,55 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
             if math.isnan(ax):
                 unit = 0.0
                 spread = NO_FORCE_SHARE * loads[wheel]
+            elif lone >= 0 and not brakes:  # the other axle gives the rest of what moves the car
+                unit = 0.5 * row[Parameter.MASS]
+                force = 0.5 * (known - axle_force(memory, features, lone))
+                spread = math.hypot(spread, constants.no_torque_share * unit * features.change)
         features.force[wheel], features.force_unit[wheel] = (
             force / loads[wheel],
             unit / loads[wheel],
         )
         features.noise_std[wheel] = spread / loads[wheel]
     return health
+
+
+@compiled
+def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
+    """Return the axle whose torque alone is known, front 0 or rear 1; -1 where both or none is."""
+    known = 0
+    axle = -1
+    for k in range(2):
+        left = 2 * k
+        both = features.rolling[left] + features.rolling[left + 1]
+        both += mean_or(memory.block, S.TORQUE + left, math.nan)
+        both += mean_or(memory.block, S.TORQUE + left + 1, math.nan)
+        if not math.isnan(both):
+            known += 1
+            axle = k
+    return axle if known == 1 else -1
+
+
+@compiled
+def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> bool:
+    """Return True if the car brakes, and the known torque of an axle has less than half of what
+    brakes usually give there: a powertrain's torque does not hold the brakes.
+    """
+    usual = BRAKES_FRONT if axle == 0 else 1.0 - BRAKES_FRONT
+    least = 0.5 * usual * memory.row[Parameter.MASS] * features.change
+    return features.change < -ENGINE_BRAKE and axle_force(memory, features, axle) > least
+
+
+@compiled
+def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> float:
+    """Return the force along [N] of an axle whose torque is known."""
+    row = memory.row
+    total = 0.0
+    for wheel in range(2 * axle, 2 * axle + 2):
+        torque = mean_or(memory.block, S.TORQUE + wheel, math.nan)
+        total += force_from_torque(
+            torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS]
+        )
+    return total
 
 
 @compiled

@@ -157,6 +157,8 @@ class MixtureMemory:
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
+    # force over load of the axles, along and across, smoothed [1]
+    axle_force: Annotated[FloatArray, 2, 2]
     drive_odds: Annotated[
         FloatArray, 3
     ]  # of a car that drives its rear axle, all wheels, its front axle

@@ -17,6 +17,7 @@ from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.reported_interval import find_interval
+from edge_agent.estimators.friction_mixture.rolling_motion import STANDING_STD
 from edge_agent.estimators.friction_mixture.wheel_readings import refuse_jumps
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray
@@ -25,7 +26,6 @@ from schemas.signals import S
 
 # [m/s] wheels that turn slower at the first sample are those of a car at rest
 REST_M_S = 0.1
-REST_V_STD = 0.05
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
@@ -70,7 +70,7 @@ def start(
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
     forget_vehicle(memory)
     covariance = memory.overall_covariance
-    first = REST_V_STD if speed < REST_M_S else FIRST_V_STD
+    first = STANDING_STD if speed < REST_M_S else FIRST_V_STD
     covariance[NodeState.VX, NodeState.VX] = (first if known else UNKNOWN_V_STD) ** 2
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):

@@ -14,7 +14,10 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
-from edge_agent.estimators.friction_mixture.block_features import block_features
+from edge_agent.estimators.friction_mixture.block_features import (
+    SLOWEST_COMPARED_M_S,
+    block_features,
+)
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
@@ -35,13 +38,12 @@ from edge_agent.estimators.friction_mixture.restart import recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
 from edge_agent.estimators.friction_mixture.trust import LEAST_VARIANCE, judge, likeness
+from edge_agent.estimators.friction_mixture.used_grip import used_grip
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-
-SLOWEST_SLIDING_M_S = 1.0  # slip of the health flag is taken against at least this speed
 
 
 @compiled
@@ -128,14 +130,14 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Friction with its interval, grip used in the last second, and whether wheels slide."""
     _find_friction(memory, design, scratch)
-    note_excitation(memory.excitation, memory.last.time, scratch.features.demand)
+    note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))
     if not memory.split:
         for friction in (memory.friction, memory.friction_left, memory.friction_right):
             friction.lower = lower_while_sliding(
                 memory.slip.held, memory.excitation.largest, friction.lower
             )
     vx = memory.overall_mean[NodeState.VX]
-    speed = max(abs(vx), SLOWEST_SLIDING_M_S)
+    speed = max(abs(vx), SLOWEST_COMPARED_M_S)
     for wheel in range(4):
         along = scratch.features.rolling[wheel] - vx
         if (

@@ -1,0 +1,51 @@
+"""Grip in use as it is reported: force over load of the harder-working axle, smoothed over
+SMOOTH_S.
+
+The evidence on friction is weighed by the demand of a block as it is. A report looks back a second
+for the largest value, and the largest of twenty noisy blocks says more of the sensors than of the
+tyres.
+
+Where torque is missing, brakes are taken to load the axles alike. ABS and brake-force distribution
+see to that near the limit, and a fixed share would ask more of an unloaded rear axle than any tyre
+gives.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
+
+SMOOTH_S = 0.1  # [s] two blocks: a tyre's force builds up as fast
+MOST_USED = 1.5  # [1] more is no tyre of a road car: a bump, or a load that the model has wrong
+
+
+@compiled
+def used_grip(memory: MixtureMemory, features: BlockFeatures) -> float:
+    """Return the larger force over load of the two axles [1] and renew the smoothed forces of
+    the memory.
+    """
+    share = 1.0 - math.exp(-features.duration / SMOOTH_S)
+    most = 0.0
+    for axle in range(2):
+        left = 2 * axle
+        right = left + 1
+        along = (
+            features.load_share[left] * features.force[left]
+            + features.load_share[right] * features.force[right]
+        )
+        if (
+            features.change < 0.0
+            and features.force_unit[left] != 0.0
+            and features.force_unit[right] != 0.0
+        ):
+            along = features.change / GRAVITY
+        side = features.side[axle]
+        force = memory.axle_force
+        force[axle, 0] += share * (along - force[axle, 0])
+        force[axle, 1] += share * ((0.0 if math.isnan(side) else side) - force[axle, 1])
+        most = max(most, math.hypot(force[axle, 0], force[axle, 1]))
+    return min(most, MOST_USED)

@@ -1,0 +1,73 @@
+"""Grip in use as it is reported, and torque that is known on one axle only."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates
+from edge_agent.estimators.friction_mixture.used_grip import MOST_USED
+from edge_agent.lab.simulation import simulate_manoeuvre
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from schemas.thresholds import GRAVITY
+from tests.edge_agent.estimators.drives import TORQUE, drive
+
+FRONT = slice(S.TORQUE, S.TORQUE + 2)
+REAR = slice(S.TORQUE + 2, S.TORQUE + 4)
+WORSE = 1.1  # ratio of two errors of speed, and
+SLACK_M_S = 0.02
+
+
+@cache
+def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return times (T,), signals (T, 18) and true v_x (T,) of a stop with anti-lock control."""
+    log, _ = simulate_manoeuvre("braking", mu=mu, seed=2, sensors="mems")
+    signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
+    return log["t"].to_numpy(), signals, log["true_vx"].to_numpy()
+
+
+def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> float:
+    """Return the error of v_x [m/s] in a stop, rms; engine_only: known torque has no brakes."""
+    t, signals, vx = stop(mu)
+    signals = signals.copy()
+    signals[:, missing] = np.nan
+    if engine_only:
+        signals[:, TORQUE] = np.maximum(signals[:, TORQUE], 0.0)
+    vehicle = drive("braking", mu)[2]
+    estimates = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+    return float(np.sqrt(np.mean((estimates.vx[t > 1.0, 0] - vx[t > 1.0]) ** 2)))
+
+
+def drive_without_torque(name: str, mu: float) -> tuple[FloatArray, Estimates]:
+    """Return signals (T, 18) and estimates of a manoeuvre."""
+    t, signals, vehicle = drive(name, mu)
+    signals = signals.copy()
+    signals[:, TORQUE] = np.nan
+    return signals, bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+
+
+@pytest.mark.parametrize("name", ["braking", "slalom"])
+@pytest.mark.parametrize("mu", [0.3, 0.9])
+def test_grip_in_use_is_near_the_acceleration_and_never_beyond_a_tyre(name: str, mu: float) -> None:
+    signals, estimates = drive_without_torque(name, mu)
+    used = estimates.mu_utilised[:, 0]
+    reached = np.percentile(np.hypot(signals[:, S.AX], signals[:, S.AY]), 90) / GRAVITY
+    assert used.max() <= MOST_USED
+    assert 0.7 * reached < np.percentile(used, 90) < 1.4 * reached
+
+
+@pytest.mark.parametrize("missing", [FRONT, REAR])
+@pytest.mark.parametrize("mu", [0.3, 0.8])
+def test_torque_of_one_axle_helps_the_speed_of_a_stop(missing: slice, mu: float) -> None:
+    assert speed_error(mu, missing) < WORSE * speed_error(mu, TORQUE) + SLACK_M_S
+
+
+@pytest.mark.parametrize("missing", [FRONT, REAR])
+@pytest.mark.parametrize("mu", [0.3, 0.8])
+def test_torque_of_an_engine_does_not_harm_the_speed_of_a_stop(missing: slice, mu: float) -> None:
+    alone = speed_error(mu, missing, engine_only=True)
+    assert alone < WORSE * speed_error(mu, TORQUE) + SLACK_M_S
