@@ -1,8 +1,10 @@
 """Errors that a person or another program can act on.
 
-InputError          misuse or bad input: names the field and the fix (exit code 2 at the command line)
+InputError          misuse or bad input: names the field and the fix (exit code 2 at the command
+                    line)
 ├── UnreachableError  nobody answers where an answer was expected (exit code 1)
-└── WireError       a payload that is not the message it claims to be (a counted refusal in the service)
+└── WireError       a payload that is not the message it claims to be (a counted refusal in the
+                    service)
 """
 
 from __future__ import annotations

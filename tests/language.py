@@ -2,7 +2,8 @@
 `tests/test_language.py`.
 
     python -m tests.language          print the figures, and lower the ceilings to them
-    python -m tests.language WORD     print every docstring that a rule of this name finds fault with
+    python -m tests.language WORD     print every docstring that a rule of this name finds fault
+                                      with
 
 Rules are those of CONTRIBUTING.md, section "Rules for language". Ceilings are in
 `language_ceilings.json`, per package. This program only lowers them.

@@ -3,7 +3,8 @@ III.C, figures 2 and 3).
 
 Legend
     peaks       upper vertices of the five sets of the mismatch [1] (5,)
-    feet        their lower vertices between the peaks: right foot of set k, left foot of set k + 1 [1] (8,)
+    feet        their lower vertices between the peaks: right foot of set k, left foot of set k + 1
+                [1] (8,)
     out_peaks   upper vertices of the five sets of the step, ln of the factor on R [nat] (5,)
     out_feet    their lower vertices [nat] (8,)
     w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output

@@ -1,19 +1,24 @@
 """The fuzzy sets of the adaptation as numbers that can be stored, tuned and refused.
 
 Legend
-    mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 when R is right, -1 is its lower end
-    inputs      peaks of the five triangular sets: much smaller, smaller, equal, larger, much larger (5,)
+    mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 when R is right, -1 is
+                its lower end
+    inputs      peaks of the five triangular sets: much smaller, smaller, equal, larger, much larger
+                (5,)
     outputs     log of the multiplier on R that each set asks for [nat] (5,)
-    ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows [nat] (2,)
+    ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows
+                [nat] (2,)
 
 Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, and what two rules ask
 for:
     far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
-    consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and bank return to their
-                prior where the wheels are FAR [1/s]
-    shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel slides (no, yes),
-                then demand (low, middle, high), then forces (as before, new) [nat] (12,)
-    strained    what is added to it where beliefs about the car are strained, by whether a wheel slides [nat] (2,)
+    consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and
+                bank return to their prior where the wheels are FAR [1/s]
+    shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel
+                slides (no, yes), then demand (low, middle, high), then forces (as before, new)
+                [nat] (12,)
+    strained    what is added to it where beliefs about the car are strained, by whether a wheel
+                slides [nat] (2,)
 
 Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the
 range is covered.

@@ -2,8 +2,8 @@
 rate (paper 001).
 
 Legend
-    alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the paper's (18) is a
-                difference of traces, which adds squares of unlike units
+    alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the
+                paper's (18) is a difference of traces, which adds squares of unlike units
     rate        its rate [1/s]
     level       what a rule asks for: ln of the factor on R [nat]                         (5, 7)
 

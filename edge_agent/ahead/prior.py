@@ -12,12 +12,12 @@ Legend
     w⁻, w   the filter's own belief at the border, and now             (32,)
     m       the map's belief of this cell, faded with its age           (32,)
     u       uniform on the friction grid                                (32,)
-    h       chance that the road changes at this border: how much the map's beliefs of the two cells differ (total
-            variation), BLIND where it knows only this one
+    h       chance that the road changes at this border: how much the map's beliefs of the two cells
+            differ (total variation), BLIND where it knows only this one
     L       likelihood of the visit's measurements so far               (32,)
-    β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 - β)·Z_M) with
-            Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take away, and what a
-            visit found holds for the next ones, KEPT of it from border to border
+    β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 -
+            β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take
+            away, and what a visit found holds for the next ones, KEPT of it from border to border
 
 The filter's own belief is carried over a border, never the mixture, so that no cell of the map is
 counted twice. Hypotheses that are averaged by what they predicted: Hoeting et al., Bayesian model

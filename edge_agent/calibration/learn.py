@@ -2,11 +2,14 @@
 deviation.
 
     quantity          from
-    radius_fl … rr    turning of each wheel against the mean of the four on calm moments, less what yaw and slip explain
+    radius_fl … rr    turning of each wheel against the mean of the four on calm moments, less what
+                      yaw and slip explain
     ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
     yaw_rate          intercept of the wheels' yaw rate over the gyro's
-    steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three at once
-    force_gain        torque over radius, over mass times acceleration: torque gain and mass, where torque is recorded
+    steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three
+                                            at once
+    force_gain        torque over radius, over mass times acceleration: torque gain and mass, where
+                      torque is recorded
     wheel_lag, steer_lag    by which they speak later than the inertial unit: lags.py
 
 At one speed gain and understeer are the same; only a prior that the whole fleet shares tells them

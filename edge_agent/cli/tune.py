@@ -339,7 +339,8 @@ def table(scores: dict[str, SplitScores]) -> str:
     """Return the comparison as plain text, one row per search and set of drives."""
     lines = [
         (
-            f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} "
+            f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} "
+            f"{'innovations [nat/s]':>20} "
             f"{'NIS':>6}"
         )
     ]

@@ -3,8 +3,9 @@
 Legend
     m, L        mean (n,) and sqrt_cov, lower triangular, covariance P = L*L'            (n, n)
     xi          points of the rule for a standard normal variable                       (points, n)
-    A, S        axes and sizes of the covariance's ellipsoid: L = A*S*V' by singular values gives P = A*S^2*A', so A*S
-                is another square root of P (papers 000 and 001, equations 21 and 22)
+    A, S        axes and sizes of the covariance's ellipsoid: L = A*S*V' by singular values gives P
+                = A*S^2*A', so A*S is another square root of P (papers 000 and 001, equations 21 and
+                22)
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """A profile: which signal of a recording is which channel of the signal log, as checked JSON.
 
-    value of a channel = scale · (sum of its signals, in SI) · sign + offset,     at the time stamped − delay_s
+    value of a channel = scale · (sum of its signals, in SI) · sign + offset,     at the time
+                                                                                  stamped − delay_s
 
 A speed at the rim becomes a wheel speed by `wheel_radius`, an angle of the steering wheel a road
 wheel's by `steering_ratio`; the vehicle file's radius and ratio go before those of the profile.

@@ -1,8 +1,10 @@
 """Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here,
 or on Spark.
 
-    OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all visited cells
-    OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all days
+    OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all
+                                                                     visited cells
+    OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all
+    days
 
 Cells do not depend on each other once the weights are known. A zone therefore needs its own rows
 and those of a margin around it, and gives the same result as a replay of everything. Both engines

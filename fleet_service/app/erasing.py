@@ -2,8 +2,10 @@
 background jobs.
 
     a segment; the service's state is on disk up to it
-    in a separate process:    the vehicle's rows leave the files, and all others, read again, make a checkpoint
-    between two segments:     the service drops its state and begins from that checkpoint and the log since
+    in a separate process:    the vehicle's rows leave the files, and all others, read again, make a
+                              checkpoint
+    between two segments:     the service drops its state and begins from that checkpoint and the
+                              log since
 
 Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an
 incomplete erasure. Others wait for the lock of compaction. Messages wait for as long as a start

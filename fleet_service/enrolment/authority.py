@@ -1,9 +1,11 @@
 """Certificate authority in a folder, and the certificates that it issues (elliptic curve P-256,
 X.509 version 3).
 
-DIR/authority/ca.pem  ca.key      signs; stays on this machine DIR/authority/next.*  old.pem     another authority on
-its way in, or out DIR/trust.pem                     what everyone trusts DIR/NAME.pem  NAME.key            of each name
-DIR/revoked/NAME.pem              of names that were taken off the list
+    DIR/authority/ca.pem  ca.key      signs; stays on this machine
+    DIR/authority/next.*  old.pem     another authority on its way in, or out
+    DIR/trust.pem                     what everyone trusts
+    DIR/NAME.pem  NAME.key            of each name
+    DIR/revoked/NAME.pem              of names that were taken off the list
 """
 
 from __future__ import annotations

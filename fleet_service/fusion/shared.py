@@ -7,9 +7,10 @@ averages it out; other manoeuvres do, and who uses more. So a belief is about wh
 a road for, and whoever reads it gets the road:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
-    σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where μ_j < μ_i
-    σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
-    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ w_k)²/Σ w_k²
+    σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where
+    μ_j < μ_i σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
+    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ
+                                                                                   w_k)²/Σ w_k²
 
 The error of the shape is one-sided, since only what reads low falls enough towards the upper end to
 be a value. Its slope is what `trust.shape_of` finds, and SHAPE_DOUBT. For an alarm it is the upper

@@ -7,7 +7,8 @@ and each of its visits is one that this vehicle made on a road nearly as slipper
 the town's visit is:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
-    c        μ/μ_w: forces scale with the grip, so value, interval and grip used do, and ℓ(x) becomes ℓ(x/c)
+    c        μ/μ_w: forces scale with the grip, so value, interval and grip used do, and ℓ(x)
+             becomes ℓ(x/c)
 
 A pass over the border of a surface is drawn as any other. What all vehicles of one place share is
 not kept, for each visit is drawn by itself: of that the whole ways tell.

@@ -5,13 +5,16 @@ which carries what it believed in the cell before. Each lets its variance grow b
 the fusion's own drift does.
 
     newest report         the last posterior
-    inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information added up
+    inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information
+                          added up
     one per pass          one posterior per pass, information added up
-    covariance inters.    one per pass, with weights in proportion to information (W. Niehsen, FUSION 2002)
-    federated reset       the cell is the master; local filters start from it, so that only the reading is added
-                          (N. A. Carlson, IEEE Trans. Aerospace and Electronic Systems 26(3), 1990)
-    median                of the vehicles' last readings of an hour, with an interval of 6 % that all share and 12 %
-                          of one vehicle
+    covariance inters.    one per pass, with weights in proportion to information (W. Niehsen,
+                          FUSION 2002)
+    federated reset       the cell is the master; local filters start from it, so that only the
+                          reading is added (N. A. Carlson, IEEE Trans. Aerospace and Electronic
+                          Systems 26(3), 1990)
+    median                of the vehicles' last readings of an hour, with an interval of 6 % that
+                          all share and 12 % of one vehicle
 """
 
 from __future__ import annotations

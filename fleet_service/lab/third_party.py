@@ -8,7 +8,8 @@ columns. Pure.
 
 Two drives:
 
-    honest fleet   300 cells in stretches of three; 15 visits per cell in 40 minutes, half of them excited
+    honest fleet   300 cells in stretches of three; 15 visits per cell in 40 minutes, half of them
+                   excited
     change         30 cells of .85 turn to .15 and back, each for 40 minutes, in a town as above
 
 Legend

@@ -1,8 +1,9 @@
 """Server-sent events to browsers: each has a view and a short queue; a slow one is told to reload.
 
-tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out alerts   all standing
-stretches beat     time, served regions, standing alerts: every two seconds reload   this watcher missed something and
-must query again
+tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out
+alerts   all standing stretches
+beat     time, served regions, standing alerts: every two seconds
+reload   this watcher missed something and must query again
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 the rest.
 
     checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that it includes
-    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it includes
+    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it
+                                                 includes
 
 A folder appears when it is complete. Compiled code follows the numbers in a checkpoint without
 checks, so nothing of it is used before all digests are verified. A checkpoint with which a service

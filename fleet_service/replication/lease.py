@@ -1,6 +1,7 @@
 """Lease of an archive's bucket copy. It needs only a bucket with conditional create.
 
-    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the highest number holds
+    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the
+                            highest number holds
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
 A service takes over by creating the next number, which only one can do. It renews by writing its

@@ -1,7 +1,8 @@
 """Journal of uploads: the files of an archive that are in its copy, with size and time at the
 upload.
 
-    ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each delete, [name]
+    ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each
+                        delete, [name]
 
 A line that is lost costs a put, or brings a file back that is then removed again; it never removes
 one.

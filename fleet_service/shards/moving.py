@@ -3,9 +3,9 @@ standby.
 
 ask                                      the service
 get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
-watches the tokens                       checkpoint, copied; then as at any stop: flush, acknowledge, undeclare
-                                         lease given free for NAME, which takes it, restores,
-                                         declares
+watches the tokens                       checkpoint, copied; then as at any stop: flush,
+                                         acknowledge, undeclare lease given free for NAME, which
+                                         takes it, restores, declares
 """
 
 from __future__ import annotations

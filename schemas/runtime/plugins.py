@@ -6,8 +6,10 @@ name.
 
 group                   object behind a name
 gripmap.estimators      bank(vehicles) with `advance` as in EstimatorBank
-gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array; `--estimator aco-fckf@name`
-gripmap.sources         blocks(address), an iterator of edge_agent.Block; used by `--source name:address`
+gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array;
+                        `--estimator aco-fckf@name`
+gripmap.sources         blocks(address), an iterator of edge_agent.Block; used by `--source
+                        name:address`
 gripmap.questions       a fleet_service.analytics.questions.Question
 """
 

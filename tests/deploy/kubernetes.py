@@ -1,7 +1,8 @@
 """The manifests of deploy/kubernetes: built by kustomize, held against Kubernetes' schemas, and
 their pods started.
 
-    python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid, kube.commands_failed
+    python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid,
+                                             kube.commands_failed
 
 A pod is its containers as processes with command, environment and mounts of the manifest; each path
 of a mount lies below a folder of that pod, and names of pods and their ports are those of this

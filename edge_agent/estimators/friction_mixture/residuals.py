@@ -5,7 +5,8 @@ Legend
     g_x, g_y    linear force over load, slope*stiffness factor*slip [1]
     theta       hypot(g_x, g_y)/mu, normalised slip
     e_b         force minus the tyre's force at the measured slip, over load [1]
-    e_a         slip at the measured force by the inverse tyre, minus the measured slip, as linear force over load [1]
+    e_a         slip at the measured force by the inverse tyre, minus the measured slip, as linear
+                force over load [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
 Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force

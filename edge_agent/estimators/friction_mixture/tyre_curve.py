@@ -4,8 +4,8 @@ shape.
 Legend
     theta    normalised slip, see edge_agent.dynamics.tyres           [1]
     f        force over mu*F_z, peak 1                                  [1]
-    shape    half the difference between a sharp and a round tyre: one standard deviation of shape; it changes
-             sign at the peak, for what rises steeply also falls steeply [1]
+    shape    half the difference between a sharp and a round tyre: one standard deviation of shape;
+             it changes sign at the peak, for what rises steeply also falls steeply [1]
     u        theta/(1 + theta), where the tables of theta are even       [1]
     t        sqrt(1 - f), where the inverse is smooth up to the peak     [1]
 """

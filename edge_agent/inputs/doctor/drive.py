@@ -2,7 +2,8 @@
 the motion.
 
 Legend
-    v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle file
+    v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle
+         file
     r    yaw rate [rad/s];  r_w the same from the wheels: (right − left) / track, mean of both axles
     v_g  speed over ground from fixes [m/s]; course likewise, counter-clockwise from east [rad]
 """

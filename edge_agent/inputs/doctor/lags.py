@@ -1,7 +1,9 @@
 """How late devices speak against the inertial unit, each from two ways to the yaw rate.
 
-    wheel_lag   wheels' yaw rate behind the gyro's: mean of both axles, or the axle that follows the gyro best
-    steer_lag   yaw rate of a bicycle model on the measured angle behind the gyro's (Rajamani 2012, section 2.3)
+    wheel_lag   wheels' yaw rate behind the gyro's: mean of both axles, or the axle that follows the
+                gyro best
+    steer_lag   yaw rate of a bicycle model on the measured angle behind the gyro's (Rajamani 2012,
+                section 2.3)
 
     m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
 

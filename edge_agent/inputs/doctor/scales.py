@@ -4,7 +4,8 @@ Every quantity may be sound or have one of a few faults, each a factor on what i
 fault costs as much as FAULT_COST / 2 in log probability, since few columns are wrong). An identity
 says, in logarithms,
 
-    ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π sign(factor)
+    ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π
+                                                                                  sign(factor)
 
 Every set of at most two faulty quantities is tried. A quantity is settled when all explanations
 that say otherwise of it cost SETTLED more. Clocks likewise: the lag of an identity is the

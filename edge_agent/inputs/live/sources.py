@@ -1,13 +1,14 @@
 """Live sources as they are asked for on a command line: `kind:address?option=value`.
 
 source                                   is
-can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its number in the profile
-                                         (else that in the channel's name), other options are those
-                                         of the interface
-ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0); `frames=/can0` is one of
-                                         can_msgs/Frame; `messages=FOLDER` holds PACKAGE/NAME.msg of
-                                         types of one's own
-vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with `token=FILE` as somebody
+can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its
+                                         number in the profile (else that in the channel's name),
+                                         other options are those of the interface
+ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0);
+                                         `frames=/can0` is one of can_msgs/Frame; `messages=FOLDER`
+                                         holds PACKAGE/NAME.msg of types of one's own
+vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with
+                                         `token=FILE` as somebody
 gpsd:127.0.0.1:2947                      a gpsd
 """
 

@@ -6,16 +6,20 @@ Towns are drawn by the seed; cars are rough ones (ROUGH_FLEET) or plain ones. "s
 pool the samples of its towns.
 
 Legend
-    slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least SLIDE_S
+    slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
+                SLIDE_S
     value       the visit's likelihood falls by VALUE_NATS or more to the upper end of the grid
     favoured    max ln L(μ < .4) - max ln L(μ >= .4) >= FAVOURED_NATS
-    on ice      of a visit: its mean friction is at most .2 and moves by less than MOVES; of a sample: friction <= .2
+    on ice      of a visit: its mean friction is at most .2 and moves by less than MOVES; of a
+                sample: friction <= .2
     excited     of a visit: some wheel uses more than EXCITED_SHARE of its grip in it
-    pass        a stretch of PASS_S or longer of one car on ice, or on snow; found: mu_upper < .4 at some time of it
+    pass        a stretch of PASS_S or longer of one car on ice, or on snow; found: mu_upper < .4 at
+                some time of it
     settled     not within SETTLED_S of snow and ice
-    false event a settled stretch with mu_upper < .4 on wet or dry road; gaps up to EVENT_GAP_S do not end it
-    false grip  mu_lower more than FALSE_GRIP above the true friction
-    stood       ice or snow appeared under the standing car: judged apart, and not in any other figure
+    false event a settled stretch with mu_upper < .4 on wet or dry road; gaps up to EVENT_GAP_S do
+    not end it false grip  mu_lower more than FALSE_GRIP above the true friction
+    stood       ice or snow appeared under the standing car: judged apart, and not in any other
+                figure
 """
 
 from __future__ import annotations

@@ -8,9 +8,12 @@ that of least squares with a Gaussian prior.
 
 `speed`: v_x of an accelerating sine. He hears the wheels without noise: W = (1 + ρ) v.
 
-    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: what the rolling body has followed
-    ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of STRETCH_S
-    unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and pitches, b offsets
+    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: what the rolling
+                                                                             body has followed
+    ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of
+                                                                             STRETCH_S
+    unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and
+    pitches, b offsets
 
 `friction`: μ under .6 g, at the end of the drive. He hears the mean of four wheels, knows the force
 of every tyre, and the speed but for offset and leak of a_x.

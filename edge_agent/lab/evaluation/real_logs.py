@@ -5,7 +5,8 @@ vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: friction th
 surely had). Of the time in which a car moves, from the third second on:
 
     informative    share with an interval narrower than INFORMATIVE of the prior's
-    right          of that, share whose interval meets what is known: true friction, else at least the grip in use
+    right          of that, share whose interval meets what is known: true friction, else at least
+                   the grip in use
     ice            share with P(slippery) > ICE although the road was not slippery
     contradicted   share with the health flag CONTRADICTION
     urgent         observations per hour that would be sent at once, of logs with a position

@@ -5,16 +5,19 @@ Towns (friction, hills), cars, sensors and clocks are drawn by the seed, half of
 torque. All figures are over samples, so that a minute on dry road weighs a minute.
 
 Legend
-    surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
+    surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry
+                  above
     missed ice    share of the samples on ice where excited whose upper end is not below SLIPPERY_MU
-    false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the truth
-    false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU; "settled": of
-                  those that left snow and ice SETTLED_S ago, or never met any: who drives off the
-                  ice learns of it when he uses the grip; "of_all": share of all samples that are
-                  such on a road above SURE_GRIP
+    false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the
+                  truth
+    false ice     share of the samples on wet and dry road whose whole interval lies below
+                  SLIPPERY_MU; "settled": of those that left snow and ice SETTLED_S ago, or never
+                  met any: who drives off the ice learns of it when he uses the grip; "of_all":
+                  share of all samples that are such on a road above SURE_GRIP
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
-    contradiction share of the samples in which the estimator says that no friction explains its data (health)
+    contradiction share of the samples in which the estimator says that no friction explains its
+    data (health)
     lost          share of the samples whose speed is off by more than LOST_M_S
 """
 

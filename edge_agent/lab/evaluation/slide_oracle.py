@@ -5,7 +5,8 @@ It bounds what any estimator can conclude from a visit. Unknown are the shape of
 and its stiffness.
 
     f    |F| / F_z, known with noise FORCE_STD          q    slip times stiffness per load, known with the wheels' noise
-    f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic Formula, k ln-normal
+    f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic
+                                                        Formula, k ln-normal
 
     ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope ·
     σ_q)²) · p(q)

@@ -8,10 +8,11 @@ and the vehicle file.
     no faster than the
                      accelerometer says, plus FREE; where all wheels have agreed for AGREE_S it is
                      their speed
-    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i includes the yaw rate
-                     wheels and cars slower than SLOWEST do not slip
+    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i
+                     includes the yaw rate wheels and cars slower than SLOWEST do not slip
     yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
-    friction         |a| / g while a flag is up; while driving, over the share of the load on the driven axle
+    friction         |a| / g while a flag is up; while driving, over the share of the load on the
+                     driven axle
 """
 
 from __future__ import annotations

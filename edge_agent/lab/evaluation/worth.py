@@ -6,7 +6,8 @@ Legend, all scores less is better
     none         the same filter without any rule, and with untuned noise (`ckf`)
     same_scales  without any rule, with the shipped noise scales
     default      all rules with untuned vertices
-    random       what each random search found, mean over the searches; colony: the same of the colony, equal budget
+    random       what each random search found, mean over the searches; colony: the same of the
+                 colony, equal budget
 
 Each seed is a town of rough cars and a set of rough manoeuvres on hills, with friction and vehicles
 of its own.

@@ -4,14 +4,15 @@ and ESC.
 They act in steps of the plant, on slip that they know exactly: only their action is modelled, not
 their sensors.
 
-    ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half of the limit, and
-           gets it back, fast up to NEARLY of the torque at which it let go, then slowly: 6 to 10
-           cycles per second; the rear wheels share the lower torque
-    TCS    the engine's torque is cut while a driven wheel spins, and the brake holds a wheel that spins much; the same
-           cut ends the drag of engine or generator at lift-off, and while ABS works
-    ESC    where the yaw rate is off what steering asks for, one wheel is braked: the outer front wheel of a car that
-           turns too much, the inner rear wheel of one that turns too little; the engine's torque is
-           cut
+    ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half
+           of the limit, and gets it back, fast up to NEARLY of the torque at which it let go, then
+           slowly: 6 to 10 cycles per second; the rear wheels share the lower torque
+    TCS    the engine's torque is cut while a driven wheel spins, and the brake holds a wheel that
+           spins much; the same cut ends the drag of engine or generator at lift-off, and while ABS
+           works
+    ESC    where the yaw rate is off what steering asks for, one wheel is braked: the outer front
+           wheel of a car that turns too much, the inner rear wheel of one that turns too little;
+           the engine's torque is cut
 """
 
 from __future__ import annotations

@@ -5,9 +5,11 @@ Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place)
 another)
     θ, φ, ψ  pitch, roll and yaw of the inertial unit's mount [rad], to first order:
              a_x' = a_x + g θ + ψ a_y,  a_y' = a_y + g φ − ψ a_x
-    δ        front wheel's angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), offset, gain, and a map that depends on angle
+    δ        front wheel's angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), offset, gain, and a map that
+             depends on angle
     ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
-    Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are counted
+    Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are
+             counted
     τ        each device tells of the moment τ ago
 
 Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to

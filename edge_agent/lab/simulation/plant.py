@@ -4,7 +4,8 @@ It shares its equations with `edge_agent.dynamics` but is not the estimator's mo
 another shape, their stiffness grows less than the load, its loads follow the accelerations with a
 lag, it rolls, drags and resists rolling.
 
-    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x    v_x, v_y  speed of the centre of gravity in the body [m/s]
+    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x    v_x, v_y  speed of the centre of gravity in the
+                                                     body [m/s]
     m (dv_y/dt + r v_x) = ΣY + m g_y             r         yaw rate [rad/s]
     I_z dr/dt = Σ (x_i Y_i − y_i X_i)            X, Y      wheel forces in the body's axes [N]
     J dω/dt = T − R F_x − k_r R F_z              ω, T      wheel speed [rad/s], torque at the wheel [N·m]

@@ -3,10 +3,11 @@ its lanes upon it.
 
 Legend
     h       height [m] over x (east) and y (north) [m]
-    ∇h      rise per metre east and north [1]; a wave of steepest slope a and length λ towards the unit vector e gives
-            a cos(2π s/λ + φ) e, with s = (x, y)·e; its limit of infinite length is one slope
-            everywhere
-    c, b    crossfall to the right of a lane [1], and bank per curvature [m], which lowers the inside of a bend
+    ∇h      rise per metre east and north [1]; a wave of steepest slope a and length λ towards the
+            unit vector e gives a cos(2π s/λ + φ) e, with s = (x, y)·e; its limit of infinite length
+            is one slope everywhere
+    c, b    crossfall to the right of a lane [1], and bank per curvature [m], which lowers the
+            inside of a bend
 
 Slopes add up and are cut at STEEPEST. Positions are measured along the road, so that a metre on 8 %
 is a metre here and .997 m on a map. Sizes are those of real roads: standard deviation 3 %, hardly

@@ -3,9 +3,9 @@ connectors through junctions.
 
 lane       a directed polyline, points about a metre apart, with heading and curvature
 connector  a lane through a junction, from the end of one lane to the start of one of another road
-profile    v²/q at each point [m]: the square of the speed that a driver may have there who allows himself q m/s^2
-           across and BRAKING·q along, knowing where he will turn; it scales with q, so one profile
-           serves all
+profile    v²/q at each point [m]: the square of the speed that a driver may have there who allows
+           himself q m/s^2 across and BRAKING·q along, knowing where he will turn; it scales with q,
+           so one profile serves all
 """
 
 from __future__ import annotations

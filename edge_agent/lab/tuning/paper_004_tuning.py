@@ -4,9 +4,12 @@ objective as a choice.
 The double lane change at 80 km/h on the printed tyre, P_0 = .2*I, Q = .1*T^2; noise variance and R
 are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
 
-    mismatch     1/(1 + |e|), e the mean difference of actual and theoretical innovation variance (33)
-    likelihood   mean log-likelihood of the innovations [nat per sample], which no inflation of R wins
-    error        less the mean of RMSE over the printed one, of v_x, v_y, yaw rate and mu: it needs the truth
+    mismatch     1/(1 + |e|), e the mean difference of actual and theoretical innovation variance
+                 (33)
+    likelihood   mean log-likelihood of the innovations [nat per sample], which no inflation of R
+                 wins
+    error        less the mean of RMSE over the printed one, of v_x, v_y, yaw rate and mu: it needs
+                 the truth
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ Legend
     w    weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
     D    difference Σ w·(mean after - mean before) / Σ w
     u_v  influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period)
-    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, the sandwich of clusters)
+    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, the sandwich
+         of clusters)
 """
 
 from __future__ import annotations

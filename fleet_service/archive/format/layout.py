@@ -3,9 +3,11 @@
     inbox/…                                                     the log, see `segments`
     observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
     states/date=…/zone=…/NAME.parquet                           compacted
-    checkpoints/…                                               start of a restart, see `replay.checkpoints`
+    checkpoints/…                                               start of a restart, see
+                                                                `replay.checkpoints`
     requests/…                                                  see `erasure_requests`
-    drafts/                                                     files being written; nothing there counts
+    drafts/                                                     files being written; nothing there
+                                                                counts
 
 The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file
 holds. If services succeed each other by a lease, the epoch of the compacting service follows SHARD:

@@ -1,6 +1,7 @@
 """Snapshots of the public map: one GeoParquet file per hour.
 
-map/date=2026-01-31/20260131T070000Z.parquet      cells that are public, their polygons, sorted by cell
+map/date=2026-01-31/20260131T070000Z.parquet      cells that are public, their polygons, sorted by
+                                                  cell
 """
 
 from __future__ import annotations

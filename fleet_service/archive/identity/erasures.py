@@ -1,7 +1,8 @@
 """Forgotten months, and forgotten vehicles of a month: their measurements are not accepted again.
 
     keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
-    keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with the month's key
+    keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with
+                                          the month's key
 
 Without the month's key nobody can tell which batches were received, so a repeated batch would count
 twice. If the rows of a vehicle were removed, nothing proves either that they were received. UNTIL

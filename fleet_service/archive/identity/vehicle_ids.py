@@ -3,7 +3,8 @@ per month.
 
     keys/witness.key            of the service: a vehicle's number is the keyed hash of its name
     keys/2026-01.witnesses      number of each pseudonym of the month; removed with the month's key
-    keys/2026-01.TERM.witnesses the same, of a service that succeeds others: each writes a file of its own
+    keys/2026-01.TERM.witnesses the same, of a service that succeeds others: each writes a file of
+    its own
 
 One car must not become two witnesses because a month ended, or because it claims so. The second
 file is for restarts and replays, which see pseudonyms. A lost or damaged line makes one vehicle two

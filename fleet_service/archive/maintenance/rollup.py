@@ -10,8 +10,8 @@ rewritten.
 Legend of the merging (columns of `tables.CELL_HOUR`)
     sums, counts     add
     mu_min, mu_max   minimum, maximum
-    vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of zeros)
-                     (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2)
+    vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of
+                     zeros) (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2)
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     regions    17, 17 and 16 in three zones side by side, a service for each zone
     towns      four in a region; regions are unlike in size, as 1/sqrt(rank)
-    vehicles   each has a piece of the drive of one of the city's, moved by whole tiles, and drives it again and again;
-               those of one town with one drive are spread evenly over it
+    vehicles   each has a piece of the drive of one of the city's, moved by whole tiles, and drives
+               it again and again; those of one town with one drive are spread evenly over it
     reports    each sends ROWS visits every PERIOD_S, in turn; they take that long: traffic is slow
 
 The same for who sends it and for who looks at it; nothing but the seed and the city's observations

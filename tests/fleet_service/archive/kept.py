@@ -1,7 +1,8 @@
 """An archive to keep: every kind of file that a service writes, small, and the map that it stood
 for when it was made.
 
-    python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of today
+    python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of
+                                                           today
 
 `data/v1.0` was made so by commit 1f90692, before any file had a version. What is kept is never made
 again: it is what later code must go on reading.
