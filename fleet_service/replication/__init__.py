@@ -15,7 +15,7 @@ a callback.
 | waiting | any other look | waiting | a standby downloads new objects |
 | taking | another service created the number first | waiting | |
 | taking | created, and the former turn is the one seen last | joining | |
-| taking | created, but the former holder renewed meanwhile | joining | wait for `lease_s / 2` first |
+| taking | created, but the former holder renewed meanwhile | joining | wait for `lease_s` first |
 | joining | folder and bucket are equal, and the fence is put | holding | serve and acknowledge |
 | joining | a higher number exists | waiting | |
 | joining | the bucket does not answer | joining | a standby retries, another service stops |

@@ -26,7 +26,7 @@ SCHEMES: Final = re.compile(
 )  # a folder or memory would not be a second place
 CONNECT_S: Final = 2.0
 _ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-_TOOK: Final = re.compile(r" in [\d.]+[^\s\d]*s\b")
+_TOOK: Final = re.compile(r" in [\d.]+[^\s\d.]*s\b")
 _TEXT: Final = 160  # characters of an error; what the server says as XML may name keys
 
 

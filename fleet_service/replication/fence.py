@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import gzip
 import json
+import zlib
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from fleet_service.archive.format import layout
-from fleet_service.replication.bucket import ObjectBucket
+from fleet_service.replication.bucket import CopyError, ObjectBucket
 
 FOLDER: Final = "fence"
 
@@ -63,8 +64,11 @@ def fence_of(bucket: ObjectBucket) -> Fence:
     content = bucket.get(max(names)) if names else None
     if content is None:
         return Fence(0, frozenset())
-    document = json.loads(gzip.decompress(content))
-    return Fence(int(document["epoch"]), frozenset(document["names"]))
+    try:
+        document = json.loads(gzip.decompress(content))
+        return Fence(int(document["epoch"]), frozenset(document["names"]))
+    except (EOFError, zlib.error, OSError, ValueError, KeyError, TypeError) as error:
+        raise CopyError(f"{max(names)} is damaged") from error
 
 
 def largest_epoch(names: Iterable[str]) -> int:

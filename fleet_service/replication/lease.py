@@ -1,7 +1,7 @@
 """Lease of an archive's bucket copy. It needs only a bucket with conditional create.
 
-    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the
-                            highest number holds
+    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to",
+                            "lease_s"}: the highest number holds
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
 A service takes over by creating the next number, which only one can do. It renews by writing its
@@ -13,21 +13,29 @@ only what is in the bucket already, and only within `lease_s / 2` after it *bega
 A valid renewal saw no higher number, so it began before T. B takes over when it has seen the same
 turn for `lease_s` (or for HINT of it, when A's token fell): then A's last renewal began before B
 saw it first, and A's time was over before T. If the turn has changed after T, a renewal landed in
-between, and B waits for `lease_s / 2` more. Only then B lists the bucket: everything that A
-acknowledged is there. An acknowledgement that A's network delivers later is still true. If A was
-frozen and uploads after the listing, its files have an older epoch and are not in B's fence
-(`archive.terms`): they do not count, and A acknowledged none of them. A deletes only after it
-uploaded the replacement and saw no higher number, so B finds the replacement.
+between, and B waits for `lease_s` more: twice the time in which A acknowledges, so that A's clock
+may be slower. Only then B lists the bucket: everything that A acknowledged is there. An
+acknowledgement that A's network delivers later is still true. If A was frozen and uploads after the
+listing, its files have an older epoch and are not in B's fence (`archive.terms`): they do not
+count, and A acknowledged none of them. A deletes only after it uploaded the replacement and saw no
+higher number, so B finds the replacement.
 
 Why nothing is doubled. The files that count are one set, which B reads completely before it admits
 anything. A batch that A archived and did not acknowledge is known to B and acknowledged again. Rows
 of A outside this set are sent again and admitted once. A's folder is synchronised with the bucket
 before A serves again.
 
+All of this needs one `lease_s` on all machines, so it is in the object. A service with another
+value does not start next to a live holder. Fields that this version does not know are ignored; an
+older version's record has no `lease_s`. A damaged object is one whose holder is unknown: a live
+holder writes it again with its next turn.
+
 A machine that was suspended finds its lease expired (`elapsed_seconds`).
 
-Not covered: a machine whose elapsed-time clock runs at less than half the speed of another's, or
-stops while it is migrated between hosts, and a bucket without read-after-write consistency.
+Not covered: a machine whose elapsed-time clock runs at less than 5/6 of another one's speed (half
+of it where no token falls), or stops while it is migrated between hosts, and a bucket without
+read-after-write consistency. `tests/faults/protocol_model.py` checks all states of a model, and
+`tests/faults/lease_histories.py` judges histories of this module in virtual time.
 """
 
 from __future__ import annotations
@@ -40,6 +48,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -58,6 +67,7 @@ HINT: Final = 0.6
 # between two times that a standby gets what is new, so that little is left when it must
 AHEAD_S: Final = 10.0
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
+UNKNOWN: Final = "unknown"  # the service of a damaged lease object
 LOOK_S: Final = 0.25  # between two looks of who waits
 
 
@@ -71,6 +81,7 @@ class LeaseRecord(NamedTuple):
         released: True if the holder released it.
         before: names of the services that held it earlier.
         to: the service for which it was released; others leave it alone for one lease time.
+        lease_s: of the holder; 0 in a record of an older version.
     """
 
     number: int
@@ -81,6 +92,7 @@ class LeaseRecord(NamedTuple):
     released: bool
     before: tuple[str, ...] = ()
     to: str = ""
+    lease_s: float = 0.0
 
     @property
     def name(self) -> str:
@@ -193,7 +205,7 @@ class Lease:
             standby: None for a service that is no standby and does not wait for a live holder.
 
         Raises:
-            InputError: a live service has it, and this one is no standby.
+            InputError: a live service has it, and this one is no standby or has another `lease_s`.
             CopyError: the bucket cannot be reached, and this one is no standby.
         """
         seen: LeaseRecord | None = None
@@ -225,6 +237,8 @@ class Lease:
                     found.to in ("", self.service)
                     and (found.released or self._was_held_here(found))
                 )
+                if not free and found is not None:
+                    _check_settings(found, self._lease_s)
                 if free or time.monotonic() - since >= stale_s:
                     if (standby is None or standby.may()) and self._take(found, epoch, stop):
                         return True
@@ -302,7 +316,15 @@ class Lease:
     def _newest(self) -> LeaseRecord | None:
         names = [name for name in self._bucket.names(FOLDER) if name.endswith(".json")]
         content = self._bucket.get(max(names)) if names else None
-        return None if content is None else _read(max(names), content)
+        if content is None:
+            return None
+        found = _read(max(names), content)
+        if found is not None:
+            return found
+        former = sorted(names)[-2] if len(names) > 1 else ""
+        previous = self._bucket.get(former) if former else None
+        last = None if previous is None else _read(former, previous)
+        return _unknown_holder(max(names), content, last)
 
     def _take(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
@@ -312,7 +334,14 @@ class Lease:
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
         mine = LeaseRecord(
-            number, self._holder, self.service, epoch, 0, released=False, before=before
+            number=number,
+            holder=self._holder,
+            service=self.service,
+            epoch=epoch,
+            turn=0,
+            released=False,
+            before=before,
+            lease_s=self._lease_s,
         )
         began = elapsed_seconds()
         if not self._bucket.make(mine.name, mine.content):
@@ -321,9 +350,8 @@ class Lease:
         self._renewed = began
         self.succeeds = found is not None and found.holder != self._holder
         if found is not None and self._bucket.get(found.name) != found.content:
-            stop.wait(
-                self._lease_s / 2
-            )  # it was renewed in between, and may acknowledge for so long
+            # it was renewed in between, and may acknowledge for half of that by its own clock
+            stop.wait(self._lease_s)
         return True
 
 
@@ -365,8 +393,52 @@ def forget_holder(root: Path) -> None:
     (root / layout.EPOCH_FILE).unlink(missing_ok=True)
 
 
-def _read(name: str, content: bytes) -> LeaseRecord:
-    record: dict[str, Any] = json.loads(content)
+def _check_settings(found: LeaseRecord, lease_s: float) -> None:
+    """Raise InputError if the live holder uses another lease time: it would acknowledge after a
+    take-over.
+    """
+    if found.lease_s not in (0.0, lease_s):
+        problem = (
+            f"is {lease_s:g}, and {found.service}, which has the lease, uses {found.lease_s:g}"
+        )
+        raise InputError(
+            "archive.lease_s", problem, "give all services of an archive the same value"
+        )
+
+
+def _read(name: str, content: bytes) -> LeaseRecord | None:
+    """Return the record of an object; None if it is damaged. Unknown fields are ignored."""
+    try:
+        record: dict[str, Any] = json.loads(content)
+        found = LeaseRecord(
+            number=int(Path(name).stem),
+            holder=record["holder"],
+            service=record["service"],
+            epoch=record["epoch"],
+            turn=record["turn"],
+            released=record["released"],
+            before=tuple(record.get("before", ())),
+            to=record.get("to", ""),
+            lease_s=float(record.get("lease_s", 0.0)),
+        )
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    texts = (found.holder, found.service, found.to, *found.before)
+    is_valid = all(isinstance(text, str) for text in texts) and isinstance(found.released, bool)
+    is_valid = is_valid and all(
+        type(number) is int and number >= 0 for number in (found.epoch, found.turn)
+    )
+    return found if is_valid and found.lease_s >= 0.0 else None
+
+
+def _unknown_holder(name: str, content: bytes, previous: LeaseRecord | None) -> LeaseRecord:
+    """Return a record for a damaged object: held by nobody known, and changed whenever the
+    object changes.
+    """
+    log.warning("the lease object %s is damaged", name)
+    turn = int.from_bytes(blake2b(content, digest_size=6).digest(), "big")
+    before = () if previous is None else (*previous.before, previous.service)
+    epoch = 0 if previous is None else previous.epoch + 1
     return LeaseRecord(
-        int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))}
+        int(Path(name).stem), "", UNKNOWN, epoch, turn, released=False, before=before
     )

@@ -15,6 +15,7 @@ values, but not the names and types of the columns.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import lru_cache
 from hashlib import blake2b
@@ -88,7 +89,7 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
 
     Raises:
         DamagedError: its columns or its key-value pairs are not those that were written.
-        InputError: it is of a newer major version.
+        InputError: it is of a newer major version, or states no valid version.
     """
     if KEY not in entries and DIGEST not in entries:
         if digest(schema, {}) not in FIRST:
@@ -108,7 +109,17 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
 
 
 def parse_version(text: str) -> Version:
-    """Return a version from its text."""
+    """Return a version from its text.
+
+    Raises:
+        InputError: it is not two numbers.
+    """
+    if re.fullmatch(r"[0-9]{1,6}\.[0-9]{1,6}", text) is None:
+        raise InputError(
+            "archive",
+            f"version {text[:20]!r} is not MAJOR.MINOR",
+            "use the GripMap that wrote the file",
+        )
     major, minor = text.split(".")
     return Version(int(major), int(minor))
 

@@ -319,7 +319,9 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
     holder = Machine(tmp_path / "one", bucket)
     with (
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told,
-        hosts(tmp_path, ["two"], router.connect[0], bucket, metrics_port=0) as (two,),
+        hosts(tmp_path, ["two"], router.connect[0], bucket, lease_s=LEASE_S, metrics_port=0) as (
+            two,
+        ),
     ):
         told.bind(str(tmp_path / "notify"))
         told.settimeout(PATIENCE_S)

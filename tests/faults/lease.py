@@ -1,0 +1,77 @@
+"""Histories with unlike lease times, skewed clocks, pauses, partitions and kills; see
+`lease_histories`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+from unittest.mock import patch
+
+from fleet_service.replication import lease as lease_module
+from fleet_service.replication.lease import Lease
+from schemas.runtime.figures import Figure
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.faults.lease_histories import ServiceHistory, judge_history
+
+
+class Judged(NamedTuple):
+    """Sums over histories."""
+
+    acknowledged_by_two: int
+    violations: int
+    failovers: int
+    acknowledged: int
+    refused: int
+
+
+def judge_seeds(seeds: Iterable[int]) -> Judged:
+    """Play and judge a history per seed."""
+    counts = [0] * len(Judged._fields)
+    for seed in seeds:
+        history = ServiceHistory(seed)
+        history.run()
+        verdict = judge_history(history.events)
+        kinds = [event.kind for event in history.events]
+        found = (
+            verdict.acknowledged_by_two,
+            verdict.violations,
+            max(kinds.count("serves") - 1, 0),
+            kinds.count("acknowledges"),
+            history.refused,
+        )
+        counts = [one + other for one, other in zip(counts, found, strict=True)]
+    return Judged(*counts)
+
+
+def judge_without_comparison(seeds: Iterable[int]) -> Judged:
+    """Judge histories in which lease times are not compared."""
+    with patch.object(lease_module, "_check_settings", lambda *_: None):
+        return judge_seeds(seeds)
+
+
+def judge_without_expiry(seeds: Iterable[int]) -> Judged:
+    """Judge histories in which a holder acknowledges until it notices its successor."""
+    fresh = property(lambda lease: not lease.lost)
+    with patch.object(Lease, "fresh", fresh):
+        return judge_seeds(seeds)
+
+
+def run(site: Site) -> list[Figure]:
+    """Judge the histories, and two protocols that each lack a rule and must be found out."""
+    first = 1000 * site.seed
+    judged = judge_seeds(range(first, first + site.of(200, 12)))
+    controls = range(first, first + site.of(40, 12))
+    unlike = judge_without_comparison(controls)
+    endless = judge_without_expiry(controls)
+    site.say(f"{judged}; without comparison {unlike}; without expiry {endless}")
+    return [
+        figure("faults.lease.acknowledged_by_two", judged.acknowledged_by_two),
+        figure("faults.history.violations", judged.violations),
+        figure("faults.history.failovers", judged.failovers),
+        figure("faults.history.acknowledged", judged.acknowledged),
+        figure("faults.lease.refused", judged.refused),
+        figure("faults.lease.control_unlike", unlike.acknowledged_by_two),
+        figure("faults.lease.control_endless", endless.acknowledged_by_two),
+    ]

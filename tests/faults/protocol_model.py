@@ -1,0 +1,292 @@
+"""Explicit-state model of acknowledgement, lease, take-over, hand-over and erasure; `check` visits
+every state.
+
+Two services share a bucket; a vehicle has BATCHES. Time passes in ticks, during which each
+service's clock advances by one; that of a holder may stand still in every second tick. No step must
+be taken: a service that takes none for a while is frozen, or cut off. Uploads and renewals take
+effect in the bucket at any time after they began.
+
+    renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal
+             counts from its begin
+    ack      only within lease / 2 of the begin of the last valid renewal, and only for batches
+             that are uploaded
+    take     a standby that saw the same turn for its lease time creates the next number; if the
+             turn changed meanwhile, it waits for its lease time more
+    list     reads all objects of the bucket: these count, and later objects of older numbers do
+             not (the fence)
+    release  hands the lease over at once; the holder acknowledges nothing afterwards
+    erase    the holder deletes a batch from the bucket after it wrote that it is erased
+
+Invariants: every acknowledged batch that is not erased is known to each serving service; a batch
+counts at most once; an erased batch counts nowhere and is not accepted again.
+
+`Rules` switches single rules off. Each of them must then break an invariant: so the model can fail.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+NAMES: Final = (0, 1)
+BATCHES: Final = (0,)  # batches do not depend on each other
+NOT_YET: Final = -1
+
+
+class Rules(NamedTuple):
+    """Rules of the protocol, and the lease times [ticks] of both services."""
+
+    lease: tuple[int, int] = (4, 4)
+    compares_lease: bool = True
+    acknowledges_within_half: bool = True
+    lists_after_waiting: bool = True
+    wait_share: int = 2  # halves of the lease time for which it waits before it lists
+    has_fence: bool = True
+    remembers_erasure: bool = True
+
+
+BROKEN: Final = {
+    "unlike lease times": Rules(lease=(6, 2), compares_lease=False),
+    "acknowledges for ever": Rules(acknowledges_within_half=False),
+    "waits half a lease next to a slow clock": Rules(wait_share=1),
+    "no fence": Rules(has_fence=False),
+    "erasure forgotten": Rules(remembers_erasure=False),
+}  # each lacks one rule
+
+
+class Service(NamedTuple):
+    """State of a service.
+
+    Attributes:
+        role: "waiting", "taking" (has created its number and not listed yet), "serving", or "gone".
+        number: of its lease; 0 without one.
+        age: ticks since the begin of its last valid renewal, capped.
+        begun: age of a renewal under way; NOT_YET for none.
+        seen: (number, turn) of the lease that it saw last, and `same` for how long [ticks].
+        same: see `seen`.
+        wait: ticks to wait before it lists.
+        known: batches that it knows.
+        sending: batches whose upload is under way.
+        uploaded: own uploads that it knows to be in the bucket.
+        slow: its clock did not advance in the last tick.
+    """
+
+    role: str = "waiting"
+    number: int = 0
+    age: int = 0
+    begun: int = NOT_YET
+    seen: tuple[int, int] = (0, 0)
+    same: int = 0
+    wait: int = 0
+    known: frozenset[int] = frozenset()
+    sending: frozenset[int] = frozenset()
+    uploaded: frozenset[int] = frozenset()
+    slow: bool = False
+
+
+class World(NamedTuple):
+    """State of everything.
+
+    Attributes:
+        services: both.
+        number, holder, turn, released: the newest lease object.
+        objects: (batch, number) in the bucket.
+        fence: (number, objects of before that count).
+        acked: batches that the vehicle was told are durable.
+        erased: batches that were erased.
+    """
+
+    services: tuple[Service, Service]
+    number: int = 0
+    holder: int = NOT_YET
+    turn: int = 0
+    released: bool = False
+    objects: frozenset[tuple[int, int]] = frozenset()
+    fence: tuple[int, frozenset[tuple[int, int]]] = (0, frozenset())
+    acked: frozenset[int] = frozenset()
+    erased: frozenset[int] = frozenset()
+
+
+class Violation(NamedTuple):
+    """Broken invariant, and the steps that lead to it."""
+
+    problem: str
+    steps: tuple[str, ...]
+
+
+class Checked(NamedTuple):
+    """Result of a check."""
+
+    states: int
+    violation: Violation | None
+
+
+def check(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
+    """Visit all states with up to this many lease numbers and turns; stop at the first
+    violation.
+    """
+    start = World((Service(), Service()))
+    came: dict[World, tuple[World, str] | None] = {start: None}
+    waiting = deque([start])
+    while waiting:
+        world = waiting.popleft()
+        problem = find_problem(world)
+        if problem:
+            return Checked(len(came), Violation(problem, _steps_to(world, came)))
+        for step, after in steps(world, rules, most_number, most_turn):
+            if after not in came:
+                came[after] = (world, step)
+                waiting.append(after)
+    return Checked(len(came), None)
+
+
+def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tuple[str, ...]:
+    out = []
+    while (before := came[world]) is not None:
+        world, step = before
+        out.append(step)
+    return tuple(reversed(out))
+
+
+def counting(world: World) -> list[int]:
+    """Return the batches of the objects that count for a reader of the bucket."""
+    number, before = world.fence
+    return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
+
+
+def find_problem(world: World) -> str:
+    """Return the broken invariant, or ""."""
+    counted = counting(world)
+    if len(counted) != len(set(counted)):
+        return "a batch counts twice"
+    if world.erased & set(counted):
+        return "an erased batch counts"
+    if (world.acked - world.erased) - set(counted):
+        return "an acknowledged batch does not count"
+    current = [s for s in world.services if s.role == "serving" and s.number == world.number]
+    if any((world.acked - world.erased) - s.known for s in current):
+        return "the serving service does not know an acknowledged batch"
+    return ""
+
+
+def steps(
+    world: World, rules: Rules, most_number: int, most_turn: int
+) -> Iterator[tuple[str, World]]:
+    """Yield each possible step and the state after it."""
+    for slow in (NOT_YET, *NAMES):
+        if slow == NOT_YET or (
+            not world.services[slow].slow and world.services[slow].role == "serving"
+        ):
+            yield f"tick, slow {slow}", _tick(world, slow, rules)
+    for me in NAMES:
+        one = world.services[me]
+        for batch in one.sending:  # the network delivers whatever the service does
+            landed = world._replace(objects=world.objects | {(batch, one.number)})
+            known = one._replace(sending=one.sending - {batch}, uploaded=one.uploaded | {batch})
+            yield f"upload of {batch} by {me} lands", _with(landed, me, known)
+        yield from _serve(world, me, rules, most_turn)
+        yield from _stand_by(world, me, rules, most_number)
+
+
+def _serve(world: World, me: int, rules: Rules, most_turn: int) -> Iterator[tuple[str, World]]:
+    one = world.services[me]
+    if one.role != "serving":
+        return
+    lease = rules.lease[me]
+    if one.begun == NOT_YET:
+        yield f"{me} begins a renewal", _with(world, me, one._replace(begun=0))
+    elif world.number != one.number:
+        yield f"{me} sees that it lost the lease", _with(world, me, _gone(one))
+    elif not world.released and world.turn < most_turn:
+        renewed = one._replace(age=one.begun, begun=NOT_YET)
+        yield f"{me} renews", _with(world._replace(turn=world.turn + 1), me, renewed)
+    is_fresh = one.age < lease / 2 or not rules.acknowledges_within_half
+    for batch in BATCHES:
+        is_refused = batch in world.erased and rules.remembers_erasure
+        if batch not in one.known and batch not in one.sending and not is_refused:
+            yield (
+                f"{me} takes {batch}",
+                _with(
+                    world,
+                    me,
+                    one._replace(known=one.known | {batch}, sending=one.sending | {batch}),
+                ),
+            )
+        if is_fresh and batch in one.uploaded and batch not in world.acked:
+            yield f"{me} acknowledges {batch}", world._replace(acked=world.acked | {batch})
+        if (
+            is_fresh
+            and world.number == one.number
+            and batch in one.known
+            and (batch, one.number) in world.objects
+        ):
+            kept = frozenset(o for o in world.objects if o[0] != batch)
+            gone = one._replace(known=one.known - {batch}, uploaded=one.uploaded - {batch})
+            yield (
+                f"{me} erases {batch}",
+                _with(world._replace(objects=kept, erased=world.erased | {batch}), me, gone),
+            )
+    if world.number == one.number and not one.sending and not world.released:
+        yield f"{me} hands over", _with(world._replace(released=True), me, _gone(one))
+
+
+def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator[tuple[str, World]]:
+    one = world.services[me]
+    now = (world.number, world.turn)
+    if one.role == "waiting":
+        other = rules.lease[1 - me]
+        is_refused = (
+            rules.compares_lease
+            and world.holder == 1 - me
+            and not world.released
+            and other != rules.lease[me]
+        )
+        if one.seen != now:
+            yield f"{me} looks", _with(world, me, one._replace(seen=now, same=0))
+        is_free = world.number == 0 or world.released
+        is_stale = one.seen[0] == world.number and one.same >= rules.lease[me]
+        if not is_refused and world.number < most_number and (is_free or is_stale):
+            is_changed = not is_free and one.seen != now and rules.lists_after_waiting
+            wait = rules.wait_share * rules.lease[me] // 2 if is_changed else 0
+            taken = Service("taking", world.number + 1, age=0, wait=wait)
+            after = world._replace(number=world.number + 1, holder=me, turn=0, released=False)
+            yield f"{me} takes number {world.number + 1}", _with(after, me, taken)
+    elif one.role == "taking" and one.wait <= 0:
+        if world.number != one.number:
+            yield f"{me} lost it before it served", _with(world, me, _gone(one))
+            return
+        counted = frozenset(counting(world))
+        fence = (one.number, frozenset(world.objects)) if rules.has_fence else world.fence
+        served = one._replace(role="serving", wait=0, known=counted, uploaded=counted)
+        yield f"{me} lists", _with(world._replace(fence=fence), me, served)
+
+
+def _tick(world: World, slow: int, rules: Rules) -> World:
+    """Advance the clocks that are in use: of a lease, of a wait for it, or of a wait before
+    listing.
+    """
+    out = []
+    for me, one in enumerate(world.services):
+        most = rules.lease[me] + 1
+        if me == slow:
+            one = one._replace(slow=True)
+        elif one.role == "waiting":
+            one = one._replace(same=min(one.same + 1, most), slow=False)
+        elif one.role != "gone":
+            begun = one.begun if one.begun == NOT_YET else min(one.begun + 1, most)
+            one = one._replace(
+                age=min(one.age + 1, most), begun=begun, wait=max(one.wait - 1, 0), slow=False
+            )
+        out.append(one)
+    return world._replace(services=(out[0], out[1]))
+
+
+def _gone(one: Service) -> Service:
+    """Return a service that serves no more; what the network still holds of it may land."""
+    return Service("gone", one.number, age=0, sending=one.sending)
+
+
+def _with(world: World, me: int, one: Service) -> World:
+    services = (one, world.services[1]) if me == 0 else (world.services[0], one)
+    return world._replace(services=services)

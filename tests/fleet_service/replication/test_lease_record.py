@@ -1,0 +1,128 @@
+"""The lease object states the lease time; other versions are read; damage is waited for and
+never ends a service.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import threading
+from typing import cast
+
+import pytest
+
+from fleet_service.archive.format.version import Version, parse_version
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.fence import fence_of
+from fleet_service.replication.lease import UNKNOWN, Lease, Standby
+from schemas.errors import InputError
+
+
+class MemoryBucket:
+    """Bucket in memory with conditional create."""
+
+    def __init__(self) -> None:
+        self.objects: dict[str, bytes] = {}
+
+    def names(self, folder: str) -> list[str]:
+        return [name for name in self.objects if name.startswith(f"{folder}/")]
+
+    def get(self, name: str) -> bytes | None:
+        return self.objects.get(name)
+
+    def put(self, name: str, content: bytes) -> None:
+        self.objects[name] = content
+
+    def make(self, name: str, content: bytes) -> bool:
+        return self.objects.setdefault(name, content) is content
+
+
+def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
+    return Lease(name, cast(ObjectBucket, bucket), name, lease_s)
+
+
+def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
+    """Return the lease of a standby after it took over."""
+    standby = Standby(
+        may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
+    )
+    lease = lease_on(bucket, name, lease_s)
+    assert lease.wait(threading.Event(), print, lambda: 0, standby)
+    return lease
+
+
+@pytest.mark.parametrize(("holder_s", "standby_s"), [(60.0, 5.0), (5.0, 60.0), (0.5, 0.6)])
+def test_service_with_another_lease_time_does_not_start(holder_s: float, standby_s: float) -> None:
+    bucket = MemoryBucket()
+    holder = lease_on(bucket, "one", holder_s)
+    assert holder._take(None, lambda: 0, threading.Event())
+    with pytest.raises(
+        InputError, match=rf"archive.lease_s: is {standby_s:g}, and one, .* uses {holder_s:g}"
+    ):
+        standby_of(bucket, "two", standby_s)
+    assert holder.fresh
+    holder.release()
+    assert standby_of(bucket, "two", standby_s).former == ("one",)
+
+
+@pytest.mark.parametrize("lease_s", [None, 0.5])
+def test_lease_of_another_version_is_read(lease_s: float | None) -> None:
+    bucket = MemoryBucket()
+    record = {
+        "holder": "one",
+        "service": "one",
+        "epoch": 7,
+        "turn": 3,
+        "released": False,
+        "later": {"a": [1]},
+    }
+    bucket.put(
+        "lease/0000000002.json",
+        json.dumps(record | ({} if lease_s is None else {"lease_s": lease_s})).encode(),
+    )
+    standby = standby_of(bucket, "two", 0.5)
+    assert (standby.term.number, standby.former) == (3, ("one",))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b'{"holder": "one", "ser',
+        b"[]",
+        b"\xff",
+        b'{"holder":1,"service":2,"epoch":"x","turn":0,"released":0}',
+    ],
+)
+def test_damaged_lease_is_waited_for_and_then_taken(content: bytes) -> None:
+    bucket = MemoryBucket()
+    assert lease_on(bucket, "one", 0.5)._take(None, lambda: 0, threading.Event())
+    bucket.put("lease/0000000002.json", content)
+    standby = standby_of(bucket, "two", 0.5)
+    assert (standby.term.number, standby.former) == (3, ("one", UNKNOWN))
+
+
+def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
+    bucket = MemoryBucket()
+    holder = lease_on(bucket, "one", 0.5)
+    assert holder._take(None, lambda: 0, threading.Event())
+    name = "lease/0000000001.json"
+    bucket.put(name, bucket.objects[name][:20])
+    holder.renew()
+    assert holder.fresh
+    assert json.loads(bucket.objects[name])["service"] == "one"
+
+
+def test_damaged_fence_is_an_error_of_the_copy() -> None:
+    bucket = MemoryBucket()
+    for content in (b"", b"no gzip", gzip.compress(b"[]"), gzip.compress(b'{"epoch": 1}')):
+        bucket.put("fence/0000000001-000001.json.gz", content)
+        with pytest.raises(CopyError, match="is damaged"):
+            fence_of(cast(ObjectBucket, bucket))
+
+
+@pytest.mark.parametrize("text", ["1.x", "1", "", "1.2.3", "one", " 1.2", "-1.0"])
+def test_malformed_version_is_an_input_error(text: str) -> None:
+    with pytest.raises(InputError, match="archive: version .* is not MAJOR.MINOR"):
+        parse_version(text)
+    assert parse_version("10.2") == Version(10, 2)

@@ -1,0 +1,23 @@
+"""The protocol keeps its promises in every state, and each of its rules is needed."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.faults.protocol_model import BROKEN, Rules, check
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("lease", [(4, 4), (6, 2)])
+def test_no_state_breaks_a_promise(lease: tuple[int, int]) -> None:
+    found = check(Rules(lease=lease), most_turn=1)
+    assert found.violation is None
+    assert found.states > 100
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("rules", BROKEN.values(), ids=BROKEN)
+def test_each_rule_is_needed(rules: Rules) -> None:
+    found = check(rules, most_turn=1)
+    assert found.violation is not None
+    assert found.violation.steps
