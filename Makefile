@@ -13,8 +13,8 @@ export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of pro
 # Main targets have a comment "##", campaigns "#=", everything else "#-"; `make help` and `make campaigns` print them.
 .DEFAULT_GOAL := help
 .PHONY: help campaigns setup demo test test-all test-shuffled check package docs lint types results figures release \
-  faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability roads-bench \
-  page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
+  faults faults-quick cluster-faults soak bench tune proto lock audit fuzz clean analytics-bench spark-test usability \
+  roads-bench page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
 
 help:  #- print the main targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | awk -F '\t' '{printf "%-18s%s\n", $$1, $$2}'
@@ -150,8 +150,17 @@ proto: setup  #- generate the message modules
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto
 	cd edge_agent/inputs/live/kuksa && $(CURDIR)/$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. broker.proto
 
-lock: setup  #- write the installed versions to constraints.txt
+lock: setup  #- write the installed versions and their hashes
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip compile --quiet --generate-hashes --no-deps --no-annotate --no-header --python-version 3.11.9 constraints.txt -o deploy/constraints-hashes.txt
+
+audit: setup  #- look for known vulnerabilities of the pinned versions; needs a network
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
+	$(BIN)/pip-audit --no-deps --disable-pip --require-hashes -r deploy/constraints-hashes.txt
+
+fuzz: setup  #= coverage-guided fuzzing of parsers, ten minutes; FUZZ_S=SECONDS for each parser
+	$(BIN)/python -m tests.fuzz --seconds $(or $(FUZZ_S),45)
 
 clean:
 	rm -rf deploy/docs/reference/generated .iov .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info

@@ -1,5 +1,5 @@
-"""Prepare a release: check the changelog, set the version, and build sdist, wheel and SBOM in
-`dist/`.
+"""Prepare a release: check the changelog, set the version, and build sdist, wheel, SBOM and
+licences in `dist/`.
 
     python -m tests.release 0.2.0
 
@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 from datetime import UTC, datetime
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Final
 
@@ -69,6 +70,20 @@ def set_version(root: Path, version: str, day: str) -> None:
     citation.write_text(with_version(text, r'^(date-released: ")', day), encoding="utf-8")
 
 
+def licences() -> str:
+    """Return a line per installed package: name, version, licence."""
+    lines = []
+    for package in distributions():
+        about = package.metadata
+        classifiers = about.get_all("Classifier") or []
+        named = [line.rpartition(" :: ")[2] for line in classifiers if line.startswith("License")]
+        stated = [about[name] for name in ("License-Expression", "License") if name in about]
+        text = next(iter([*stated[:1], ", ".join(named)]), "") or "?"
+        text = text.splitlines()[0]
+        lines.append(f"{about['Name']} {package.version}: {text}")
+    return "\n".join(sorted(set(lines), key=str.lower)) + "\n"
+
+
 def main() -> int:
     """Run all steps; print what remains to be done by hand."""
     version = next(iter(sys.argv[1:]), "")
@@ -87,7 +102,8 @@ def main() -> int:
     sbom = ROOT / "dist" / f"gripmap-{version}.cdx.json"
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(sbom)]
     subprocess.run(command, cwd=ROOT, check=True)
-    print(f"dist/ holds version {version}. Commit, then: git tag -a v{version}\n\n{section}")
+    (ROOT / "dist" / "licences.txt").write_text(licences(), encoding="utf-8")
+    print(f"dist/ holds version {version}. Commit, then: git tag -s v{version}\n\n{section}")
     return 0
 
 

@@ -15,10 +15,13 @@ from tests.faults import (
     disk,
     flood,
     fuzz,
+    fuzz_parsers,
     fuzz_wire,
     insider,
     kill,
+    lease,
     link,
+    model,
     outages,
     path,
     queries,
@@ -202,6 +205,29 @@ CAMPAIGNS: Final = (
                 "faults.path.teleports",
             ),
             *("faults.path.two_car_alerts", "faults.path.pair_alerts", "faults.path.honest_alerts"),
+        ),
+    ),
+    Campaign(
+        "model",
+        model.run,
+        ("faults.model.violations", "faults.model.unnoticed", "faults.model.states_checked"),
+    ),
+    Campaign(
+        "lease",
+        lease.run,
+        (
+            *("faults.lease.acknowledged_by_two", "faults.lease.refused"),
+            *("faults.lease.control_unlike", "faults.lease.control_endless"),
+            *("faults.history.violations", "faults.history.failovers"),
+            "faults.history.acknowledged",
+        ),
+    ),
+    Campaign(
+        "fuzz-parsers",
+        fuzz_parsers.run,
+        (
+            *("faults.fuzz_parsers.crashes", "faults.fuzz_parsers.hangs"),
+            *("faults.fuzz_parsers.executions", "faults.fuzz_parsers.lines"),
         ),
     ),
     Campaign(

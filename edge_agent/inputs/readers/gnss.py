@@ -75,7 +75,10 @@ def parse_gpsd(line: str) -> Fix | None:
     report = json.loads(line)
     if not isinstance(report, dict):
         raise ValueError("no object")
-    if report.get("class") != "TPV" or report.get("mode", 0) < 2 or "time" not in report:
+    mode = report.get("mode", 0)
+    if not isinstance(mode, (int, float)):
+        raise ValueError("mode is no number")
+    if report.get("class") != "TPV" or mode < 2 or "time" not in report:
         return None
     moment = datetime.fromisoformat(str(report["time"])).astimezone(UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)

@@ -1,0 +1,259 @@
+"""Coverage-guided fuzzing of parsers: what an input makes run decides whether it is kept and
+changed further.
+
+    python -m tests.fuzz [--seconds 45] [--only NAME …] [--seed N] [--out .fuzz]
+
+Each parser has seeds in `tests/data/fuzz/NAME/`, which are kept, and a corpus in the folder
+`--out`. A crash is any exception that the parser does not document; a hang is more than SLOW_S for
+one input. Inputs that crash or hang are written next to the corpus. Found inputs that matter belong
+into `tests/data/fuzz`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import random
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any, Final, NamedTuple, cast
+
+from edge_agent.inputs.readers.dbc import parse_dbc
+from edge_agent.inputs.readers.gnss import parse_gpsd, parse_nmea
+from fleet_service.archive.format.version import parse_version
+from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.fence import fence_of
+from fleet_service.replication.lease import _read
+from schemas import keys, query, wire
+from schemas.errors import InputError
+from schemas.runtime.batch_decoder import decode_many
+from schemas.wire import Kind
+from schemas.wire.tile import decode_tile
+from tests.structure import ROOT
+
+SEEDS: Final = ROOT / "tests" / "data" / "fuzz"
+# of processor time, for inputs of at most LONGEST bytes, which take milliseconds
+SLOW_S: Final = 5.0
+LONGEST: Final = 4096
+CODE: Final = tuple(str(ROOT / name) for name in ("schemas", "edge_agent", "fleet_service"))
+# that readers of lines catch
+GNSS_ERRORS: Final = (ValueError, TypeError, OverflowError, RecursionError)
+WORDS: Final = (
+    *(
+        b"\x00",
+        b"\xff",
+        b"-1",
+        b"1e308",
+        b"nan",
+        b"null",
+        b'"',
+        b"{",
+        b"[",
+        b":",
+        b"|",
+        b"@",
+        b"*",
+        b"/",
+    ),
+    b" " * 64,
+)
+
+
+class Parser(NamedTuple):
+    """Parser with the exceptions that it documents."""
+
+    parse: Callable[[bytes], object]
+    allowed: tuple[type[Exception], ...] = (InputError,)
+
+
+class Result(NamedTuple):
+    """Result of fuzzing one parser."""
+
+    executions: int
+    corpus: int
+    lines: int
+    crashes: int
+    hangs: int
+
+
+def _text(parse: Callable[[str], object]) -> Callable[[bytes], object]:
+    return lambda data: parse(data.decode("utf-8", "replace"))
+
+
+def _query(data: bytes) -> object:
+    pairs = (part.partition("=") for part in data.decode("utf-8", "replace").split(";"))
+    return query.parse({name: value for name, _, value in pairs})
+
+
+class _OneFence:
+    """Bucket with one fence object."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+
+    def names(self, _: str) -> list[str]:
+        """Return the name of the object."""
+        return ["fence/0000000001-000001.json.gz"]
+
+    def get(self, _: str) -> bytes:
+        """Return the content."""
+        return self._content
+
+
+PARSERS: Final = {
+    "observations": Parser(
+        lambda data: decode_many(Kind.OBSERVATION, [(data, wire.ENCODING[Kind.OBSERVATION])])
+    ),
+    "states": Parser(lambda data: decode_many(Kind.STATE, [(data, wire.ENCODING[Kind.STATE])])),
+    "json": Parser(lambda data: decode_many(Kind.OBSERVATION, [(data, wire.JSON)])),
+    "acks": Parser(wire.decode_ack),
+    "alerts": Parser(wire.decode_alert),
+    "standing": Parser(wire.decode_standing),
+    "tiles": Parser(decode_tile),
+    "queries": Parser(_query),
+    "keys": Parser(_text(keys.parse)),
+    "versions": Parser(_text(parse_version)),
+    "dbc": Parser(_text(parse_dbc)),
+    "nmea": Parser(_text(parse_nmea), GNSS_ERRORS),
+    "gpsd": Parser(_text(parse_gpsd), GNSS_ERRORS),
+    "leases": Parser(lambda data: _read("lease/0000000001.json", data)),
+    "fences": Parser(
+        lambda data: fence_of(cast(ObjectBucket, _OneFence(data))), (InputError, CopyError)
+    ),
+}
+
+
+class Fuzzer:
+    """Fuzzer of one parser.
+
+    Args:
+        parser: to be fuzzed.
+        inputs: to begin with.
+        seed: of the changes.
+        keep: called with kind and content of each input that is kept: corpus, crash or hang.
+    """
+
+    def __init__(
+        self, parser: Parser, inputs: Sequence[bytes], seed: int, keep: Callable[[str, bytes], None]
+    ) -> None:
+        self._parser = parser
+        self._keep = keep
+        self._random = random.Random(seed)
+        self._lines: set[tuple[CodeType, int, int]] = set()
+        self._corpus: list[bytes] = []
+        self._executions = self._crashes = self._hangs = 0
+        for one in inputs or [b""]:
+            self._run(one, always=True)
+
+    def run(self, seconds: float = float("inf"), executions: float = float("inf")) -> Result:
+        """Fuzz for a time or a number of executions."""
+        end = time.monotonic() + seconds
+        while self._executions < executions and time.monotonic() < end:
+            self._run(self._changed(self._random.choice(self._corpus)))
+        return Result(
+            self._executions, len(self._corpus), len(self._lines), self._crashes, self._hangs
+        )
+
+    def _run(self, data: bytes, *, always: bool = False) -> None:
+        known = len(self._lines)
+        began = time.process_time()
+        self._executions += 1
+        sys.settrace(self._trace_call)
+        try:
+            self._parser.parse(data)
+        except self._parser.allowed:
+            pass
+        except Exception:  # noqa: BLE001 whatever it is, it is a crash
+            sys.settrace(None)
+            self._crashes += 1
+            self._keep("crash", data)
+            traceback.print_exc()
+        finally:
+            sys.settrace(None)
+        # the first inputs may compile kernels
+        if not always and time.process_time() - began > SLOW_S:
+            self._hangs += 1
+            self._keep("hang", data)
+        if always or len(self._lines) > known:
+            self._corpus.append(data)
+            self._keep("corpus", data)
+
+    def _trace_call(self, frame: FrameType, event: str, _: Any) -> Any:  # noqa: ANN401 the type of sys.settrace
+        if not frame.f_code.co_filename.startswith(CODE):
+            return None
+        before = 0
+
+        def trace_line(inner: FrameType, _event: str, _arg: Any) -> Any:  # noqa: ANN401
+            nonlocal before
+            self._lines.add((inner.f_code, before, inner.f_lineno))
+            before = inner.f_lineno
+            return trace_line
+
+        return trace_line
+
+    def _changed(self, data: bytes) -> bytes:
+        r = self._random
+        out = bytearray(data)
+        for _ in range(r.choice((1, 1, 2, 4))):
+            place = r.randrange(len(out) + 1)
+            what = r.randrange(6)
+            if what == 0 and out:
+                out[place % len(out)] ^= 1 << r.randrange(8)
+            elif what == 1:
+                out[place:place] = r.choice(WORDS)
+            elif what == 2:
+                del out[place : place + r.randrange(1, 16)]
+            elif what == 3:
+                out[place:place] = out[place : place + r.randrange(1, 64)]
+            elif what == 4:
+                other = r.choice(self._corpus)
+                out[place:] = other[r.randrange(len(other) + 1) :]
+            else:
+                out[place : place + 1] = bytes([r.randrange(256)])
+        return bytes(out[:LONGEST])
+
+
+def seeds_of(name: str) -> list[bytes]:
+    """Return the kept seeds of a parser."""
+    return [path.read_bytes() for path in sorted((SEEDS / name).glob("*"))]
+
+
+def keeper(folder: Path) -> Callable[[str, bytes], None]:
+    """Return a function that writes inputs to a folder, each once."""
+
+    def keep(kind: str, data: bytes) -> None:
+        path = folder / kind / hashlib.sha256(data).hexdigest()[:16]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+    return keep
+
+
+def main() -> int:
+    """Fuzz all parsers, or some; 1 if anything crashed or hung."""
+    parser = argparse.ArgumentParser(
+        prog="tests.fuzz", description="Coverage-guided fuzzing of parsers."
+    )
+    parser.add_argument("--seconds", type=float, default=45.0, help="for each parser (default 45)")
+    parser.add_argument("--only", nargs="+", choices=PARSERS, help="these parsers alone")
+    parser.add_argument("--seed", type=int, default=0, help="of the changes (default 0)")
+    parser.add_argument(
+        "--out", type=Path, default=Path(".fuzz"), help="corpus and findings (default .fuzz)"
+    )
+    args = parser.parse_args()
+    bad = 0
+    for name in args.only or PARSERS:
+        kept = [path.read_bytes() for path in sorted((args.out / name / "corpus").glob("*"))]
+        fuzzer = Fuzzer(PARSERS[name], [*seeds_of(name), *kept], args.seed, keeper(args.out / name))
+        found = fuzzer.run(args.seconds)
+        print(f"{name}: {found}", flush=True)
+        bad += found.crashes + found.hangs
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
