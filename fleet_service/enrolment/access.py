@@ -26,6 +26,8 @@ from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 
 QUESTION_BYTES: Final = 1024  # of payload and attachment; there is none
+# of a picture of the map ahead, or of the signals: ten times the largest measured
+PRIVATE_BYTES: Final = 256 * 1024
 PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
 WEATHER: Final = f"{keys.ROOT}/weather/**"
 SERVED: Final = f"{keys.SERVES}/**"
@@ -82,7 +84,7 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
             },
         },
         "access_control": access_control(fleet),
-        "low_pass_filter": [_no_larger(), _no_payload()],
+        "low_pass_filter": [_no_larger(), _no_larger_private(), _no_payload()],
         "downsampling": rate_caps(fleet, name),
         "qos": {"network": [_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
     }
@@ -227,6 +229,19 @@ def _no_larger() -> Section:
         "messages": ["put"],
         "key_exprs": [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
         "size_limit": wire.MAX_BYTES,
+    }
+
+
+def _no_larger_private() -> Section:
+    """Stop messages of one vehicle for its owner at the first router if they are larger than any
+    agent writes.
+    """
+    return {
+        "id": "private",
+        "flows": ["ingress"],
+        "messages": ["put"],
+        "key_exprs": list(keys.private_keys("*")),
+        "size_limit": PRIVATE_BYTES,
     }
 
 

@@ -30,6 +30,9 @@ KINDS: Final = {
 }
 ZOOMS: Final = (0, 19)  # that an address answers: as far as the public ones go
 DEEPEST: Final = 30
+MOST_BYTES: Final = 4 << 20  # of a tile
+STEP: Final = 10_000  # instructions of SQLite between two looks
+MOST_STEPS: Final = 100  # looks; a tile by its index takes a fraction of one
 _TAG: Final = re.compile(r"<[^>]*>")
 
 
@@ -79,15 +82,22 @@ class TileFile:
         self.zooms = (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west and unpack_tile; None if there is none."""
+        """Return an unpacked tile, counted from the north-west; None if there is none."""
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
         asked = (
             "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
         )
         with self._lock:
-            found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
-        return None if found is None else unpack_tile(bytes(found[0]))
+            steps = iter(range(MOST_STEPS))
+            self._table.set_progress_handler(lambda: next(steps, None) is None, STEP)
+            try:
+                found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
+            except sqlite3.Error:  # damaged, or a view whose query does not end
+                return None
+        if found is None or not isinstance(found[0], bytes) or len(found[0]) > MOST_BYTES:
+            return None
+        return unpack_tile(found[0])
 
 
 class _Pmtiles:

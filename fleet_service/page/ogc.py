@@ -20,6 +20,7 @@ from fleet_service.client import map_client
 from fleet_service.page import asked, features
 from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
 from fleet_service.page.reader import Reader
+from fleet_service.page.turns import PastTurns, TooManyQuestionsError
 from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.tables import MAP_SCHEMA
@@ -39,6 +40,7 @@ class FeatureRoutes:
     def __init__(self, world: MapMirror, reader: Reader) -> None:
         self._world = world
         self._reader = reader
+        self._turns = PastTurns()
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
         """Return the handlers by path."""
@@ -84,7 +86,14 @@ class FeatureRoutes:
         if not self._reader.is_served:
             message = "no service answers for the map; that is no empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
-        return await run_in_threadpool(self._items, request, question)
+        if question.at is None:
+            return await run_in_threadpool(self._items, request, question)
+        try:
+            async with self._turns.take(request.client.host if request.client else ""):
+                return await run_in_threadpool(self._items, request, question)
+        except TooManyQuestionsError:
+            message = "other questions about the past of this client wait already\n"
+            return PlainTextResponse(message, 429, headers={"Retry-After": "5"})
 
     def _items(self, request: Request, question: FeatureQuestion) -> Response:
         table = self._cells(question)

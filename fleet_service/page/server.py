@@ -22,6 +22,7 @@ from fleet_service.client.datex_feed import DatexFile
 from fleet_service.client.watching import GATHER_S
 from fleet_service.page import web
 from fleet_service.page.basemap import BaseMap
+from fleet_service.page.connections import BoundedProtocol, LoopErrors
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
@@ -150,7 +151,9 @@ async def _serve(
         ws="none",
         timeout_graceful_shutdown=LEAVE_S,
         h11_max_incomplete_event_size=64 * 1024,
+        http=BoundedProtocol,
     )
+    asyncio.get_running_loop().set_exception_handler(LoopErrors())
     server = _Server(config)
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     while not server.started and not serving.done():

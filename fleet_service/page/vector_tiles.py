@@ -10,8 +10,10 @@ github.com/protomaps/PMTiles/blob/main/spec/v3.
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import struct
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -32,6 +34,7 @@ _NO_COMPRESSION = 1
 _GZIP_COMPRESSION = 2
 _MVT = 1
 _MOST_DIRECTORY: Final = 16 << 20
+MOST_UNPACKED: Final = 16 << 20  # bytes of a tile or of a directory without compression
 
 
 class TileShape(NamedTuple):
@@ -117,9 +120,18 @@ def _field(number: int, body: bytes) -> bytes:
     return _varint(number << 3 | 2) + _varint(len(body)) + body
 
 
-def unpack_tile(tile: bytes) -> bytes:
-    """Return a tile without the compression that most files give it."""
-    return gzip.decompress(tile) if tile.startswith(_GZIP) else tile
+def unpack_tile(tile: bytes) -> bytes | None:
+    """Return a tile without the compression that most files give it; None if it is damaged or
+    larger than MOST_UNPACKED.
+    """
+    if not tile.startswith(_GZIP):
+        return tile if len(tile) <= MOST_UNPACKED else None
+    try:
+        with gzip.open(io.BytesIO(tile)) as file:
+            found = file.read(MOST_UNPACKED + 1)
+    except (OSError, EOFError, zlib.error):
+        return None
+    return found if len(found) <= MOST_UNPACKED else None
 
 
 class PmtilesFile:
@@ -151,10 +163,22 @@ class PmtilesFile:
         if self._packing not in packings or tile_packing not in packings:
             raise _refusal_of(f"{path} is packed in a way that is not known here (gzip is)")
         self.zooms = (int(least), int(most))
-        self.metadata: dict[str, Any] = json.loads(self._part(about, about_size) or b"{}")
+        try:
+            about_map = json.loads(self._part(about, about_size) or b"{}")
+        except (ValueError, OSError, OverflowError, RecursionError) as error:
+            raise _refusal_of(f"{path} is damaged: its metadata cannot be read") from error
+        self.metadata: dict[str, Any] = about_map if isinstance(about_map, dict) else {}
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west, unpacked; None if there is none."""
+        """Return a tile, counted from the north-west, unpacked; None if there is none, or if the
+        file is damaged there.
+        """
+        try:
+            return self._find_tile(zoom, x, y)
+        except (StopIteration, OSError, OverflowError, ValueError):
+            return None
+
+    def _find_tile(self, zoom: int, x: int, y: int) -> bytes | None:
         wanted = _hilbert(zoom, x, y)
         offset = self._root
         size = self._root_size
@@ -164,13 +188,16 @@ class PmtilesFile:
                 return None
             start, size, run = entry
             if run:
-                return unpack_tile(self._read(self._data + start, size))
+                return unpack_tile(self._read(self._data + start, min(size, MOST_UNPACKED + 1)))
             offset = self._leaves + start
         return None
 
     def _part(self, offset: int, size: int) -> bytes:
         raw = self._read(offset, min(size, _MOST_DIRECTORY))
-        return gzip.decompress(raw) if raw.startswith(_GZIP) else raw
+        part = unpack_tile(raw)
+        if part is None:
+            raise ValueError("a damaged directory")
+        return part
 
     def _read(self, offset: int, size: int) -> bytes:
         with self._path.open("rb") as file:  # of its own, so that threads do not share a position

@@ -12,6 +12,7 @@ import asyncio
 import base64
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Final, NamedTuple
 
@@ -41,6 +42,7 @@ class View(NamedTuple):
 class _OpenPage(NamedTuple):
     view: View
     queue: asyncio.Queue[bytes | None]
+    client: str
 
 
 class Watchers:
@@ -58,32 +60,44 @@ class Watchers:
         self._world = world
         self._state = state
         self._most = most
-        self._watchers: set[_OpenPage] = set()
+        self._watchers: dict[asyncio.Queue[bytes | None], _OpenPage] = {}  # the oldest first
         self.reloads = 0
 
     def __len__(self) -> int:
         return len(self._watchers)
 
-    def enter(self, view: View) -> AsyncIterator[bytes]:
+    def enter(self, view: View, client: str = "") -> AsyncIterator[bytes]:
         """Yield events for a view from now on, until the watcher leaves.
+
+        Places are shared fairly: if all are taken, the client with the most streams loses one to a
+        client with fewer.
 
         Raises:
             TooManyWatchersError: the browser must come again later.
         """
         if len(self._watchers) >= self._most:
-            raise TooManyWatchersError
-        watcher = _OpenPage(view, asyncio.Queue(WAITING))
-        self._watchers.add(watcher)
+            self._make_place(client)
+        watcher = _OpenPage(view, asyncio.Queue(WAITING), client)
+        self._watchers[watcher.queue] = watcher
         watcher.queue.put_nowait(_event("alerts", self._world.standing()))
         watcher.queue.put_nowait(_event("beat", self._beat()))
         return self._events(watcher)
+
+    def _make_place(self, client: str) -> None:
+        counts = Counter(watcher.client for watcher in self._watchers.values())
+        greedy, most = counts.most_common(1)[0] if counts else ("", 0)
+        if most <= counts[client] + 1:
+            raise TooManyWatchersError
+        oldest = next(watcher for watcher in self._watchers.values() if watcher.client == greedy)
+        del self._watchers[oldest.queue]
+        self._put(oldest, None)
 
     async def _events(self, watcher: _OpenPage) -> AsyncIterator[bytes]:
         try:
             while (event := await watcher.queue.get()) is not None:
                 yield event
         finally:
-            self._watchers.discard(watcher)
+            self._watchers.pop(watcher.queue, None)
 
     async def run(self) -> None:
         """Push changes until cancelled."""
@@ -100,7 +114,7 @@ class Watchers:
 
     def close(self) -> None:
         """End all streams."""
-        for watcher in list(self._watchers):
+        for watcher in list(self._watchers.values()):
             self._put(watcher, None)
 
     def _beat(self) -> dict[str, Any]:
@@ -109,7 +123,7 @@ class Watchers:
     def push(self, changes: list[TileBlock]) -> None:
         """Send changes to the watchers whose view they touch."""
         lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
-        for watcher in list(self._watchers):
+        for watcher in list(self._watchers.values()):
             found = []
             for block in changes:
                 if grid.touches(watcher.view.box, _area(block.tile)):
@@ -126,7 +140,7 @@ class Watchers:
         return block.encoded() if level == CELL_LEVEL else self._world.encoded(block.tile, level)
 
     def _tell(self, event: bytes) -> None:
-        for watcher in list(self._watchers):
+        for watcher in list(self._watchers.values()):
             self._put(watcher, event)
 
     def _put(self, watcher: _OpenPage, event: bytes | None) -> None:

@@ -214,7 +214,9 @@ class Routes:
     async def events(self, request: Request) -> Response:
         """Stream the changes in `bbox` at a `level`, from now on."""
         try:
-            stream = self._of.watchers.enter(asked.view(request))
+            stream = self._of.watchers.enter(
+                asked.view(request), request.client.host if request.client else ""
+            )
         except TooManyWatchersError:
             return PlainTextResponse("too many watch already\n", 503, headers={"Retry-After": "10"})
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}

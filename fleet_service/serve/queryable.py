@@ -8,7 +8,7 @@ small ones cannot starve a large one. If too many wait, the most expensive one i
 again. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated as expensive
 ones, smallest first. After each tile of an expensive answer the thread rests as long as the tile
 took. A query beyond the size limit is an error with a hint. One past map is rebuilt at a time, in a
-separate process; other such queries are told to come again.
+separate process; a few such queries wait for their turn, and more are told to come again.
 """
 
 from __future__ import annotations
@@ -46,6 +46,12 @@ WAITING: Final = 64  # questions; more are told to come again
 # after a tile of a heavy answer, by the time it took: light ones find the interpreter free
 REST: Final = 1.0
 LONGEST_REST_S: Final = 0.05
+PAST_WAITING: Final = 8  # questions about the past, with the one that is answered
+PAST_WAIT_S: Final = 4.0  # for their turn; a reader waits longer
+
+
+def _past_is_busy() -> InputError:
+    return InputError("at", "other pasts are being rebuilt", "ask again later")
 
 
 class Answering(NamedTuple):
@@ -117,6 +123,7 @@ class MapQueryable:
         self._answering = answering
         self._counts = counts
         self._past = threading.Lock()
+        self._past_waiting = threading.BoundedSemaphore(PAST_WAITING)
         self._heavy: list[_QueuedQuery] = []  # a heap
         self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
@@ -159,14 +166,22 @@ class MapQueryable:
             self._queue(request, wanted, cost)
 
     def _ask_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
-        if self._past.acquire(blocking=False):
+        if self._past_waiting.acquire(blocking=False):
             threading.Thread(
-                target=self._answer_past, args=(request, wanted), name="past", daemon=True
+                target=self._wait_for_past, args=(request, wanted), name="past", daemon=True
             ).start()
         else:
-            self._refuse(
-                request, InputError("at", "another past is being rebuilt", "ask again later")
-            )
+            self._refuse(request, _past_is_busy())
+
+    def _wait_for_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
+        """Answer when the questions before are answered, or refuse after PAST_WAIT_S."""
+        try:
+            if self._past.acquire(timeout=PAST_WAIT_S):
+                self._answer_past(request, wanted)
+            else:
+                self._refuse(request, _past_is_busy())
+        finally:
+            self._past_waiting.release()
 
     def _queue(self, request: zenoh.Query, wanted: MapQuery, cost: float) -> None:
         self._counts["heavy_queries"] += 1

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from urllib.parse import urlsplit
 
 from schemas.errors import InputError
 from schemas.runtime.installing import install_command
@@ -117,6 +118,9 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def do_GET(self) -> None:
+        if not self._is_own_name():
+            self._send(421, "text/plain", b"this service is not known under that name\n")
+            return
         path = self.path.partition("?")[0]
         if path == "/metrics":
             self._send(200, *self.exposition())
@@ -126,6 +130,21 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(503 if troubles else 200, "application/json", json.dumps(state).encode())
         else:
             self._send(404, "text/plain", b"/metrics and /healthz\n")
+
+    def _is_own_name(self) -> bool:
+        """Return False on loopback for a foreign host name, by which a web page would read it
+        (DNS rebinding).
+        """
+        server = self.server
+        try:
+            host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        except ValueError:
+            return False
+        is_local = isinstance(server, ThreadingHTTPServer) and server.server_address[0] in (
+            "127.0.0.1",
+            "::1",
+        )
+        return not is_local or host in (None, "localhost", "127.0.0.1", "::1")
 
     def _send(self, status: int, form: str, body: bytes) -> None:
         self.send_response(status)

@@ -105,7 +105,7 @@ def _answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table
         if not refused:
             payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
             return seconds, [pa.ipc.open_stream(payload).read_all() for payload in payloads]
-        if "another past" not in refused[0]:
+        if "other pasts" not in refused[0]:
             raise RuntimeError(refused[0])
 
 

@@ -19,6 +19,7 @@ SERVICE: Final = "/kuksa.val.v2.VAL/"
 BUFFER: Final = 1000  # updates that the broker keeps for a slow subscriber, the most it allows
 ASK_S: Final = 5.0
 NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double")
+LOOPBACK: Final = ("127.", "localhost:", "[::1]:", "unix:")
 
 
 class DatabrokerFeed(Feed):
@@ -65,6 +66,10 @@ class DatabrokerFeed(Feed):
         self._authority = read.get("ca")
         token = read.get("token", b"").decode("ascii", errors="replace").strip()
         self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
+        if token and self._authority is None and not address.startswith(LOOPBACK):
+            raise InputError(
+                "source", "would send its token without encryption", "give ca=FILE as well"
+            )
         self._call: Any = None
 
     def listen(self) -> None:

@@ -24,10 +24,13 @@ LONGEST: Final = 64  # bytes of a CAN FD frame
 MOST_BYTES: Final = 16_000_000  # of a database; the largest public one has 2 MB
 
 _MESSAGE: Final = re.compile(r"^\s*BO_\s+(\d+)\s+([^:\s]+)\s*:\s*(\d+)")
+# No two neighbouring parts match the same characters, so that the time is linear in the length of a
+# line.
 _SIGNAL: Final = re.compile(
-    r"^\s*SG_\s+(?P<name>[^:]*?)(?:\s+(?P<mux>M|m\d+M?))?\s*:\s*(?P<start>\d+)\|(?P<size>\d+)@(?P<order>[01])(?P<sign>[+-])"
-    r"\s*\(\s*(?P<factor>[^,]+),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?\s*(?:\"(?P<unit>[^\"]*)\")?"
+    r"^\s*SG_\s(?P<label>[^:]+):\s*(?P<start>\d+)\|(?P<size>\d+)@(?P<order>[01])(?P<sign>[+-])"
+    r"\s*\(\s*(?P<factor>[^,\s][^,]*),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?\s*(?:\"(?P<unit>[^\"]*)\")?"
 )
+_MULTIPLEXED: Final = re.compile(r"M|m\d+M?")  # the last word before the colon, after the name
 Bytes: TypeAlias = NDArray[np.uint8]
 
 
@@ -154,11 +157,11 @@ def parse_dbc(text: str) -> Database:
             )
             database[message.name] = message
         elif message is not None and (found := _SIGNAL.match(line)):
-            signal = _signal(found)
+            signal, mux = _signal(found)
             if signal is None or signal.last_byte >= min(max(message.length, 1), LONGEST):
                 continue
             message.signals[signal.name] = signal
-            if found["mux"] == "M":
+            if mux == "M":
                 message = CanMessage(**{**vars(message), "multiplexer": signal.name})
                 database[message.name] = message
         elif line.strip() and not line.lstrip().startswith("SG_"):
@@ -166,11 +169,13 @@ def parse_dbc(text: str) -> Database:
     return database
 
 
-def _signal(found: re.Match[str]) -> Signal | None:
-    mux = found["mux"] or ""
+def _signal(found: re.Match[str]) -> tuple[Signal | None, str]:
+    """The signal of a line, None if it makes no sense, and its multiplexer mark."""
+    words = found["label"].split()
+    mux = words.pop() if len(words) > 1 and _MULTIPLEXED.fullmatch(words[-1]) else ""
     try:
         signal = Signal(
-            name=re.sub(r"\W", "_", found["name"]),
+            name=re.sub(r"\W", "_", " ".join(words)),
             start=int(found["start"]),
             size=int(found["size"]),
             little=found["order"] == "1",
@@ -181,6 +186,6 @@ def _signal(found: re.Match[str]) -> Signal | None:
             switch=int(mux[1:].rstrip("M")) if mux.startswith("m") else None,
         )
     except ValueError:
-        return None
+        return None, mux
     sound = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST
-    return signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None
+    return (signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None), mux

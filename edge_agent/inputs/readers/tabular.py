@@ -40,7 +40,7 @@ MOST_NAMES: Final = 20  # in an error
 RACECHRONO: Final = "racechrono"
 LONGEST_PREAMBLE: Final = 50  # lines
 _WORD: Final = re.compile(r"[a-z]+")
-_UNIT: Final = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+_UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 
 
 def read_table(path: Path, time: str | None = None, time_unit: str | None = None) -> Recording:

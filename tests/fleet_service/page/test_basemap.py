@@ -10,11 +10,11 @@ import zlib
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import pytest
 
-from fleet_service.page.basemap import OWN, ZOOMS, BaseMap, base_map
+from fleet_service.page.basemap import OWN, ZOOMS, BaseMap, TileFile, base_map
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -141,3 +141,26 @@ _BLUE: Final = """(() => {
   for (let k = 0; k < points.length; k += 4) blue += points[k + 2] - points[k] > 60 && points[k + 2] > points[k + 1];
   return blue > 400;
 })()"""
+
+
+@pytest.mark.parametrize("value", ["2000000000", "null", "'text'", "zeroblob(5000000)"])
+def test_mbtiles_value_that_is_no_tile_is_none(tmp_path: Path, value: str) -> None:
+    path = tiles_in(tmp_path / "a.mbtiles", {(0, 0, 0): b"x"})
+    with closing(sqlite3.connect(path)) as table, table:
+        table.execute(f"update tiles set tile_data = {value}")
+    assert base_map(str(path)).file is not None
+    assert cast(TileFile, base_map(str(path)).file).picture(0, 0, 0) is None
+
+
+def test_mbtiles_view_with_an_endless_query_is_given_up(tmp_path: Path) -> None:
+    path = tiles_in(tmp_path / "a.mbtiles", {(0, 0, 0): b"x"})
+    endless = "with recursive n(i) as (select 1 union all select i + 1 from n) select max(i) from n"
+    file = cast(TileFile, base_map(str(path)).file)
+    with closing(sqlite3.connect(path)) as table, table:
+        table.execute("alter table tiles rename to sound")
+        table.execute(
+            "create view tiles as select zoom_level, tile_column, tile_row,"
+            f" ({endless}) as tile_data from sound"
+        )
+    assert file.picture(0, 0, 0) is None
+    assert file.picture(1, 0, 0) is None

@@ -7,16 +7,19 @@ from __future__ import annotations
 import gzip
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fleet_service.page.basemap import base_map
 from fleet_service.page.vector_tiles import (
     LINE,
+    MOST_UNPACKED,
     POINT,
     POLYGON,
     PmtilesFile,
     TileShape,
     encode_tile,
+    unpack_tile,
 )
 from schemas.errors import InputError
 
@@ -90,3 +93,28 @@ def test_a_tile_is_the_bytes_of_the_specification() -> None:
     ring = encode_tile({"r": [TileShape(POLYGON, [[(3, 6), (8, 12), (20, 34)]], {})]})
     assert bytes([9, 6, 12, 18, 10, 12, 24, 44, 15]) in ring
     assert encode_tile({"empty": []}) == b""
+
+
+def test_damaged_pmtiles_file_has_no_tiles_and_raises_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "map.pmtiles")
+    sound = path.read_bytes()
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        content = np.frombuffer(sound, np.uint8).copy()
+        at = rng.integers(100, len(content), 200)
+        content[at] = rng.integers(0, 256, len(at))
+        path.write_bytes(content.tobytes())
+        try:
+            file = PmtilesFile(path)
+        except InputError:
+            continue
+        for place in list(TILES)[::400]:
+            assert isinstance(file.tile(*place), bytes | None)
+
+
+def test_compressed_bomb_is_no_tile() -> None:
+    bomb = gzip.compress(bytes(MOST_UNPACKED + 1))
+    assert len(bomb) < 100_000
+    assert unpack_tile(bomb) is None
+    assert unpack_tile(bomb[:1000]) is None
+    assert unpack_tile(gzip.compress(b"tile")) == b"tile"

@@ -1,0 +1,56 @@
+"""Turns for questions about the past, because a service rebuilds one past map at a time.
+
+The page asks one question at a time, in the order of arrival, and holds at most MOST_WAITING of one
+client. After each question it pauses for as long as the question took, so that other readers of the
+service get their turn as well.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Final
+
+MOST_WAITING: Final = 2  # of one client: one that is answered, and one that waits
+MOST_CLIENTS: Final = 32
+LONGEST_PAUSE_S: Final = 2.0
+
+
+class TooManyQuestionsError(Exception):
+    """A client, or all clients together, have too many questions waiting."""
+
+
+class PastTurns:
+    """Queue of questions about the past; used in one event loop."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._waiting: Counter[str] = Counter()
+        self._free_at = 0.0
+
+    @asynccontextmanager
+    async def take(self, client: str) -> AsyncIterator[None]:
+        """Wait for a turn and hold it while the block runs.
+
+        Raises:
+            TooManyQuestionsError: too many questions wait.
+        """
+        if self._waiting[client] >= MOST_WAITING or len(+self._waiting) >= MOST_CLIENTS:
+            raise TooManyQuestionsError
+        self._waiting[client] += 1
+        try:
+            async with self._lock:
+                await asyncio.sleep(max(self._free_at - time.monotonic(), 0.0))
+                began = time.monotonic()
+                try:
+                    yield
+                finally:
+                    ended = time.monotonic()
+                    self._free_at = ended + min(ended - began, LONGEST_PAUSE_S)
+        finally:
+            self._waiting[client] -= 1
+            if not self._waiting[client]:
+                del self._waiting[client]

@@ -1,0 +1,130 @@
+"""One client cannot take the past, the streams or the connections of a page from the others."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from fleet_service.page import connections
+from fleet_service.page.connections import BoundedProtocol, LoopErrors
+from fleet_service.page.turns import MOST_WAITING, PastTurns, TooManyQuestionsError
+from fleet_service.page.watchers import TooManyWatchersError, View, Watchers
+from fleet_service.page.world import MapMirror
+
+VIEW = View((-180.0, -85.0, 180.0, 85.0), 0)
+
+
+def test_client_with_many_questions_does_not_keep_others_from_the_past() -> None:
+    served: list[str] = []
+
+    async def ask(turns: PastTurns, client: str, *, is_first: bool = False) -> None:
+        try:
+            async with turns.take(client):
+                await asyncio.sleep(0)
+                served.append(client)
+        except TooManyQuestionsError:
+            served.append(f"{client} refused")
+        if is_first:
+            assert not turns._waiting[client]
+
+    async def run() -> None:
+        turns = PastTurns()
+        await asyncio.gather(
+            *(ask(turns, "greedy") for _ in range(8)), *(ask(turns, f"other-{k}") for k in range(8))
+        )
+        await ask(turns, "greedy", is_first=True)
+
+    asyncio.run(run())
+    assert served.count("greedy") == MOST_WAITING + 1
+    assert served.count("greedy refused") == 8 - MOST_WAITING
+    assert all(served.count(f"other-{k}") == 1 for k in range(8))
+
+
+def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
+    async def run() -> list[int]:
+        watchers = Watchers(MapMirror(), dict, most=6)
+        greedy = [watchers.enter(VIEW, "greedy") for _ in range(6)]
+        for _ in range(3):
+            watchers.enter(VIEW, "other")
+        with pytest.raises(TooManyWatchersError):
+            watchers.enter(VIEW, "other")
+        ended = 0
+        for stream in greedy[:3]:
+            events = [event async for event in stream]
+            ended += bool(events)
+        return [len(watchers), ended]
+
+    assert asyncio.run(run()) == [6, 3]
+
+
+class Transport:
+    """Connection that records its end."""
+
+    def __init__(self) -> None:
+        self.is_aborted = False
+
+    def abort(self) -> None:
+        """End it."""
+        self.is_aborted = True
+
+    def get_extra_info(self, _: str) -> Any:  # noqa: ANN401 as asyncio has it
+        """Return nothing."""
+        return None
+
+
+def accept(open_ones: set[Any], timers: list[Any]) -> tuple[BoundedProtocol, Transport]:
+    """Return a new connection of a server."""
+    protocol = BoundedProtocol.__new__(BoundedProtocol)
+
+    def call_later(seconds: float, call: Any) -> Any:  # noqa: ANN401 as asyncio has it
+        timers.append((seconds, call))
+        return SimpleNamespace()
+
+    loop = SimpleNamespace(call_later=call_later)
+    logger = SimpleNamespace(level=100)
+    values = {
+        "connections": open_ones,
+        "loop": loop,
+        "cycle": None,
+        "logger": logger,
+        "transport": None,
+    }
+    for name, value in values.items():
+        setattr(protocol, name, value)
+    transport = Transport()
+    protocol.connection_made(cast(asyncio.Transport, transport))
+    return protocol, transport
+
+
+def test_silent_connections_are_closed_and_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "MOST", 3)
+    monkeypatch.setattr(connections, "FlowControl", object, raising=False)
+    open_ones: set[Any] = set()
+    timers: list[Any] = []
+    first = accept(open_ones, timers)
+    others = [accept(open_ones, timers) for _ in range(2)]
+    newest = accept(open_ones, timers)
+    assert first[1].is_aborted
+    assert len(open_ones) == 3
+    seconds, close = timers[-1]
+    close()
+    assert (seconds, newest[1].is_aborted) == (connections.HEAD_S, True)
+    busy = [others[0][0], others[1][0], newest[0]]
+    for one in busy:
+        one.cycle = cast(Any, object())
+    refused = accept(open_ones, timers)
+    assert refused[1].is_aborted
+    assert refused[0] not in open_ones
+
+
+def test_errors_of_the_loop_are_logged_once_in_a_while(caplog: pytest.LogCaptureFixture) -> None:
+    handler = LoopErrors()
+    loop = cast(asyncio.AbstractEventLoop, None)
+    for _ in range(100):
+        handler(loop, {"message": "accept failed"})
+    assert [record.getMessage() for record in caplog.records] == [
+        "web server: accept failed (and 0 more since the last line)"
+    ]

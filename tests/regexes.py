@@ -1,0 +1,224 @@
+"""Find regular expressions whose time grows faster than the length of the text.
+
+    python -m tests.regexes      print every suspicious pattern of the product
+
+A backtracking matcher takes quadratic time if two unbounded repeats follow each other and can match
+the same character, with nothing mandatory and different between them, because the text can be
+divided between them in many ways. It takes exponential time if such a repeat is inside another. The
+check looks at literal patterns of the module `re`.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from re import _constants as sre  # type: ignore[attr-defined]
+from re import _parser as parser  # type: ignore[attr-defined]
+from typing import Any, Final, NamedTuple
+
+from tests.structure import ROOT, parse, sources
+
+CALLS: Final = {
+    "compile",
+    "match",
+    "fullmatch",
+    "search",
+    "sub",
+    "subn",
+    "split",
+    "findall",
+    "finditer",
+}
+PRODUCT: Final = ("schemas", "edge_agent", "fleet_service", "deploy")
+CHARACTERS: Final = frozenset(range(128))
+MANY: Final = 64  # repeats; fewer take no time
+Characters = frozenset[int]
+
+
+class Part(NamedTuple):
+    """Part of a sequence: characters it can match, whether it may be empty, and whether it
+    repeats without bound.
+    """
+
+    characters: Characters
+    is_optional: bool
+    is_unbounded: bool
+
+
+class Found(NamedTuple):
+    """A suspicious pattern and its place."""
+
+    place: str
+    pattern: str
+
+
+def is_superlinear(pattern: str) -> bool:
+    """Return True if matching may take more than linear time."""
+    return any(_is_ambiguous(sequence) for sequence in _sequences(parser.parse(pattern)))
+
+
+def _is_ambiguous(sequence: list[Any]) -> bool:
+    """Return True if an unbounded repeat meets another one of the same characters, or holds one."""
+    parts = [_part(item) for item in sequence]
+    for k, part in enumerate(parts):
+        if not part.is_unbounded:
+            continue
+        if _holds_repeat(sequence[k]):
+            return True
+        free = part.characters
+        for later in parts[k + 1 :]:
+            if later.is_unbounded and free & later.characters:
+                return not _never_fails(parts, k)
+            if not later.is_optional:
+                free &= later.characters
+                if not free:
+                    break
+    return False
+
+
+def _never_fails(parts: list[Part], start: int) -> bool:
+    """Return True if everything after a repeat is optional, so that nothing is tried again."""
+    return all(part.is_optional for part in parts[start + 1 :])
+
+
+def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
+    """Return True if a repeated group ends with a repeat of characters with which it can begin
+    again.
+    """
+    parts = [_part(one) for one in _opened(item[1][2])]
+    if not any(part.is_unbounded for part in parts):
+        return False
+    first: Characters = frozenset()
+    for part in parts:
+        first |= part.characters
+        if not part.is_optional:
+            break
+    for part in reversed(parts):
+        if part.is_unbounded and part.characters & first:
+            return True
+        if not part.is_optional:
+            break
+    return False
+
+
+def _sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
+    """Yield every sequence of a pattern, with groups without a repeat opened."""
+    yield _opened(parsed)
+    for name, value in parsed:
+        for inner in _inner(name, value):
+            yield from _sequences(inner)
+
+
+def _opened(parsed: Any) -> list[Any]:  # noqa: ANN401
+    out: list[Any] = []
+    for name, value in parsed:
+        out += _opened(value[-1]) if name is sre.SUBPATTERN else [(name, value)]
+    return out
+
+
+def _inner(name: Any, value: Any) -> list[Any]:  # noqa: ANN401
+    if name is sre.SUBPATTERN:
+        return [value[-1]]
+    if name in (sre.MAX_REPEAT, sre.MIN_REPEAT):
+        return [value[2]]
+    if name is sre.BRANCH:
+        return list(value[1])
+    return [value[1]] if name in (sre.ASSERT, sre.ASSERT_NOT) else []
+
+
+def _part(item: Any) -> Part:  # noqa: ANN401
+    name, value = item
+    if name in (sre.MAX_REPEAT, sre.MIN_REPEAT):
+        least, most, inner = value
+        return Part(_characters(inner), least == 0, most is sre.MAXREPEAT or most > MANY)
+    if name in (sre.AT, sre.ASSERT, sre.ASSERT_NOT):
+        return Part(frozenset(), True, False)
+    return Part(_characters([item]), False, False)
+
+
+def _characters(items: Any) -> Characters:  # noqa: ANN401
+    """Return the ASCII characters that items can match anywhere."""
+    out: Characters = frozenset()
+    for name, value in items:
+        if name is sre.LITERAL:
+            out |= {value} & CHARACTERS
+        elif name is sre.NOT_LITERAL:
+            out |= CHARACTERS - {value}
+        elif name is sre.ANY:
+            out |= CHARACTERS - {10}
+        elif name is sre.IN:
+            out |= _set(value)
+        else:
+            for inner in _inner(name, value):
+                out |= _characters(inner)
+    return out
+
+
+def _set(items: Any) -> Characters:  # noqa: ANN401
+    out: set[int] = set()
+    negated = False
+    for name, value in items:
+        if name is sre.NEGATE:
+            negated = True
+        elif name is sre.LITERAL:
+            out.add(value)
+        elif name is sre.RANGE:
+            out.update(range(value[0], min(value[1], 127) + 1))
+        elif name is sre.CATEGORY:
+            out |= _CATEGORIES[value]
+    return CHARACTERS - out if negated else frozenset(out) & CHARACTERS
+
+
+def _matching(pattern: str) -> Characters:
+    return frozenset(c for c in CHARACTERS if re.match(pattern, chr(c)))
+
+
+_CATEGORIES: Final = {
+    sre.CATEGORY_DIGIT: _matching(r"\d"),
+    sre.CATEGORY_NOT_DIGIT: _matching(r"\D"),
+    sre.CATEGORY_SPACE: _matching(r"\s"),
+    sre.CATEGORY_NOT_SPACE: _matching(r"\S"),
+    sre.CATEGORY_WORD: _matching(r"\w"),
+    sre.CATEGORY_NOT_WORD: _matching(r"\W"),
+}
+
+
+def patterns(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield line and text of the literal patterns in a file."""
+    for node in ast.walk(parse(path)):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in CALLS
+            and node.args
+        ):
+            is_module = isinstance(node.func.value, ast.Name) and node.func.value.id == "re"
+            first = node.args[0]
+            if is_module and isinstance(first, ast.Constant) and isinstance(first.value, str):
+                yield node.lineno, first.value
+
+
+def find_all() -> list[Found]:
+    """Return the suspicious patterns of the product."""
+    return [
+        Found(f"{path.relative_to(ROOT)}:{line}", pattern)
+        for folder in PRODUCT
+        for path in sources(ROOT, folder)
+        for line, pattern in patterns(path)
+        if is_superlinear(pattern)
+    ]
+
+
+def main() -> int:
+    """Print them; 1 if there are any."""
+    found = find_all()
+    for one in found:
+        print(f"{one.place}: {one.pattern}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
