@@ -20,7 +20,7 @@ from fleet_service.fusion.observations import Observations, SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class, shared_parts
 from fleet_service.fusion.standing import Standing, first_standing
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import NOBODY, NONE, USED, Rows
+from fleet_service.fusion.store.records import CLAIMED, HEEDED, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
 from fleet_service.fusion.trust import initial_trust, judged, shape_of
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
@@ -147,6 +147,7 @@ class Fusion:
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)
+        limited = np.zeros(n, np.int8)
         if before is None:
             checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
             late = o.time < checkpoint
@@ -168,11 +169,15 @@ class Fusion:
         for e in distinct(epoch[~left]).tolist():
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
+            standing = self._standing(e)
+            limited[rows] = (
+                np.where(standing.heeds(vehicle[rows]), HEEDED, CLAIMED) * o.limited[rows]
+            )
             if before is None:
-                used[rows] = self._standing(e).weights(vehicle[rows])
+                used[rows] = standing.weights(vehicle[rows])
             else:
                 used[rows] = before.weight[rows]
-            arrivals = _arrivals(o, vehicle, used, old)
+            arrivals = _arrivals(o, vehicle, used, old)._replace(limited=limited)
             slots, left_out = self._absorb(
                 o, rows, arrivals, c.WAITING_MOST if before is None else _ANY
             )
@@ -335,6 +340,7 @@ def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: Boo
         shared=shared_parts(o.reported),
         manoeuvre=o.manoeuvre,
         late=old,
+        limited=np.zeros(len(o.time), np.int8),
     )
 
 

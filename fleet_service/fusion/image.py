@@ -90,6 +90,7 @@ def image_of(fusion: Fusion) -> Image:
             [np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]
         ),
         "weight": np.concatenate([standing.weight for standing in fusion.standings]),
+        "heeded": np.concatenate([standing.heeded for standing in fusion.standings]),
     }
     image["trusts"] = {
         "epoch": np.array([standing.epoch for standing in fusion.standings]),
@@ -123,9 +124,10 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
+    heeded = np.split(image["trust"]["heeded"].astype(np.bool_), ends)
     epochs = image["trusts"]["epoch"].tolist()
     newcomers = image["trusts"]["newcomer"].tolist()
-    standings = [Standing(*of) for of in zip(epochs, weights, newcomers, strict=True)]
+    standings = [Standing(*of) for of in zip(epochs, weights, newcomers, heeded, strict=True)]
     columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
     columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)
     fusion.resume(None if epoch < 0 else epoch, standings, Reports(**columns))

@@ -11,11 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_service.fusion import constants as c
 from fleet_service.fusion.likelihoods import evidence
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
+from schemas.signals import FLAGS
 
 SmallArray = NDArray[np.int8]
 # more than a batch has rows: seq and row become one number that keeps their order
@@ -40,6 +42,8 @@ class Observations:
             to read them in `evidence`.
         used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not tell.
         manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
+        limited: (n,) whether a slip controller intervened at so little grip used that only slippery
+            road explains it.
         other: (n, k) other cells in which the vehicle may have been instead, -1 where there is
             none.
         other_share: (n, k) probability that it was there; what is left belongs to `cell`.
@@ -57,6 +61,7 @@ class Observations:
     reported: Float32Array
     used: Float32Array
     manoeuvre: SmallArray
+    limited: BoolArray
     other: IntArray
     other_share: Float32Array
 
@@ -84,6 +89,7 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     other, share = other_cells(
         columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
     )
+    used = np.clip(np.nan_to_num(used), 0.0, USED_MOST).astype(np.float32)
     return Observations(
         time=columns["leave_time"] // _US * _US,
         cell=columns["cell"],
@@ -95,8 +101,25 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         sequence=columns["seq"] * ROWS_PER_SEQ + columns["row"],
         evidence=steps,
         reported=reported,
-        used=np.clip(np.nan_to_num(used), 0.0, USED_MOST).astype(np.float32),
+        used=used,
         manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
+        limited=find_limited(columns, columns["mu_utilised"]),
         other=other,
         other_share=share,
     )
+
+
+def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
+    """Return where ABS, ESC or traction control intervened although less than slippery road's grip
+    was used, (n,).
+
+    `used` (n,) is raised by one standard deviation of its error. A controller that works at more is
+    no news: on dry road it does so as well. A flag that a sender leaves out, or does not know, is
+    no intervention.
+    """
+    active = np.zeros(len(used), np.bool_)
+    for name in FLAGS:
+        if name in columns:
+            active |= columns[name] == 1
+    most = used + np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * used)
+    return np.asarray(active & (most < c.SLIPPERY))

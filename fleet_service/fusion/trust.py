@@ -32,7 +32,7 @@ from fleet_service.fusion.shared import Shape
 from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.records import NOBODY, USED
 from schemas import mugrid
-from schemas.numeric import Float32Array
+from schemas.numeric import BoolArray, Float32Array
 from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
@@ -100,6 +100,41 @@ def compare(
 
 
 @refcount_free
+def judge_flag(
+    reporters: RecordArray, row: int, peers: RecordArray, entries: RecordArray, entry: int
+) -> None:
+    """Compare a slip controller's intervention with the newest value that another vehicle gave here
+    lately.
+
+    A value supports one side if it is at least its standard deviation away from SLIPPERY. The
+    vehicle's own value of the same visit is no confirmation: the flag and the value come from one
+    slip.
+    """
+    if entries[entry].share < c.HERE_SHARE or entries[entry].late:
+        return
+    here = reporters[row]
+    vehicle = int(entries[entry].vehicle)
+    now = entries[entry].time // NS
+    newest = 0
+    away = 0.0
+    for k in range(c.REPORTERS):
+        other = int(here.reporter[k])
+        time = int(here.time[k])
+        if other == NOBODY or other == vehicle or now - time > c.PEER_S or time <= newest:  # noqa: SIM109 as above
+            continue
+        newest = time
+        away = (c.SLIPPERY - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
+    this = peers[vehicle]
+    if away >= 1.0:
+        this.flags_confirmed += np.float32(1.0)
+    elif away <= -1.0:
+        this.flags_contradicted += np.float32(1.0)
+    if this.flags_confirmed + this.flags_contradicted > c.PEERS:
+        this.flags_confirmed *= np.float32(0.5)
+        this.flags_contradicted *= np.float32(0.5)
+
+
+@refcount_free
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
@@ -162,7 +197,7 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _weigh(peers, before.weight, weight)
-    return Standing(epoch, weight, initial_trust(established))
+    return Standing(epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)]))
 
 
 @compiled
@@ -195,6 +230,18 @@ def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
         if not known[v]:
             out[v] = min(float(out[v]), c.NEWCOMER)
     return True
+
+
+def heeded_flags(peers: RecordArray) -> BoolArray:
+    """Return whose slip controllers (V,) may support an alert.
+
+    A flag has a record of its own: at first TRUST_PRIOR_PEERS imagined cells confirmed it in
+    TRUST_PRIOR; below TRUST_NONE it supports nothing. So a vehicle whose flag is always on is out
+    after two dry cells.
+    """
+    right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
+    whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
+    return np.asarray(right >= c.TRUST_NONE * whole)
 
 
 def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:

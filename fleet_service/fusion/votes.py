@@ -30,6 +30,7 @@ from fleet_service.fusion.store.records import (
     AGED,
     FINE,
     GRIP,
+    HEEDED,
     ICE,
     NONE,
     SOURCES,
@@ -241,10 +242,7 @@ def update(
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if (
-            entries[entry].slippery >= c.SOURCE_SHARE
-            and ice_evidence(entries, entry) >= c.WITNESS_NATS
-        ):
+        if is_ice_source(entries, entry):
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
@@ -254,6 +252,20 @@ def update(
 def _aged(seconds: float) -> np.uint16:
     """Time that is not forgotten yet in parts of 1/AGED; it counts below FORGET_S only."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
+
+
+@refcount_free_inlined
+def is_ice_source(entries: RecordArray, entry: int) -> bool:
+    """Return True if a visit supports an alert: by its value, or by a slip controller that no value
+    contradicts.
+
+    A controller that intervenes while little grip is used corroborates others. It never enters the
+    belief, because it and the likelihood of the same visit come from one slip.
+    """
+    slippery = entries[entry].slippery
+    if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:
+        return True
+    return bool(entries[entry].limited == HEEDED and slippery > 1.0 - c.SOURCE_SHARE)
 
 
 @refcount_free_inlined
@@ -285,8 +297,14 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
 
 @refcount_free_inlined
 def needs_reporters(entries: RecordArray, entry: int) -> bool:
-    """Whether a cell needs reporters for an entry: it is a value, or a source of grip."""
-    return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.SOURCE_SHARE)
+    """Return True if a cell needs reporters for an entry: it is a value, a source of grip, or a
+    controller worked.
+    """
+    return bool(
+        entries[entry].kind == VALUE
+        or entries[entry].limited > 0
+        or entries[entry].slippery <= 1.0 - c.SOURCE_SHARE
+    )
 
 
 @refcount_free_inlined

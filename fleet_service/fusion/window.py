@@ -29,7 +29,7 @@ from fleet_service.fusion.store.records import (
     State,
 )
 from fleet_service.fusion.store.table import AHEAD, first_place
-from fleet_service.fusion.trust import compare
+from fleet_service.fusion.trust import compare, judge_flag
 from fleet_service.fusion.votes import (
     SCRATCH,
     describe_vote,
@@ -47,8 +47,8 @@ from schemas.runtime.records import RecordArray
 class Arrivals(NamedTuple):
     """A batch of observations, arrays of shape (n,): see `Observations`.
 
-    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `used`,
-    `shared` and `late` are as an entry has them.
+    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it; the
+    others are as an entry has them.
     """
 
     time: IntArray
@@ -63,6 +63,7 @@ class Arrivals(NamedTuple):
     shared: ByteArray
     manoeuvre: NDArray[np.int8]
     late: BoolArray
+    limited: NDArray[np.int8]
 
 
 class Votes(NamedTuple):
@@ -174,6 +175,7 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
     new.shared = arrivals.shared[row]
     new.manoeuvre = arrivals.manoeuvre[row]
     new.late = arrivals.late[row]
+    new.limited = arrivals.limited[row]
     return entry
 
 
@@ -331,6 +333,8 @@ def _commit(
             if not whole:
                 load_likelihood(entries, entry, scratch)
                 update(state.base, window, window, entries, entry, weather, scratch)
+            if entries[entry].limited > 0:
+                judge_flag(live.reporters, live.cells[slot].reporters, peers, entries, entry)
             if entries[entry].kind == VALUE:
                 windows[window].values -= 1
                 compare(live.reporters, live.cells[slot].reporters, peers, names, entries, entry)

@@ -29,6 +29,7 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.process import trim_memory
+from schemas.signals import FLAGS
 from schemas.tables import US_STEP
 from schemas.wire import Kind
 
@@ -46,7 +47,7 @@ COLUMNS: Final = [
         "mu_upper",
     ),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
-    *("used_longitudinal", "used_lateral", "late_by"),
+    *("used_longitudinal", "used_lateral", "late_by", *FLAGS),
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]

@@ -35,6 +35,8 @@ SHARED: Final = 400.0
 WEIGHT: Final = 16.0
 UNTRUSTED: Final = 64.0
 MANOEUVRES: Final = 4
+# a slip controller's intervention: none, of a flag with a bad record, of one with a good record
+_NO_FLAG, CLAIMED, HEEDED = range(3)
 
 Int32Array = NDArray[np.int32]
 UIntArray = NDArray[np.uint32]
@@ -106,6 +108,8 @@ class EntryRecord:
             1/SHARED.
         manoeuvre: see `shared`.
         late: whether it came after the checkpoint, and is compared with nobody.
+        limited: CLAIMED where a slip controller says slippery, HEEDED where the vehicle's flags
+            have a good record.
     """
 
     previous: np.int32
@@ -134,6 +138,7 @@ class EntryRecord:
     shared: np.uint8
     manoeuvre: np.int8
     late: np.int8
+    limited: np.int8
 
 
 class WindowRecord:
@@ -195,7 +200,8 @@ class ReportersRecord:
 class PeersRecord:
     """Vehicles with which a vehicle was compared: the other, the rank of their pair, agreement and
     comparisons, summed; squares of the differences of its own use between two visits to one cell,
-    and their products with those of its values, by weight."""
+    and their products with those of its values, by weight; how often others' values confirmed and
+    contradicted its slip controllers."""
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
@@ -203,6 +209,8 @@ class PeersRecord:
     met: Annotated[Float32Array, c.PEERS]
     used_squares: np.float32
     used_products: np.float32
+    flags_confirmed: np.float32
+    flags_contradicted: np.float32
 
 
 class VehicleRecord:

@@ -1,0 +1,98 @@
+"""Slip controllers as witnesses: they support an alert, never a belief, and only with a good
+record of their own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion.observations import find_limited
+from fleet_service.fusion.store.records import ICE
+from fleet_service.serve.alerts import Alerts
+from schemas.numeric import BoolArray, FloatArray
+from tests.fleet_service.examples import CELL, at_least, belief, observations, value
+
+ICY = 0.15
+FLAGGED = 1  # vehicle with a working controller
+
+
+def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations:
+    return dataclasses.replace(o, limited=limited, used=used.astype(np.float32))
+
+
+def acquainted(claims_on_dry: bool) -> Fusion:
+    """Fusion after 30 minutes on dry cells.
+
+    FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`; else it gives
+    values and is trusted.
+    """
+    fusion = Fusion(120.0)
+    for minute in range(30):
+        who = np.arange(12)
+        gentle = (who == FLAGGED) & (minute % 2 == 1)
+        dry = np.where(gentle[:, None], at_least(np.full(12, 0.2)), value(np.full(12, 0.8), 0.04))
+        o = observations(60.0 * minute + 2.0 * who, who, dry, cell=CELL + 100 + minute % 5)
+        fusion.update(flags(o, gentle & claims_on_dry, np.where(gentle, 0.2, 0.7)))
+    return fusion
+
+
+def ice_with(fusion: Fusion, *, flag: bool) -> bool:
+    """Return True if one value of ice and one gentle visit, with a flag or without, make an
+    alert.
+    """
+    who = np.array([3, FLAGGED])
+    likelihood = np.concatenate([value(np.array([ICY]), 0.02), at_least(np.array([0.1]))])
+    o = observations(np.array([1900.0, 1905.0]), who, likelihood)
+    updated = fusion.update(flags(o, np.array([False, flag]), np.array([0.14, 0.1])))
+    return any(alert.raised for alert in Alerts(fusion).update(updated.slots))
+
+
+def test_controller_is_the_second_witness_of_ice() -> None:
+    assert ice_with(acquainted(claims_on_dry=False), flag=True)
+    assert not ice_with(acquainted(claims_on_dry=False), flag=False)
+
+
+def test_flag_that_is_always_on_supports_no_alert() -> None:
+    fusion = acquainted(claims_on_dry=True)
+    assert fusion.standings[-1].heeded.sum() == 11
+    assert not ice_with(fusion, flag=True)
+
+
+def test_flags_alone_raise_no_alert_and_move_no_belief() -> None:
+    beliefs = []
+    for limited in (False, True):
+        fusion = Fusion(120.0)
+        who = np.arange(8)
+        o = observations(10.0 * who, who, at_least(np.full(8, 0.1)))
+        updated = fusion.update(flags(o, np.full(8, limited), np.full(8, 0.1)))
+        assert not Alerts(fusion).update(updated.slots)
+        assert (fusion.sources(updated.slots, ICE, 0) > 0).any() == limited
+        beliefs.append(belief(fusion))
+    assert np.array_equal(beliefs[0], beliefs[1])
+
+
+def test_value_of_grip_is_not_overruled_by_its_own_flag() -> None:
+    fusion = Fusion(120.0)
+    o = observations(np.zeros(1), np.zeros(1, np.int64), value(np.array([0.8]), 0.04))
+    updated = fusion.update(flags(o, np.array([True]), np.array([0.2])))
+    assert not (fusion.sources(updated.slots, ICE, 0) > 0).any()
+
+
+@pytest.mark.parametrize(
+    ("abs_active", "used", "limited"),
+    [(1, 0.15, True), (0, 0.15, False), (-1, 0.15, False), (1, 0.38, False), (1, 0.9, False)],
+)
+def test_only_an_intervention_at_little_grip_counts(
+    abs_active: int, used: float, limited: bool
+) -> None:
+    columns = {"abs_active": np.array([abs_active], np.int8)}
+    assert find_limited(columns, np.array([used])).tolist() == [limited]
+
+
+def test_unknown_use_is_no_intervention_at_little_grip() -> None:
+    assert not find_limited({"esc_active": np.ones(1, np.int8)}, np.array([np.nan])).any()
+    assert not find_limited({}, np.array([0.1])).any()
