@@ -75,6 +75,15 @@ BARS: Final[dict[str, MapBar]] = {
     },
     "fusion.cold.ice_passes.median": MapBar(2, "less", "passes, a service that knows nobody"),
     "fusion.cold.ice_passes.p90": MapBar(4, "less", "passes, a service that knows nobody"),
+    "fusion.value.known.r20": MapBar(
+        0.50, "more", "of road-hours: 90 % interval below .3, 20 cars an hour"
+    ),
+    "fusion.value.alert.precision.r20": MapBar(0.90, "more", "of cell-minutes under alert"),
+    "fusion.value.alert.recall.r20": MapBar(0.95, "more", "of slippery cell-minutes"),
+    "fusion.value.alert.unnoticed.r5": MapBar(20, "less", "min, median, 5 cars an hour"),
+    "fusion.demand.slippery.grip_raised": MapBar(
+        0.05, "less", "of cells with grip on gentle roads: P(slippery) > .5"
+    ),
     "fusion.same_manoeuvre.false_alerts": MapBar(0, "less", "fleets on a wet curve"),
     "fusion.bounds.lower_excess": MapBar(0.05, "less", "lower end over what was used"),
     "fusion.backlog.fused": MapBar(0.95, "more", "of an hour's rows"),

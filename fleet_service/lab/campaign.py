@@ -24,6 +24,7 @@ from fleet_service.lab import (
     resampled,
     situations,
     third_party,
+    value,
 )
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
@@ -135,6 +136,7 @@ def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
         ("fleets that err otherwise", lambda: models.measure(seeds, log_line)),
         ("how long a dry road stays dry", lambda: fading.measure(seeds)),
         ("a third party's fleet", lambda: third_party.measure(seeds, log_line)),
+        ("value to users", lambda: value.measure(seeds, log_line)),
         ("bounds, a backlog, gentle drivers, a wet curve", lambda: situations.measure(seeds)),
     ]
 

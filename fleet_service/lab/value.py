@@ -1,0 +1,220 @@
+"""Value of the map to its users: road-hours known, alerts next to two simpler rules, minutes of
+unnoticed ice. Pure.
+
+Drivers use what a place demands, so that slippery road excites everybody and dry road hardly
+anybody. The service knows its fleet for an hour and a half before it counts. Half of the roads get
+another surface once.
+
+    d      demand of a pass [g]: log-normal about DEMAND of the kind of place, DEMAND_SPREAD
+    s      share of the grip used, min(d/μ, 1); a slip controller works where it is 1
+    known  cells and moments whose 90 % interval is narrower than NARROW
+
+The alerts are compared with two rules on the same visits of the last hour: two visits whose
+controller worked at less than slippery road's grip, and at least two values whose median is
+slippery.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.lab import agent, town
+from fleet_service.lab.agent import Errors, Passes
+from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
+from fleet_service.lab.score import RAISED, SURE_GRIP
+from fleet_service.lab.town import CELLS, LENGTH, ROADS, START, Town, Visits
+from fleet_service.serve.alerts import Alerts
+from schemas import mugrid
+from schemas.numeric import BoolArray, FloatArray
+from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
+
+VEHICLES: Final = 60
+MINUTES: Final = 360
+BEGIN: Final = 90  # minute from which it counts
+STEP: Final = 2  # minutes between two readings
+CHANGING: Final = 0.5  # share of roads that get another surface
+DEMAND: Final = {0.40: 0.25, 0.08: 0.15, 0.02: 0.10}  # [g], by the town's excitement of the place
+DEMAND_SPREAD: Final = 0.5  # standard deviation of its logarithm
+GENTLE: Final = 0.6  # of the demand, on gentle roads
+NARROW: Final = 0.3
+UNNOTICED_MOST: Final = 90.0  # minutes; later or never counts as this
+HOUR_S: Final = 3600.0
+CARS: Final = (5, 20)  # per hour and road
+SEEDS: Final = 3
+
+
+class TownTraffic(NamedTuple):
+    """Visits of a town, and whether a slip controller worked, (n,)."""
+
+    visits: Visits
+    limited: BoolArray
+
+
+class Readings(NamedTuple):
+    """Readings of the map and the rules next to the truth, (readings, CELLS)."""
+
+    truth: FloatArray
+    width: FloatArray
+    slippery: FloatArray
+    alerted: BoolArray
+    two_events: BoolArray
+    median: BoolArray
+
+
+def drive(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffic:
+    """Let `cars` an hour pass each road, by drivers who use `demand` times what the place
+    demands.
+    """
+    passes = rng.poisson(cars * ROADS * MINUTES / 60.0)
+    along = np.tile(np.arange(LENGTH), passes)
+    seconds = np.repeat(60.0 * MINUTES * rng.random(passes), LENGTH) + along
+    vehicle = np.repeat(rng.integers(0, VEHICLES, passes), LENGTH)
+    cell = np.repeat(rng.integers(0, ROADS, passes) * LENGTH, LENGTH) + along
+    mu = place.at(seconds, cell)
+    wanted = (
+        demand
+        * np.vectorize(DEMAND.get)(place.excitement[cell])
+        * np.exp(DEMAND_SPREAD * rng.normal(size=len(mu)))
+    )
+    share = np.minimum(wanted / mu, 1.0)
+    excited = share >= EXCITED_SHARE
+    manoeuvre = np.where(
+        rng.random(len(mu)) < agent.CLEAN.alike, place.usual[cell], rng.integers(0, 4, len(mu))
+    )
+    common = place.common[cell, manoeuvre]
+    reports = agent.report(
+        rng,
+        Errors.draw(rng, VEHICLES),
+        Passes(vehicle, mu, common, share, agent.noise(rng, along), manoeuvre, excited),
+    )
+    order = np.argsort(seconds, kind="stable")
+    return TownTraffic(
+        town.take(Visits(seconds, vehicle, cell, mu, excited, reports), order),
+        (share >= 1.0)[order],
+    )
+
+
+def observe(traffic: TownTraffic) -> Observations:
+    """Return the visits as the service takes them, with the flags of the slip controllers."""
+    rows = rows_of(traffic.visits)
+    rows["abs_active"] = traffic.limited.astype(np.int8)
+    return observations_of(rows, traffic.visits.vehicle)
+
+
+def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
+    """Return the cells where two controllers worked at little grip within the hour, (CELLS,)."""
+    v = traffic.visits
+    recent = (v.seconds > seconds - HOUR_S) & (v.seconds <= seconds)
+    rows = recent & traffic.limited & (v.reports.used < SLIPPERY_MU)
+    return np.asarray(np.bincount(v.place[rows], minlength=CELLS) >= 2)
+
+
+def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
+    """Return the cells with at least two values within the hour whose median is slippery,
+    (CELLS,).
+    """
+    v = traffic.visits
+    rows = np.flatnonzero((v.seconds > seconds - HOUR_S) & (v.seconds <= seconds) & v.excited)
+    out = np.zeros(CELLS, np.bool_)
+    for cell in np.unique(v.place[rows]).tolist():
+        values = v.reports.reading[rows[v.place[rows] == cell]]
+        out[cell] = len(values) >= 2 and np.median(values) < SLIPPERY_MU
+    return out
+
+
+def watch(place: Town, traffic: TownTraffic) -> Readings:
+    """Fuse the visits minute by minute and read the map every STEP minutes from BEGIN on."""
+    o = observe(traffic)
+    fusion = Fusion(LATENESS_S)
+    alerts = Alerts(fusion)
+    read: list[tuple[FloatArray | BoolArray, ...]] = []
+    ends = np.searchsorted(traffic.visits.seconds, 60.0 * np.arange(MINUTES + 1))
+    for minute in range(1, MINUTES + 1):
+        rows = np.arange(ends[minute - 1], ends[minute])
+        if len(rows):
+            alerts.update(fusion.update(o.take(rows)).slots)
+        if minute < BEGIN or minute % STEP:
+            continue
+        now = START + minute * 60 * NS
+        alerts.expire(now)
+        slots = fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
+        known = slots >= 0
+        belief = np.tile(mugrid.PRIOR, (CELLS, 1))
+        belief[known] = fusion.beliefs(slots[known], now)
+        width = mugrid.quantiles(belief, 0.95) - mugrid.quantiles(belief, 0.05)
+        under = np.isin(slots, list(alerts.slots)) & known
+        rules = (two_events(traffic, 60.0 * minute), slippery_median(traffic, 60.0 * minute))
+        read.append((place.mu[minute], width, belief @ SLIPPERY_SHARE, under, *rules))
+    return Readings(*(np.array(column) for column in zip(*read, strict=True)))
+
+
+def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
+    """Return for each cell that became slippery the minutes until it was `warned` of, at most
+    UNNOTICED_MOST.
+    """
+    moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
+    out = []
+    for cell in np.flatnonzero(
+        (place.changed >= BEGIN) & (place.changed <= MINUTES - UNNOTICED_MOST)
+    ).tolist():
+        change = int(place.changed[cell])
+        turned = place.mu[change - 1, cell] >= SURE_GRIP and place.mu[change, cell] < SLIPPERY_MU
+        if turned:
+            found = moments[(moments >= change) & warned[:, cell]]
+            out.append(
+                min(float(found[0] - change), UNNOTICED_MOST) if len(found) else UNNOTICED_MOST
+            )
+    return np.array(out)
+
+
+def precision(truth: FloatArray, warned: BoolArray) -> float:
+    """Return the share of warned cell-minutes that were slippery."""
+    return float((truth[warned] < SLIPPERY_MU).mean()) if warned.any() else float("nan")
+
+
+def recall(truth: FloatArray, warned: BoolArray) -> float:
+    """Return the share of slippery cell-minutes that were warned of."""
+    return float(warned[truth < SLIPPERY_MU].mean())
+
+
+def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, float]:
+    """Return the figures at `cars` an hour and road over `seeds`, of the map and of both rules."""
+    towns = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, 37])
+        place = town.build(rng, MINUTES, CHANGING)
+        towns.append((place, watch(place, drive(rng, place, cars, demand))))
+    truth, width, slippery = (np.concatenate([of[k] for _, of in towns]) for k in range(3))
+    out = {f"known.r{cars}": float((width < NARROW).mean())}
+    out[f"slippery.grip_raised.r{cars}"] = float((slippery[truth > SURE_GRIP] > RAISED).mean())
+    for label, field in (("alert", "alerted"), ("two_events", "two_events"), ("median", "median")):
+        warned = np.concatenate([getattr(of, field) for _, of in towns])
+        minutes = np.concatenate(
+            [count_unnoticed(place, getattr(of, field)) for place, of in towns]
+        )
+        out[f"{label}.precision.r{cars}"] = precision(truth, warned)
+        out[f"{label}.recall.r{cars}"] = recall(truth, warned)
+        out[f"{label}.unnoticed.r{cars}"] = (
+            float(np.median(minutes)) if len(minutes) else float("nan")
+        )
+    return out
+
+
+def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
+    """Return all figures of this module; `log_line` gets the progress."""
+    out: dict[str, float] = {}
+    for cars in CARS:
+        out |= {
+            f"fusion.value.{name}": value
+            for name, value in measure_rate(cars, seeds[:SEEDS]).items()
+        }
+        log_line(f"value at {cars} cars an hour: {len(seeds[:SEEDS])} towns")
+    gentle = measure_rate(CARS[-1], seeds[:SEEDS], GENTLE)
+    raised = gentle[f"slippery.grip_raised.r{CARS[-1]}"]
+    return out | {"fusion.demand.slippery.grip_raised": raised}
