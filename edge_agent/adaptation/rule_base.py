@@ -11,6 +11,9 @@ forget.
 Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`. Sets are ramps
 from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`.
 Inputs are of the block that has just ended, so that a rule never sees what it steers.
+
+`plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
+moves. It is what the rules are measured against (`fuzzy.worth`).
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from schemas.runtime.jit import compiled
 LOW = 0.06
 MIDDLE = 0.13
 HIGH = 0.3
+LEAST_DEMAND = 1e-3  # below it no evidence is left
+LEAST_SHARE = 1e-9  # of evidence, whose logarithm is taken
 # [1] peaks of the sets of strain, chi-square over degrees of freedom
 CALM = 1.0
 STRAINED = 2.5
@@ -35,7 +40,8 @@ WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave
 
 
 class RuleBase(NamedTuple):
-    """Feet and peaks of the sets, and what the last two rules ask for."""
+    """Feet and peaks of the sets, and what the last two rules ask for; or the numbers of
+    `plain_share` without sets."""
 
     far: Annotated[FloatArray, 2]
     wide: Annotated[FloatArray, 2]
@@ -43,6 +49,8 @@ class RuleBase(NamedTuple):
     pace: float  # of offsets, slope and bank where the wheels are FAR [1/s]
     shares: Annotated[FloatArray, 12]
     strained: Annotated[FloatArray, 2]
+    by_sets: bool  # whether the rules give the share of evidence; else `plain_share`
+    plain: Annotated[FloatArray, 3]  # of `plain_share`: half demand, power, share of steady forces
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
@@ -50,8 +58,22 @@ def rule_base(memberships: Memberships) -> RuleBase:
     m = memberships
     ln_noise, pace = m.consequents
     return RuleBase(
-        np.array(m.far), np.array(WIDE), ln_noise, pace, np.array(m.shares), np.array(m.strained)
+        np.array(m.far),
+        np.array(WIDE),
+        ln_noise,
+        pace,
+        np.array(m.shares),
+        np.array(m.strained),
+        by_sets=True,
+        plain=np.zeros(3),
     )
+
+
+def plain_rules(half: float, power: float, steady: float) -> RuleBase:
+    """Return rules without fuzzy sets: `plain_share` of the evidence, and R, steering and
+    forgetting as they are."""
+    idle = Memberships(consequents=(0.0, 0.0))
+    return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
 
 
 @compiled
@@ -73,6 +95,15 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 
 @compiled
+def plain_share(plain: FloatArray, demand: float, new: float) -> float:
+    """Return the ln of the share of a block's evidence without rules:
+    (steady + (1 - steady)*new)/(1 + (half/demand)^power)."""
+    need = (plain[0] / max(demand, LEAST_DEMAND)) ** plain[1]
+    share = (plain[2] + (1.0 - plain[2]) * new) / (1.0 + need)
+    return math.log(max(share, LEAST_SHARE))
+
+
+@compiled
 def evidence_share(
     rules: RuleBase, slides: float, demand: float, new: float, strain: float
 ) -> float:
@@ -87,6 +118,8 @@ def evidence_share(
         new: membership of the forces in "new" [1].
         strain: chi-square over degrees of freedom of the beliefs about the car [1].
     """
+    if not rules.by_sets:
+        return plain_share(rules.plain, demand, new)
     rise = min(max((demand - LOW) / (MIDDLE - LOW), 0.0), 1.0)
     top = min(max((demand - MIDDLE) / (HIGH - MIDDLE), 0.0), 1.0)
     low = 1.0 - rise

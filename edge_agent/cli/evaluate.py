@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs", "ahead", "detection", "searches", "real")
+ONLY: Final = ("inputs", "ahead", "detection", "searches", "worth", "real")
 PAPERS: Final = ("000", "001", "002", "003", "004")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "ahead: warnings, their cost and delay, the map as a prior; "
         "detection: slippery road found, missed and falsely reported, in short and long drives; "
         "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets; "
+        "worth: fuzzy sets against none, the colony's vertices against untuned and random ones; "
         "real: recorded drives of real cars in the folder --logs",
     )
     parser.add_argument(
@@ -108,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
         return _paper(args, count)
     if args.only == "searches":
         return _searches(args, count)
+    if args.only == "worth":
+        return _worth(args, count)
     if args.only == "ahead":
         return _ahead(args, count)
     if args.only == "detection":
@@ -161,6 +164,26 @@ def _searches(args: argparse.Namespace, count: int) -> int:
     )
     write(args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures)
     text = comparison_markdown(figures)
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _worth(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.evaluation import worth
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import markdown, write
+
+    seeds = range(FIGURES, FIGURES + count)
+    scores = worth.campaign(
+        seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True)
+    )
+    figures = worth.barred_figures(scores)
+    part = " --quick" if args.quick else ""
+    measured = list(seeds)[: len(scores["fuzzy"]["all"])]
+    write(args.out / "figures.json", f"edge-agent evaluate --only worth{part}", measured, figures)
+    table = worth.comparison_table({figure.name: figure.value for figure in figures})
+    text = f"# Worth of the fuzzy sets and of the ant colony\n\n{table}\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

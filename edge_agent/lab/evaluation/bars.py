@@ -53,8 +53,8 @@ def in_the_world(name: str) -> Callable[[Results], float]:
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Interval score with over without fuzzy inference, or with what the colony found over what
-    chance found.
+    """Interval score with over without fuzzy sets, or with what the colony found over untuned
+    vertices or over what chance found.
     """
     return lambda results: worth.ratio(results.worth, name)
 
@@ -153,8 +153,7 @@ BARS: Final = (
         )
         for name in SURFACES
     ),
-    EstimatorBar("fuzzy.worth", worth_of("fuzzy.worth"), SHARE, 0.97, "less"),
-    EstimatorBar("ants.worth", worth_of("ants.worth"), SHARE, 1.0, "less"),
+    *(EstimatorBar(name, worth_of(name), SHARE, bar, "less") for name, bar in worth.BARS.items()),
 )
 
 UNITS: Final = {

@@ -1,31 +1,34 @@
-"""What fuzzy inference and the ant colony bring: interval scores on rough drives that nobody tuned
+"""Worth of the fuzzy sets and of the ant colony: interval scores on rough drives that nobody tuned
 on.
 
 Legend, all scores less is better
     fuzzy        the default as it comes, with all of its rules and the shipped vertices
-    none         the same filter without any rule, and with untuned noise (`ckf`)
-    same_scales  without any rule, with the shipped noise scales
+    sets_off     no fuzzy set: a product of ramps takes the share of evidence, R is not adapted;
+                 strain and the consistency test as in the default
+    none         without any rule, without strain and the consistency test (`ckf`)
     default      all rules with untuned vertices
-    random       what each random search found, mean over the searches; colony: the same of the
-                 colony, equal budget
+    random       mean over what each random search found; colony: the same of the colony, equal
+                 budget
 
 Each seed is a town of rough cars and a set of rough manoeuvres on hills, with friction and vehicles
-of its own.
+of its own. A ratio is that of the means over the seeds. Its `.difference` is the mean of the
+differences, paired by seed, and `.difference.se` the standard error of that.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import Memberships
+from edge_agent.adaptation.memberships import SETS, Memberships
+from edge_agent.adaptation.rule_base import plain_rules
 from edge_agent.app.tuned_memberships import search_results, shipped
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet, joined
 from edge_agent.lab.evaluation.real_world import interval_score, town
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
@@ -38,10 +41,16 @@ ESTIMATOR: Final = "aco-fckf"
 CARS = 8
 TOWN_S = 60.0
 DRIVE_S = 8.0
-SEEDS = 5
+SEEDS = 15
 RATE_HZ: Final = 100.0
 SETTLED_S: Final = 1.0  # before, the score is that of the prior
-RATIOS: Final = {"fuzzy.worth": ("fuzzy", "none"), "ants.worth": ("colony", "random")}
+RATIOS: Final = {
+    "fuzzy.worth": ("fuzzy", "sets_off"),
+    "fuzzy.worth.all_rules": ("fuzzy", "none"),
+    "ants.worth": ("colony", "default"),
+    "ants.worth.random": ("colony", "random"),
+}
+BARS: Final = {"fuzzy.worth": 0.97, "ants.worth": 1.0, "ants.worth.random": 1.0}
 MANOEUVRES: Final = (
     "double-lane-change",
     "slalom",
@@ -56,42 +65,55 @@ MANOEUVRES: Final = (
 Scores = dict[str, dict[str, FloatArray]]  # by way, then by surface and "all": one number per seed
 
 
-def campaign(seeds: Sequence[int], *, quick: bool) -> Scores:
-    """Interval scores by way, surface and seed."""
+def campaign(
+    seeds: Sequence[int],
+    *,
+    quick: bool,
+    log_line: Callable[[str], None] = lambda _line: None,
+) -> Scores:
+    """Return interval scores by way, surface and seed."""
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
     chosen = [seeds[0]] if quick else list(seeds[:count])
     found = ways()
     scores: dict[str, dict[str, list[float]]] = {way: {} for way in found}
     for seed in chosen:
         batches = [town(seed, cars, seconds)[0], manoeuvres(seed, 2.0 if quick else DRIVE_S)]
-        for way, sets in found.items():
-            parts = [
-                _scored(batches, memberships, adaptive=adaptive) for memberships, adaptive in sets
-            ]
+        for way, designs in found.items():
+            parts = [_scored(batches, design) for design in designs]
             for name in parts[0]:
                 scores[way].setdefault(name, []).append(
                     float(np.mean([part[name] for part in parts]))
                 )
+        log_line(
+            f"seed {seed}: "
+            + ", ".join(f"{way} {each['all'][-1]:.3f}" for way, each in scores.items())
+        )
     return {
         way: {name: np.array(values) for name, values in each.items()}
         for way, each in scores.items()
     }
 
 
-def ways() -> dict[str, list[tuple[Memberships, bool]]]:
-    """Memberships, and whether rules are applied, by way."""
-    searched = {
-        way: [(one, True) for one in sets] for way, sets in search_results(ESTIMATOR).items()
-    }
-    tuned = shipped(ESTIMATOR)
+def ways() -> dict[str, list[MixtureDesign]]:
+    """Return the filters of each way."""
     untuned = Memberships()
-    given = {
-        "fuzzy": (tuned, True),
-        "none": (untuned, False),
-        "same_scales": (tuned, False),
-        "default": (untuned, True),
+    found = {
+        "fuzzy": [design_of(shipped(ESTIMATOR), adaptive=True)],
+        "sets_off": [without_sets()],
+        "none": [design_of(untuned, adaptive=False)],
+        "default": [design_of(untuned, adaptive=True)],
     }
-    return {way: [one] for way, one in given.items()} | searched
+    for way, sets in search_results(ESTIMATOR).items():
+        found[way] = [design_of(one, adaptive=True) for one in sets]
+    return found
+
+
+def without_sets() -> MixtureDesign:
+    """Return the default filter without fuzzy sets, with strain and the consistency test."""
+    design = design_of(Memberships(), adaptive=True)
+    c = design.constants
+    rules = plain_rules(c.demand_half, c.demand_power, c.steady_share)
+    return design._replace(fuzzy_outputs=np.zeros(SETS), rules=rules)
 
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
@@ -116,18 +138,14 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
     return joined(drives)
 
 
-def _scored(
-    batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: bool
-) -> dict[str, float]:
+def _scored(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
     """Mean interval score over the drives, and over all samples of each surface (NaN where none
     is met).
     """
     drives = []
     samples = []
     for batch in batches:
-        bank = mixture_bank(
-            parameter_table(batch.vehicles), design_of(memberships, adaptive=adaptive)
-        )
+        bank = mixture_bank(parameter_table(batch.vehicles), design)
         estimates = bank.advance(batch.t, batch.signals)
         settled = batch.t[:, 0] >= SETTLED_S
         score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)[settled]
@@ -150,14 +168,20 @@ def ratio(scores: Scores, name: str) -> float:
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """The spread of each ratio over the seeds, and the ratios per surface; then every score."""
+    """Return the spread of each ratio, the paired differences and the ratios per surface; then
+    every score."""
     listed = []
     for name, (over, under) in RATIOS.items():
         if not {over, under} <= set(scores):
             continue
         ratios = {key: scores[over][key] / scores[under][key] for key in scores[over]}
-        if len(ratios["all"]) > 1:
+        apart = scores[over]["all"] - scores[under]["all"]
+        listed.append(Figure(f"{name}.difference", float(apart.mean()), "1"))
+        if len(apart) > 1:
+            error = float(np.std(apart, ddof=1) / math.sqrt(len(apart)))
+            listed.append(Figure(f"{name}.difference.se", error, "1"))
             listed.append(Figure(f"{name}.sd", float(np.std(ratios["all"], ddof=1)), "1"))
+            listed.append(Figure(f"{name}.wins", float((apart < 0.0).mean()), "1"))
         listed += [
             Figure(f"{name}.{key}", float(np.nanmean(found)), "1")
             for key, found in ratios.items()
@@ -170,6 +194,33 @@ def figures(scores: Scores) -> list[Figure]:
             if _met(v)
         ]
     return listed
+
+
+def barred_figures(scores: Scores) -> list[Figure]:
+    """Return the ratios with their bars, then all others, as a campaign of its own reports them."""
+    barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
+    plain = [
+        Figure(name, ratio(scores, name), "1")
+        for name in RATIOS
+        if name not in BARS and not math.isnan(ratio(scores, name))
+    ]
+    return barred + plain + figures(scores)
+
+
+def comparison_table(values: dict[str, float]) -> str:
+    """Return the ratios as a Markdown table, from figures by name."""
+    lines = [
+        "| figure | compares | ratio | paired difference ± standard error | share of seeds better |",
+        "|---|---|---|---|---|",
+    ]
+    for name, (over, under) in RATIOS.items():
+        if f"{name}.difference.se" not in values:
+            continue
+        error = values[f"{name}.difference.se"]
+        apart = f"{values[f'{name}.difference']:.4f} ± {error:.4f}"
+        cells = (f"`{name}`", f"{over}, {under}", f"{values[name]:.3f}", apart)
+        lines.append(f"| {' | '.join(cells)} | {values[f'{name}.wins']:.2f} |")
+    return "\n".join(lines)
 
 
 def _met(values: FloatArray) -> bool:

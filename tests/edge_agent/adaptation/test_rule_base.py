@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.adaptation.rule_base import WIDE, hurry, is_high, rule_base, wide_noise
+from edge_agent.adaptation.rule_base import (
+    WIDE,
+    evidence_share,
+    hurry,
+    is_high,
+    plain_rules,
+    rule_base,
+    wide_noise,
+)
 
 IDLE = rule_base(replace(Memberships(), consequents=(0.0, 0.0)))
 TUNED = rule_base(replace(Memberships(), consequents=(1.0, 0.3)))
@@ -36,3 +44,14 @@ def test_offsets_hurry_where_the_wheels_are_far_and_not_where_nothing_is_asked_f
 def test_noise_grows_with_the_angle_of_steering_either_way() -> None:
     assert wide_noise(TUNED, 0.5 * WIDE[0]) == wide_noise(IDLE, 1.0) == 1.0
     assert wide_noise(TUNED, -WIDE[1]) == wide_noise(TUNED, WIDE[1]) == pytest.approx(math.e)
+
+
+def test_plain_rules_give_the_product_of_ramps_whatever_slides_or_strains() -> None:
+    plain = plain_rules(half=0.13, power=4.0, steady=0.15)
+    share = (0.15 + 0.85 * 0.5) / (1.0 + (0.13 / 0.2) ** 4)
+    for slides, strain in ((0.0, 1.0), (1.0, 9.0)):
+        asked = evidence_share(plain, slides, 0.2, 0.5, strain)
+        assert asked == pytest.approx(math.log(share))
+    assert evidence_share(TUNED, 1.0, 0.2, 0.5, 9.0) != evidence_share(TUNED, 0.0, 0.2, 0.5, 1.0)
+    assert hurry(plain, 100.0) == 0.0
+    assert wide_noise(plain, 1.0) == 1.0

@@ -73,6 +73,7 @@ ASKED = {
     },
     "fuzzy.worth": (0.97, "less"),
     "ants.worth": (1.0, "less"),
+    "ants.worth.random": (1.0, "less"),
 }
 
 
