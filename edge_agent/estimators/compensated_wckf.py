@@ -397,6 +397,13 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "lab.evaluation.papers.reproduction_002",
     ),
     Element(
+        "III.A",
+        "P_0, Q, R and length N of the window",
+        "corrected",
+        "no value is given; those used are sizes of noise and of model error",
+        "compensated_wckf.A_PROCESS, A_NOISE, B_PROCESS, B_NOISE, WINDOW",
+    ),
+    Element(
         "table 1",
         "m, I_z, l_f, l_r, half tracks, radius",
         "as printed",

@@ -399,6 +399,12 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "lab.evaluation.papers",
     ),
     Element(
+        "IV.B",
+        "relative errors of the peaks of v_x, v_y, yaw rate and mu",
+        "as printed",
+        where="lab.evaluation.papers.reproduction_004",
+    ),
+    Element(
         "figures 6, 7, 8 to 18",
         "sets, path, torques, noisy a_y, states against FCKF",
         "as printed",

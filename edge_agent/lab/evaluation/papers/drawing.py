@@ -22,6 +22,7 @@ KINDS: Final = {
     "improved": {"color": "#0072b2", "linestyle": "-", "lw": 1.1},
     "comparator": {"color": "#d55e00", "linestyle": "--", "lw": 1.0},
 }
+DASHES: Final = ("-", "--", "-.", ":")  # curves that coincide stay visible
 OTHERS: Final = [style.colour for style in ESTIMATORS.values() if style.colour != "#f0e442"]
 
 
@@ -63,7 +64,8 @@ def write_plots(plots: Sequence[PaperPlot], folder: Path) -> list[Path]:
 def _style(curve: Curve, place: int) -> dict[str, Any]:
     if curve.kind in KINDS:
         return KINDS[curve.kind]
-    return {"color": OTHERS[place % len(OTHERS)], "linestyle": "-", "lw": 1.0}
+    dashes = DASHES[place % len(DASHES)]
+    return {"color": OTHERS[place % len(OTHERS)], "linestyle": dashes, "lw": 1.2}
 
 
 def _draw_panel(axis: Axes, panel: PlotPanel) -> None:

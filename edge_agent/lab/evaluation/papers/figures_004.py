@@ -91,6 +91,12 @@ def _state_plot(run: NoisyRun, name: str, title: str) -> PaperPlot:
         Curve(each, t, run.reported[each].adaptation[:, 0], kind) for each, kind in FILTERS.items()
     )
     panels.append(PlotPanel("", "t [s]", "largest factor on R", adapted))
+    for label, column in (("error of v_y [m/s]", "vy"), ("error of yaw rate [rad/s]", "yaw_rate")):
+        errors = tuple(
+            Curve(each, t, (getattr(run.reported[each], column) - truth[f"true_{column}"])[:, 0], k)
+            for each, k in FILTERS.items()
+        )
+        panels.append(PlotPanel("", "t [s]", label, errors))
     return PaperPlot(f"states-{name}", title, tuple(panels), 2)
 
 

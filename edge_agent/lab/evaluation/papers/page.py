@@ -115,8 +115,7 @@ def report_html(done: Reproduction, seconds: float) -> str:
         *(f"<li>{escape(note)}</li>" for note in done.notes),
         "</ul><h2>Figures</h2>",
         *(
-            f'<figure><img src="{plot.name}.svg" alt="{escape(plot.title)}">'
-            f"<figcaption>{escape(plot.title)}</figcaption></figure>"
+            f'<figure><img src="{plot.name}.svg" alt="{escape(plot.title)}"></figure>'
             for plot in done.plots
         ),
         f"<h2>Elements of the paper</h2><p>{counts}.</p>",
