@@ -22,8 +22,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from edge_agent.lab.evaluation import printed, report
-from edge_agent.lab.tuning import study_report
+from edge_agent.lab.evaluation import printed, report, worth
+from edge_agent.lab.evaluation.papers.reproductions import REPRODUCTIONS
+from edge_agent.lab.tuning import search_comparison, study_report
 from fleet_service.lab import fading
 from schemas.runtime.figures import Figure
 from tests.structure import ROOT
@@ -82,6 +83,24 @@ CAMPAIGNS: Final = {
     "study": Campaign(
         "edge-agent tune --study .evaluation/study", ".evaluation/study", "edge-agent tune --study"
     ),
+    **{
+        f"paper-{paper}": Campaign(
+            f"edge-agent evaluate --paper {paper} --out .evaluation/paper-{paper}",
+            f".evaluation/paper-{paper}",
+            f"edge-agent evaluate --paper {paper}",
+        )
+        for paper in REPRODUCTIONS
+    },
+    "searches": Campaign(
+        "edge-agent evaluate --only searches --out .evaluation/searches",
+        ".evaluation/searches",
+        "edge-agent evaluate --only searches",
+    ),
+    "worth": Campaign(
+        "edge-agent evaluate --only worth --out .evaluation/worth",
+        ".evaluation/worth",
+        "edge-agent evaluate --only worth",
+    ),
     "faults": Campaign("make faults", ".faults", "faults"),
     "cluster": Campaign("make cluster-faults", ".faults/cluster", "cluster"),
     "bench": Campaign("make bench", ".bench", "bench"),
@@ -118,6 +137,11 @@ def _study(values: dict[str, float]) -> str:
     ).rstrip()
 
 
+def _searches(values: dict[str, float]) -> str:
+    listed = [Figure(name, value, "") for name, value in values.items()]
+    return search_comparison.comparison_tables(listed)
+
+
 TABLES: Final = (
     Table(
         "edge",
@@ -150,6 +174,19 @@ TABLES: Final = (
         "Fuzzy memberships of paper 004's filter, held-out drives",
         re.compile(r"tuning\."),
         _study,
+    ),
+    Table(
+        "searches",
+        "Searches with equal budgets on paper 004's filter: log-likelihood [nat/s] ± standard "
+        "error over seeds",
+        re.compile(r"searches\."),
+        _searches,
+    ),
+    Table(
+        "worth",
+        "Worth of the fuzzy sets and of the ant colony: interval score, less is better",
+        re.compile(r"(fuzzy|ants)\.worth(\.all_rules|\.random)?(\.difference(\.se)?|\.wins)?$"),
+        worth.comparison_table,
     ),
 )
 
