@@ -23,7 +23,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import Memberships
+from edge_agent.adaptation.memberships import LEAST_SHARE, Memberships
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -31,8 +31,6 @@ from schemas.runtime.jit import compiled
 LOW = 0.06
 MIDDLE = 0.13
 HIGH = 0.3
-LEAST_DEMAND = 1e-3  # below it no evidence is left
-LEAST_SHARE = 1e-9  # of evidence, whose logarithm is taken
 # [1] peaks of the sets of strain, chi-square over degrees of freedom
 CALM = 1.0
 STRAINED = 2.5
@@ -98,9 +96,10 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
     """Return the ln of the share of a block's evidence without rules:
     (steady + (1 - steady)*new)/(1 + (half/demand)^power)."""
-    need = (plain[0] / max(demand, LEAST_DEMAND)) ** plain[1]
-    share = (plain[2] + (1.0 - plain[2]) * new) / (1.0 + need)
-    return math.log(max(share, LEAST_SHARE))
+    used = demand ** plain[1]
+    taken = used / (used + plain[0] ** plain[1])
+    share = (plain[2] + (1.0 - plain[2]) * new) * taken
+    return math.log(max(share, math.exp(LEAST_SHARE)))
 
 
 @compiled
