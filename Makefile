@@ -96,7 +96,8 @@ ahead-bench: setup  #= warnings in the car, and the map as a prior
 	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
 	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
 
-iov-bench: setup  #= DENM at an interchange; routes around ice with Valhalla's programs
+iov-bench: setup  #= DENM, routes around ice, planner, Kuksa, MCAP
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[cits]'
 	$(BIN)/python -m tests.benchmarks.iov
 
 usability: setup  #= the first hour of a new user; needs Chromium and unshare

@@ -19,7 +19,8 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.horizon import COMFORT, MARGIN_M, Horizon
+from edge_agent.ahead.horizon import COMFORT, MARGIN_M, Horizon, safe_speed
+from edge_agent.ahead.known import MEASURED
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 
@@ -28,7 +29,12 @@ TYPE: Final = "tier4_planning_msgs::msg::dds_::VelocityLimit_"
 ANY_HASH: Final = "TypeHashNotSupported"  # rmw_zenoh's word for a sender without one
 SENDER: Final = "gripmap"
 HOLD_S: Final = 3.0
-STEP: Final = 1.0  # [m/s] by which a limit changes before a planner hears of it
+STEP: Final = 1.0  # [m/s] by which a limit rises before a planner hears of it
+FALL_STEP: Final = 0.2  # [m/s] by which it falls
+LATE_S: Final = 1.3  # a second between two looks ahead, and the way to the planner's brakes
+# One in twenty places has less grip than its lower bound; a machine's limit must hold in 99 %.
+CAUTION: Final = 2.576 / 1.645 - 1.0  # normal quantiles of .5 % and 5 %
+LEAST_GRIP: Final = 0.02
 FREE: Final = 1e3  # [m/s] no limit: above any planner's own
 MIN_JERK: Final = -1.0  # [m/s^3] of the braking that a limit asks for
 MAX_JERK: Final = 1.0
@@ -36,8 +42,8 @@ _GID_BYTES: Final = 16
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
-    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT;
-    inf without any.
+    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT
+    after LATE_S; inf without any.
 
     Args:
         distance: (M,) [m] from the vehicle.
@@ -47,15 +53,27 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
     if not known.any():
         return math.inf
     way = np.maximum(distance[known] - MARGIN_M, 0.0)
-    return float(np.sqrt(safe_speed[known] ** 2 + 2.0 * COMFORT * way).min())
+    safe = safe_speed[known]
+    # v^2 = safe^2 + 2 COMFORT (way - v LATE_S), solved for v
+    late = COMFORT * LATE_S
+    braked = np.sqrt(late**2 + safe**2 + 2.0 * COMFORT * way) - late
+    return float(np.maximum(braked, safe).min())
+
+
+def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
+    """Return the grip that a road has with 99.5 %, from median and 5 % quantile; NaN if unknown."""
+    below = np.nan_to_num(mu - mu_lower)
+    return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
 
 
 def limit_of(horizons: list[Horizon]) -> float:
     """Return the lowest limit over all ways on [m/s]; inf without any."""
-    found = [
-        limit_ahead(np.arange(len(one.safe_speed), dtype=np.float64), one.safe_speed)
-        for one in horizons
-    ]
+    found = []
+    for one in horizons:
+        known = (one.basis == MEASURED) | one.slippery
+        bound = np.where(known, cautious_bound(one.mu, one.mu_lower), np.nan)
+        safe = safe_speed(one.path.curvature, bound)
+        found.append(limit_ahead(np.arange(len(safe), dtype=np.float64), safe))
     return min(found, default=math.inf)
 
 
@@ -70,7 +88,7 @@ class SteadyLimit:
         """Take a new limit [m/s] at `now` [ns]; return True if the value changed."""
         if limit < self.value:
             self._higher_since = None
-            changed = self.value - limit >= STEP or self.value == math.inf
+            changed = self.value - limit >= FALL_STEP or self.value == math.inf
             if changed:
                 self.value = limit
             return changed

@@ -140,6 +140,8 @@ def drive_live(
         if lookout is not None:
             lookout.close()
             heard = lookout.counts.values()
+        if vss is not None:
+            vss.close()
         at_end()
         close_publisher(
             publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard

@@ -62,6 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="report the friction as VSS signals, one line of JSON each",
     )
     parser.add_argument(
+        "--kuksa",
+        metavar="HOST:PORT",
+        help="write the friction to a Kuksa databroker; ?ca=FILE&token=FILE as of --source vss:",
+    )
+    parser.add_argument(
         "--vehicle", type=Path, help="vehicle file (JSON); required except for simulated"
     )
     add_estimator(parser)
@@ -153,14 +158,21 @@ def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookou
 
 
 def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFrictionOutput | None:
-    if not args.vss:
+    if not args.vss and args.kuksa is None:
         return None
     from edge_agent.publish.vss import RoadFrictionOutput
     from schemas.runtime.process import print_line
 
-    return RoadFrictionOutput(
-        [name], lambda line: print_line(line, sys.stdout), config.state_rate_hz
-    )
+    def say(line: str) -> None:
+        if args.vss:
+            print_line(line, sys.stdout)
+
+    if args.kuksa is None:
+        return RoadFrictionOutput([name], say, config.state_rate_hz)
+    from edge_agent.app.kuksa_provider import KuksaProvider
+
+    provider = KuksaProvider(args.kuksa)
+    return RoadFrictionOutput([name], say, config.state_rate_hz, provider)
 
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import zenoh
 
@@ -49,6 +49,16 @@ def road_friction(
     }
 
 
+class SignalProvider(Protocol):
+    """Receiver of the signals of a vehicle."""
+
+    def write(self, signals: Mapping[str, float], time_ns: int) -> None:
+        """Take signals [%] and their time [ns UTC]; do not wait."""
+
+    def close(self) -> None:
+        """Pass on what waits, and end."""
+
+
 class RoadFrictionOutput:
     """Reports the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh
     key.
@@ -57,11 +67,19 @@ class RoadFrictionOutput:
         names: row k of the reported values is vehicle k.
         say: called with a line.
         rate_hz: reports per second.
+        provider: gets the same signals, if there is one.
     """
 
-    def __init__(self, names: Sequence[str], say: Callable[[str], None], rate_hz: float) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        say: Callable[[str], None],
+        rate_hz: float,
+        provider: SignalProvider | None = None,
+    ) -> None:
         self._names = names
         self._say = say
+        self._provider = provider
         self._step_ns = round(NS / rate_hz)
         self.publishers: dict[str, Any] = {}
         self._due = 0
@@ -87,6 +105,13 @@ class RoadFrictionOutput:
                 {"event": "vss", "vehicle": name, "time": at.replace("+00:00", "Z"), **known}
             )
             self._say(line)
+            if self._provider is not None:
+                self._provider.write(known, int(grip.time[k]))
             publisher = self.publishers.get(name)
             if publisher is not None and publisher.matching_status.matching:
                 publisher.put(line.encode())
+
+    def close(self) -> None:
+        """Let the provider finish."""
+        if self._provider is not None:
+            self._provider.close()

@@ -167,6 +167,7 @@ ELSEWHERE = {
         "--autoware": PLANNER,
         "--autoware-hash": PLANNER,
         "--vss": "test_the_command_prints_lines_of_the_drive",
+        "--kuksa": "test_command_writes_the_friction_to_the_databroker",
     },
     "fleet": {
         "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",

@@ -5,21 +5,18 @@ specification (COVESA VSS).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from edge_agent.inputs.live.feed import Feed, Heard, HostClock
-from edge_agent.inputs.recording import Series, library
-from schemas.errors import InputError
+from edge_agent.inputs.live.kuksa.connection import BrokerConnection
+from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
 
-SERVICE: Final = "/kuksa.val.v2.VAL/"
 BUFFER: Final = 1000  # updates that the broker keeps for a slow subscriber, the most it allows
 ASK_S: Final = 5.0
 NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double")
-LOOPBACK: Final = ("127.", "localhost:", "[::1]:", "unix:")
 
 
 class DatabrokerFeed(Feed):
@@ -48,28 +45,10 @@ class DatabrokerFeed(Feed):
         lasting: Iterable[str] = (),
     ) -> None:
         super().__init__(name, clock)
-        self._grpc = library("grpc")
-        self._address = address
+        self._connection = BrokerConnection(name, address, files)
+        self._messages = self._connection.messages
         self._paths = sorted(paths)
         self._lasting = frozenset(lasting)
-        # protobuf's runtime is there with the core; the messages are made when a broker is asked
-        # for
-        self._messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
-        try:
-            read = {option: Path(file).read_bytes() for option, file in files.items()}
-        except OSError as error:
-            raise InputError(
-                "source",
-                f"{name!r}: cannot read {error.filename} ({error.strerror})",
-                "correct the path",
-            ) from error
-        self._authority = read.get("ca")
-        token = read.get("token", b"").decode("ascii", errors="replace").strip()
-        self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
-        if token and self._authority is None and not address.startswith(LOOPBACK):
-            raise InputError(
-                "source", "would send its token without encryption", "give ca=FILE as well"
-            )
         self._call: Any = None
 
     def listen(self) -> None:
@@ -78,13 +57,15 @@ class DatabrokerFeed(Feed):
         Its first answer holds what it knew before, however old: not readings, but of what is sent
         when it changes the value of now.
         """
-        with self._channel() as channel:
+        connection = self._connection
+        with connection.open_channel() as channel:
             known = self._known(channel)
             if not known:
                 raise ConnectionError("it knows none of the profile's signals")
             m = self._messages
-            self._call = self._method(channel.unary_stream, "Subscribe", m.SubscribeResponse)(
-                m.SubscribeRequest(signal_paths=known, buffer_size=BUFFER), metadata=self._metadata
+            self._call = connection.method(channel.unary_stream, "Subscribe", m.SubscribeResponse)(
+                m.SubscribeRequest(signal_paths=known, buffer_size=BUFFER),
+                metadata=connection.metadata,
             )
             try:
                 for place, update in enumerate(self._call):
@@ -111,34 +92,21 @@ class DatabrokerFeed(Feed):
             values.setdefault(path, []).append(value)
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
 
-    def _channel(self) -> Any:  # noqa: ANN401 grpc has no types
-        if self._authority is None:
-            return self._grpc.insecure_channel(self._address)
-        return self._grpc.secure_channel(
-            self._address, self._grpc.ssl_channel_credentials(self._authority)
-        )
-
-    def _method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
-        return kind(
-            f"{SERVICE}{name}",
-            request_serializer=lambda request: request.SerializeToString(),
-            response_deserializer=answer.FromString,
-        )
-
     def _known(self, channel: Any) -> list[str]:  # noqa: ANN401
         """The paths that the broker knows: a subscription with an unknown one is refused as a
         whole.
         """
         m = self._messages
-        ask = self._method(channel.unary_unary, "GetValue", m.GetValueResponse)
+        connection = self._connection
+        ask = connection.method(channel.unary_unary, "GetValue", m.GetValueResponse)
         known = []
         for path in self._paths:
             try:
                 request = m.GetValueRequest(signal_id=m.SignalID(path=path))
-                ask(request, timeout=ASK_S, metadata=self._metadata, wait_for_ready=False)
+                ask(request, timeout=ASK_S, metadata=connection.metadata, wait_for_ready=False)
                 known.append(path)
-            except self._grpc.RpcError as error:
-                if error.code() != self._grpc.StatusCode.NOT_FOUND:
+            except connection.grpc.RpcError as error:
+                if error.code() != connection.grpc.StatusCode.NOT_FOUND:
                     raise ConnectionError(f"{error.code().name}: {error.details()}") from None
                 self.say(f"does not know {path}")
         return known

@@ -69,6 +69,11 @@ class Databroker:
         """How many listen."""
         return len(self._subscribers)
 
+    def value(self, path: str) -> Any:  # noqa: ANN401
+        """Return the data point of a path."""
+        with self._changed:
+            return self._values[path]
+
     def publish(self, values: Mapping[str, float], time_ns: int) -> None:
         """Tell new values of one moment."""
         update = {}

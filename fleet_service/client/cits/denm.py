@@ -104,7 +104,8 @@ def encode(denm: Denm) -> bytes:
         "messageID": MESSAGE_ID,
         "stationID": denm.sender,
     }
-    return bytes(_compiled().encode("DENM", {"header": header, "denm": content}))
+    message = {"header": header, "denm": content}
+    return bytes(_compiled().encode("DENM", message, check_types=False))
 
 
 def decode(data: bytes) -> Denm:

@@ -9,7 +9,7 @@ once more when it is over.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from fleet_service.client.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach
@@ -69,6 +69,7 @@ class EventBook:
         self.station = station
         self._next = 0
         self._events: dict[str, OpenEvent] = {}
+        self._used: set[int] = set()  # numbers of the events in the book
         if content is not None:
             self._read(content)
 
@@ -83,7 +84,7 @@ class EventBook:
         return {
             "station": self.station,
             "next": self._next,
-            "events": [asdict(event) for event in self._events.values()],
+            "events": [vars(event) for event in self._events.values()],
         }
 
     def update(
@@ -102,11 +103,13 @@ class EventBook:
             for name, event in self._events.items()
             if event.ended and now - event.ended > TERMINATED_NS
         ]:
-            del self._events[name]
+            self._used.discard(self._events.pop(name).sequence)
         for alert in standing:
             state = _state(alert)
             known = self._events.get(alert.id)
             if known is None or known.ended:
+                if known is not None:
+                    self._used.discard(known.sequence)
                 known = OpenEvent(
                     alert.id, self._number(), alert.since, 0, (), (alert.latitude, alert.longitude)
                 )
@@ -154,11 +157,11 @@ class EventBook:
         )
 
     def _number(self) -> int:
-        used = {event.sequence for event in self._events.values()}
         for _ in range(SEQUENCES):
             number = self._next
             self._next = (self._next + 1) % SEQUENCES
-            if number not in used:
+            if number not in self._used:
+                self._used.add(number)
                 return number
         raise InputError(
             "events",
@@ -175,6 +178,7 @@ class EventBook:
             for one in content["events"]:
                 both = {"state": tuple(one["state"]), "position": tuple(one["position"])}
                 self._events[one["name"]] = OpenEvent(**{**one, **both})
+                self._used.add(self._events[one["name"]].sequence)
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise

@@ -71,8 +71,6 @@ def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
 
 def quadtree(denm: Denm) -> str:
     """Return the keys of all squares of an event."""
-    found = {
-        grid.quadkey(int(grid.cell_of(*point)) >> 2 * (grid.CELL_ZOOM - QUAD_ZOOM), QUAD_ZOOM)
-        for point in (denm.position, *denm.history)
-    }
-    return f",{','.join(sorted(found))},"
+    latitude, longitude = zip(denm.position, *denm.history, strict=True)
+    squares = set(grid.cell_of(latitude, longitude, zoom=QUAD_ZOOM).tolist())
+    return f",{','.join(sorted(grid.quadkey(square, QUAD_ZOOM) for square in squares))},"

@@ -19,7 +19,7 @@ from fleet_service.client.stretches import StretchAlert
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
-from tests.fleet_service.client.cits.interchange import free_url, interchange
+from tests.fleet_service.client.cits.interchange import free_url, separate_interchange
 from tests.waiting import until
 
 START: Final = 1_700_000_000 * NS
@@ -71,14 +71,15 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     ]
     originator = Originator("SE", "SE00001")
     seconds = []
-    with interchange(url) as there:
+    received = list[tuple[bytes, dict[str, object]]]()
+    with separate_interchange(url) as there:
         for standing in steps:
             settled: list[str] = []
             link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
             until(lambda link=link: link.is_connected)  # type: ignore[misc]
             output = DenmOutput(STATION, originator, path, link.send, lambda: now[0])
             now[0] += NS
-            before = len(there.received)
+            before = len(received)
             began = time.perf_counter()
             output.keep_up(standing, lambda *_: True)
             sent = output.unsettled
@@ -88,13 +89,15 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
                 output.settle(name)
             output.keep_up(standing, lambda *_: True)
             link.close()
-            assert len(there.received) - before == sent
+            there.send(True)
+            received = there.recv()
+            assert len(received) - before == sent
     oracle = DENM_PDU_Descriptions.DENM
     invalid = 0
     first: dict[int, tuple[float, float]] = {}
     doubled = 0
     last = dict[int, str | None]()
-    for body, _ in there.received:
+    for body, _ in received:
         oracle.from_uper(body)
         invalid += oracle.to_uper() != body
         denm = decode(body)
@@ -119,7 +122,7 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
         ),
         Figure(
             "denm.selector",
-            float(_selected_wrongly(there.received)),
+            float(_selected_wrongly(received)),
             "events of a quadTree selector",
             0.0,
         ),

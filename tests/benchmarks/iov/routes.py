@@ -7,7 +7,6 @@ start without Python.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import zipfile
@@ -30,6 +29,7 @@ APART_M: Final = 150.0
 ORIGIN: Final = (57.70, 11.95)
 ICY_SHARE: Final = 0.08  # of the links between two crossings
 EDGE: Final = "edge_walk"
+NO_PATH: Final = 442  # error code of an answer without a route
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,16 @@ def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
     )
 
 
+def unpack_wheel(name: str, version: str, target: Path) -> None:
+    """Unpack the wheel of a package that is not installed."""
+    words = ["--no-deps", "--python-version", "3.12", "--only-binary=:all:"]
+    place = ["--dest", str(target.parent), f"{name}=={version}"]
+    subprocess.run([sys.executable, "-m", "pip", "download", "--quiet", *words, *place], check=True)
+    pattern = f"{name.replace('-', '_')}-*.whl"
+    with zipfile.ZipFile(next(target.parent.glob(pattern))) as packed:
+        packed.extractall(target)
+
+
 class Valhalla:
     """Valhalla's own programs, from the wheel."""
 
@@ -109,28 +119,7 @@ class Valhalla:
         self.folder = folder
         programs = folder / "wheel"
         if not programs.exists():
-            wheel = [
-                "--no-deps",
-                "--python-version",
-                "3.12",
-                "--only-binary=:all:",
-                "--dest",
-                str(folder),
-            ]
-            subprocess.run(
-                [
-                    sys.executable,
-                    "-m",
-                    "pip",
-                    "download",
-                    "--quiet",
-                    *wheel,
-                    f"pyvalhalla=={VERSION}",
-                ],
-                check=True,
-            )
-            with zipfile.ZipFile(next(folder.glob("pyvalhalla-*.whl"))) as packed:
-                packed.extractall(programs)
+            unpack_wheel("pyvalhalla", VERSION, programs)
         self._bin = programs / "valhalla" / "bin"
         for program in self._bin.iterdir():
             program.chmod(0o755)
@@ -168,20 +157,21 @@ class Valhalla:
         self._run("valhalla_build_tiles", "-c", str(self.config), str(pbf))
 
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request."""
-        done = self._run("valhalla_service", str(self.config), action, json.dumps(request))
-        found: dict[str, Any] = json.loads(
-            next(line for line in done.splitlines() if line.startswith("{"))
-        )
+        """Return the answer to a request; one without a route has an `error_code`."""
+        done = self._call("valhalla_service", str(self.config), action, json.dumps(request))
+        line = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
+        assert line is not None, (done.stdout + done.stderr)[-2000:]
+        found: dict[str, Any] = json.loads(line)
+        assert found.get("error_code", NO_PATH) == NO_PATH, line
         return found
 
-    def _run(self, program: str, *arguments: str) -> str:
-        command = [str(self._bin / program), *arguments]
-        done = subprocess.run(
-            command, capture_output=True, text=True, env={**os.environ}, check=False
-        )
+    def _run(self, program: str, *arguments: str) -> None:
+        done = self._call(program, *arguments)
         assert done.returncode == 0, (done.stdout + done.stderr)[-2000:]
-        return done.stdout
+
+    def _call(self, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [str(self._bin / program), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def _present(value: Any) -> Any:  # noqa: ANN401

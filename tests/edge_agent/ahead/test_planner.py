@@ -15,6 +15,7 @@ from edge_agent.ahead.planner import (
     HOLD_S,
     PlannerKey,
     SteadyLimit,
+    cautious_bound,
     encode_limit,
     limit_ahead,
 )
@@ -75,6 +76,14 @@ def test_limit_lets_a_car_stop_within_sight_on_ice(limited: bool) -> None:
         entered = enter_ice(speed, mu, metres, limited=limited)
         stops.append(entered <= float(stopping_speed(mu, SIGHT_M)) + 1e-6)
     assert sum(stops) == 50 if limited else sum(stops) < 10
+
+
+def test_bound_for_a_machine_is_lower_where_the_map_is_less_sure() -> None:
+    mu = np.array([0.2, 0.2, 0.1, math.nan, math.nan])
+    lower = np.array([0.18, 0.1, 0.05, 0.15, math.nan])
+    bound = cautious_bound(mu, lower)
+    np.testing.assert_allclose(bound[:4], [0.1687, 0.0434, 0.0217, 0.15], atol=1e-4)
+    assert math.isnan(bound[4])
 
 
 def test_limit_falls_at_once_and_rises_after_a_while() -> None:

@@ -1,15 +1,15 @@
-"""An AMQP interchange in the test's process: accepts what is sent to it, and hands out what a
-test gives it.
-"""
+"""An AMQP interchange: accepts what is sent to it, and hands out what a test gives it."""
 
 from __future__ import annotations
 
+import multiprocessing
 import socket
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from typing import Any
 
 import proton
@@ -73,3 +73,28 @@ def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[In
         injector.trigger(ApplicationEvent("leave"))
         thread.join(10.0)
         injector.close()
+
+
+@contextmanager
+def separate_interchange(url: str) -> Iterator[Connection]:
+    """Listen in a process of its own; the connection answers each request with all messages."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(url, theirs), daemon=True)
+    process.start()
+    try:
+        yield ours
+    finally:
+        ours.send(False)
+        process.join(30.0)
+
+
+def _serve(url: str, requests: Connection) -> None:
+    with interchange(url) as there:
+        while requests.recv():
+            requests.send([(body, _plain(given)) for body, given in there.received])
+
+
+def _plain(given: dict[str, Any]) -> dict[str, Any]:
+    """Return properties without the types of AMQP."""
+    return {name: int(value) if isinstance(value, int) else value for name, value in given.items()}

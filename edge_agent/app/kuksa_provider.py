@@ -1,0 +1,140 @@
+"""Provider of a Kuksa databroker: writes the friction at the vehicle over kuksa.val.v2.
+
+`Vehicle.ADAS.ESC.RoadFriction.*` are float percent. `Vehicle.Exterior.RoadSurfaceCondition` (VSS
+pull request 892) is a word. An unknown value is written as a data point without a value, so that no
+old one stays in the broker.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping
+from typing import Any, Final
+from urllib.parse import parse_qsl
+
+from edge_agent.inputs.live.kuksa.connection import FILES, PORT, BrokerConnection
+from edge_agent.publish.vss import BRANCH
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+FRICTION: Final = tuple(f"{BRANCH}.{name}" for name in ("MostProbable", "LowerBound", "UpperBound"))
+CONDITION: Final = "Vehicle.Exterior.RoadSurfaceCondition"
+# Friction separates ice from all else, and a dry road from all else (Pacejka 2012, ch. 1: packed
+# snow has .2 and more, wet asphalt .8 and less); between them several conditions have the same.
+ICE_BELOW: Final = 20.0  # [%] upper bound
+DRY_ABOVE: Final = 80.0  # [%] lower bound
+WRITE_S: Final = 2.0  # for one value
+LEAVE_S: Final = 5.0
+
+log = logging.getLogger(__name__)
+
+
+def surface_condition(signals: Mapping[str, float]) -> str:
+    """Return the value of RoadSurfaceCondition that the friction proves."""
+    if signals.get(f"{BRANCH}.UpperBound", 100.0) < ICE_BELOW:
+        return "ICE"
+    return "DRY" if signals.get(f"{BRANCH}.LowerBound", 0.0) > DRY_ABOVE else "UNKNOWN"
+
+
+class KuksaProvider:
+    """Writes the signals of one vehicle on a thread; a broker that is away costs nothing else.
+
+    Attributes:
+        written: values that the broker accepted.
+        refused: values that it did not accept.
+
+    Args:
+        text: HOST:PORT, with `?ca=FILE` for TLS and `&token=FILE` for a JSON web token.
+
+    Raises:
+        InputError: `text` is no address, grpc is not installed, or a file cannot be read.
+    """
+
+    def __init__(self, text: str) -> None:
+        address, _, query = text.partition("?")
+        files = dict(parse_qsl(query))
+        host, _, port = address.partition(":")
+        if not host or not (port or str(PORT)).isdigit() or not set(files) <= set(FILES):
+            fix = f"write it like 127.0.0.1:{PORT}?ca=ca.pem&token=agent.jwt"
+            raise InputError("kuksa", f"{text!r} is no databroker", fix)
+        self.written = 0
+        self.refused = 0
+        self._connection = BrokerConnection(text, f"{host}:{port or PORT}", files)
+        self._unknown: set[str] = set()
+        self._problem = ""
+        self._latest: tuple[Mapping[str, float], int] | None = None
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="kuksa", daemon=True)
+        self._thread.start()
+
+    def write(self, signals: Mapping[str, float], time_ns: int) -> None:
+        """Write signals of VSS [%] soon; values that are still waiting are replaced."""
+        with self._changed:
+            self._latest = (signals, time_ns)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        self._thread.join(LEAVE_S)
+
+    def _run(self) -> None:
+        connection = self._connection
+        with connection.open_channel() as channel:
+            answer = connection.messages.PublishValueResponse
+            publish = connection.method(channel.unary_unary, "PublishValue", answer)
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._latest is not None or self._stopping)
+                    latest = self._latest
+                    self._latest = None
+                if latest is None:
+                    return
+                self._write_all(publish, *latest)
+
+    def _write_all(self, publish: Any, signals: Mapping[str, float], time_ns: int) -> None:  # noqa: ANN401
+        messages = self._connection.messages
+        values: dict[str, Any] = {
+            path: messages.Value(float=signals[path]) if path in signals else None
+            for path in FRICTION
+        }
+        values[CONDITION] = messages.Value(string=surface_condition(signals))
+        for path, value in values.items():
+            if path not in self._unknown and not self._write_one(publish, path, value, time_ns):
+                return
+
+    def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
+        """Write a value; return False if the broker is away."""
+        messages = self._connection.messages
+        point = messages.Datapoint(value=value)
+        point.timestamp.seconds, point.timestamp.nanos = divmod(time_ns, NS)
+        request = messages.PublishValueRequest(
+            signal_id=messages.SignalID(path=path), data_point=point
+        )
+        grpc = self._connection.grpc
+        try:
+            publish(request, timeout=WRITE_S, metadata=self._connection.metadata)
+        except grpc.RpcError as error:
+            self.refused += 1
+            code = error.code()
+            if code in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT):
+                self._unknown.add(path)
+                log.warning("the databroker does not take %s: %s", path, error.details())
+                return True
+            self._report(f"{code.name}: {error.details()}")
+            return code not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
+        self.written += 1
+        self._report("")
+        return True
+
+    def _report(self, problem: str) -> None:
+        """Log a problem once, and its end."""
+        if problem and not self._problem:
+            log.warning("the databroker cannot be written (%s); trying again", problem)
+        elif self._problem and not problem:
+            log.warning("the databroker is written again")
+        self._problem = problem

@@ -1,0 +1,80 @@
+"""Connection to a Kuksa databroker: address, certificate authority, token, and the calls of
+kuksa.val.v2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from edge_agent.inputs.recording import library
+from schemas.errors import InputError
+
+SERVICE: Final = "/kuksa.val.v2.VAL/"
+PORT: Final = 55555
+FILES: Final = ("ca", "token")
+LOOPBACK: Final = ("127.", "localhost:", "[::1]:", "unix:")
+
+
+class BrokerConnection:
+    """Settings of a connection, and functions that open it.
+
+    Attributes:
+        grpc: the module.
+        messages: the messages of kuksa.val.v2.
+        metadata: sent with each call.
+
+    Args:
+        option: command-line option or source that names the broker, for errors.
+        address: host and port.
+        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`,
+            a JSON web token.
+
+    Raises:
+        InputError: grpc is not installed, a file cannot be read, or a token would be sent without
+            TLS.
+    """
+
+    def __init__(self, option: str, address: str, files: Mapping[str, str]) -> None:
+        self.grpc = library("grpc")
+        # protobuf's runtime is there with the core; the messages are made only for a broker
+        self.messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
+        self._address = address
+        try:
+            read = {name: Path(file).read_bytes() for name, file in files.items()}
+        except OSError as error:
+            raise InputError(
+                "source",
+                f"{option!r}: cannot read {error.filename} ({error.strerror})",
+                "correct the path",
+            ) from error
+        self._authority = read.get("ca")
+        token = read.get("token", b"").decode("ascii", errors="replace").strip()
+        self.metadata = (("authorization", f"Bearer {token}"),) if token else ()
+        if token and self._authority is None and not address.startswith(LOOPBACK):
+            raise InputError(
+                "source", "would send its token without encryption", "give ca=FILE as well"
+            )
+
+    def open_channel(self) -> Any:  # noqa: ANN401 grpc has no types
+        """Return a channel; it connects when it is used."""
+        if self._authority is None:
+            return self.grpc.insecure_channel(self._address)
+        return self.grpc.secure_channel(
+            self._address, self.grpc.ssl_channel_credentials(self._authority)
+        )
+
+    def method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
+        """Return a call of the service.
+
+        Args:
+            kind: function of a channel that makes calls, e.g. unary_unary.
+            name: of the call.
+            answer: class of the answer.
+        """
+        return kind(
+            f"{SERVICE}{name}",
+            request_serializer=lambda request: request.SerializeToString(),
+            response_deserializer=answer.FromString,
+        )
