@@ -33,7 +33,7 @@ STEP: Final = 1.0  # [m/s] by which a limit rises before a planner hears of it
 FALL_STEP: Final = 0.2  # [m/s] by which it falls
 LATE_S: Final = 1.3  # a second between two looks ahead, and the way to the planner's brakes
 # One in twenty places has less grip than its lower bound; a machine's limit must hold in 99 %.
-CAUTION: Final = 2.576 / 1.645 - 1.0  # normal quantiles of .5 % and 5 %
+CAUTION: Final = 0.566  # normal quantiles of .5 % over that of 5 %, less 1
 LEAST_GRIP: Final = 0.02
 FREE: Final = 1e3  # [m/s] no limit: above any planner's own
 MIN_JERK: Final = -1.0  # [m/s^3] of the braking that a limit asks for

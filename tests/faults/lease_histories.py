@@ -228,7 +228,12 @@ class VirtualBucket:
         if world.now < world.process.cut_until or self._random.random() < 0.01:
             if self._random.random() < 0.5:
                 late = self._random.uniform(0.0, 5.0)
-                world.spawn(self._network, lambda: (world.sleep(late), effect())[0])
+
+                def arrive() -> None:
+                    world.sleep(late)
+                    effect()
+
+                world.spawn(self._network, arrive)
             world.sleep(REQUEST_S)
             raise CopyError("no answer")
         world.sleep(self._random.uniform(0.0, 0.05))
