@@ -119,16 +119,16 @@ class KuksaProvider:
         try:
             publish(request, timeout=WRITE_S, metadata=self._connection.metadata)
         except grpc.RpcError as error:
-            self.refused += 1
             code = error.code()
             if code in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT):
                 self._unknown.add(path)
                 log.warning("the databroker does not take %s: %s", path, error.details())
-                return True
-            self._report(f"{code.name}: {error.details()}")
+            else:
+                self._report(f"{code.name}: {error.details()}")
+            self.refused += 1  # after the log line, so that whoever sees the count finds the line
             return code not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
-        self.written += 1
         self._report("")
+        self.written += 1
         return True
 
     def _report(self, problem: str) -> None:

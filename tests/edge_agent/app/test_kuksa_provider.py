@@ -5,6 +5,7 @@ broker.
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -56,19 +57,18 @@ def test_broker_that_comes_later_gets_the_latest_values(
 ) -> None:
     with Databroker("127.0.0.1:0", [*FRICTION, CONDITION]) as broker:
         address = f"127.0.0.1:{broker.port}"
-    provider = KuksaProvider(address)
-    provider.write(ICE, TIME)
-    until(lambda: provider.refused)
-    assert caplog.text.count("cannot be written") == 1
-    with Databroker(address, [*FRICTION, CONDITION]) as broker:
+    with closing(KuksaProvider(address)) as provider:
+        provider.write(ICE, TIME)
+        until(lambda: provider.refused)
+        assert caplog.text.count("cannot be written") == 1
+        with Databroker(address, [*FRICTION, CONDITION]) as broker:
 
-        def write() -> bool:
-            provider.write(ICE, TIME)
-            return provider.written >= 4
+            def write() -> bool:
+                provider.write(ICE, TIME)
+                return provider.written >= 4
 
-        until(write)
-        assert broker.value(CONDITION).value.string == "ICE"
-        provider.close()
+            until(write)
+            assert broker.value(CONDITION).value.string == "ICE"
 
 
 @pytest.mark.parametrize(
