@@ -23,8 +23,8 @@ LARGEST_FACTOR = 10.0
 
 @compiled
 def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
-    """Log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the mismatch at
-    peaks inputs (5,).
+    """Return the log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the
+    mismatch at peaks inputs (5,).
 
     Triangles that meet at each other's peaks make the weighted mean a straight line between
     neighbours.
@@ -43,7 +43,7 @@ def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
 def adapted(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
-    """The next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
+    """Return the next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
     return adapted_within(
         factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
     )
@@ -59,7 +59,9 @@ def adapted_within(
     pace: float,
     bounds: tuple[float, float],
 ) -> float:
-    """`adapted` within other bounds, and with `pace` as many steps as the sets were made for."""
+    """Return `adapted` within other bounds, for `pace` times as many steps as the sets were made
+    for.
+    """
     if not theoretical > 0.0:
         return factor
     step = pace * infer(actual / theoretical - 1.0, inputs, outputs)

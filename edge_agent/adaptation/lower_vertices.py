@@ -110,7 +110,7 @@ class LowerVertices:
 
 
 def _triangles(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
-    """Left foot, peak and right foot of each set, (5, 3); outer sets end at their peaks."""
+    """Return left foot, peak and right foot of each set, (5, 3); outer sets end at their peaks."""
     sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
     for k in range(SETS - 1):
         gap = peaks[k + 1] - peaks[k]
@@ -120,7 +120,7 @@ def _triangles(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
 
 
 def _memberships(sets: FloatArray, mismatch: float) -> FloatArray:
-    """Memberships (5,) of a mismatch; the outer sets are shoulders."""
+    """Return the memberships (5,) of a mismatch; the outer sets are shoulders."""
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):
         if mismatch <= peak:

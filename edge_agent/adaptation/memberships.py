@@ -9,15 +9,15 @@ Legend
     ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows
                 [nat] (2,)
 
-Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, and what two rules ask
-for:
+Rules of the default estimator (`rule_base.py`): pairs (foot, peak) of ramps, and consequents of two
+rules:
     far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
     consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and
                 bank return to their prior where the wheels are FAR [1/s]
     shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel
                 slides (no, yes), then demand (low, middle, high), then forces (as before, new)
                 [nat] (12,)
-    strained    what is added to it where beliefs about the car are strained, by whether a wheel
+    strained    term added to it where beliefs about the car are strained, by whether a wheel
                 slides [nat] (2,)
 
 Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the
@@ -143,15 +143,15 @@ class Memberships:
                 )
 
     def to_vector(self) -> FloatArray:
-        """Free numbers for an optimiser, shape (30,): the fields one after the other."""
+        """Return the free numbers for an optimiser, shape (30,): the fields one after the other."""
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """The memberships of a vector (30,) within `bounds`; inputs and outputs are sorted first,
-        so all are valid.
+        """Return the memberships of a vector (30,) within `bounds`; inputs and outputs are sorted
+        first, so all are valid.
 
-        Of a vector (12,), which ends at ln_scales, the rest is as untuned.
+        For a vector (12,), which ends at ln_scales, the rest keeps the untuned values.
         """
         v = np.asarray(vector, float)
         if v.shape == (NOISE,):
@@ -173,7 +173,9 @@ class Memberships:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Lower and upper ends of the vector, (30,) each: where an optimiser may look."""
+        """Return lower and upper ends of the vector, (30,) each: the range of an optimiser's
+        search.
+        """
         lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -0.1, -0.1]
         lower += [0.3, 2.5, 0.5, 0.1]
         upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 0.1, 0.1]
@@ -184,12 +186,13 @@ class Memberships:
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:
-        """A plain dictionary for a JSON file."""
+        """Return a plain dictionary for a JSON file."""
         return {name: list(getattr(self, name)) for name in LENGTHS}
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """The memberships in a parsed JSON document; one without rules has the untuned ones.
+        """Return the memberships in a parsed JSON document; one without rules gets the untuned
+        ones.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.

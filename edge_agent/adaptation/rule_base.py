@@ -1,5 +1,5 @@
-"""The rules by which the default estimator steers what varies: what to believe, and how fast to
-forget.
+"""The rules by which the default estimator adapts: noise, share of the evidence, and speed of
+forgetting.
 
 | if | then | kind |
 |---|---|---|
@@ -8,12 +8,12 @@ forget.
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
 | slide, demand, new forces and strain are in one set each | ln of the share of evidence taken | Takagi–Sugeno |
 
-Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`. Sets are ramps
-from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`.
-Inputs are of the block that has just ended, so that a rule never sees what it steers.
+Sugeno: the consequent of a rule times its membership. The first line is `fuzzy.py`. Sets are ramps
+from a foot (membership 0) to a peak (1); feet, peaks and consequents are `Memberships`. Inputs come
+from the block that has just ended, so that no rule sees its own effect.
 
 `plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
-moves. It is what the rules are measured against (`fuzzy.worth`).
+changes. It is the baseline of the rules (`fuzzy.worth`).
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave
 
 
 class RuleBase(NamedTuple):
-    """Feet and peaks of the sets, and what the last two rules ask for; or the numbers of
-    `plain_share` without sets."""
+    """Feet and peaks of the sets, and the consequents of the last two rules; or the numbers of
+    `plain_share` without sets.
+    """
 
     far: Annotated[FloatArray, 2]
     wide: Annotated[FloatArray, 2]
@@ -52,7 +53,7 @@ class RuleBase(NamedTuple):
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
-    """The rules with the vertices of `memberships`."""
+    """Return the rules with the vertices of `memberships`."""
     m = memberships
     ln_noise, pace = m.consequents
     return RuleBase(
@@ -68,27 +69,30 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return rules without fuzzy sets: `plain_share` of the evidence, and R, steering and
-    forgetting as they are."""
+    """Return rules without fuzzy sets: `plain_share` of the evidence, with R, steering and
+    forgetting not adapted.
+    """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
 
 
 @compiled
 def is_high(value: float, ramp: FloatArray) -> float:
-    """Membership of `value` in the set that rises from ramp[0] to ramp[1]."""
+    """Return the membership of `value` in the set that rises from ramp[0] to ramp[1]."""
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
 
 
 @compiled
 def hurry(rules: RuleBase, wheels: float) -> float:
-    """Pace at which offsets, slope and bank return to their prior, beside the usual one [1/s]."""
+    """Return the rate, added to the usual one, at which offsets, slope and bank return to their
+    prior [1/s].
+    """
     return rules.pace * is_high(wheels, rules.far)
 
 
 @compiled
 def wide_noise(rules: RuleBase, angle: float) -> float:
-    """Factor on R of an axle whose wheels are steered by `angle` [rad]."""
+    """Return the factor on R of an axle whose wheels are steered by `angle` [rad]."""
     return math.exp(rules.ln_noise * is_high(abs(angle), rules.wide))
 
 

@@ -5,14 +5,14 @@ Legend
     alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the
                 paper's (18) is a difference of traces, which adds squares of unlike units
     rate        its rate [1/s]
-    level       what a rule asks for: ln of the factor on R [nat]                         (5, 7)
+    level       consequent of a rule: ln of the factor on R [nat]                         (5, 7)
 
 Sets are triangles that meet at each other's peaks, so memberships sum to one and the inference is
 bilinear.
 
 Table 1 of paper 001, rows NB NM Z PM PB of the rate, columns NB NM NS Z PS PM PB of alpha. Where
 alpha is negative the printed table grows R, although the text asks for less: there the level counts
-as its reciprocal. PMB and PSM, which the declared sets do not have, are taken as the steps beside
+as its reciprocal. PMB and PSM, which the declared sets do not have, are taken as the steps next to
 PM.
 """
 
@@ -40,10 +40,10 @@ RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s]
 
 
 def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
-    """Levels (5, 7) [nat] of a table of set names.
+    """Return the levels (5, 7) [nat] of a table of set names.
 
     Raises:
-        InputError: a name is unknown, the shape is wrong, or no mismatch does not mean no change.
+        InputError: a name is unknown, the shape is wrong, or zero mismatch does not mean no change.
     """
     try:
         levels = np.array([[math.log(LEVELS[name]) for name in row.split()] for row in printed])
@@ -61,8 +61,8 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
-    """ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)),
-    level beyond the ends.
+    """Return ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)),
+    constant beyond the ends.
     """
     i, u = bracket(alpha, at)
     j, v = bracket(rate, of)
@@ -73,7 +73,9 @@ def infer_two(
 
 @compiled
 def bracket(value: float, peaks: FloatArray) -> tuple[int, float]:
-    """(k, share) with value = (1 - share)*peaks[k] + share*peaks[k + 1], held at the ends."""
+    """Return (k, share) with value = (1 - share)*peaks[k] + share*peaks[k + 1], held at the
+    ends.
+    """
     last = peaks.shape[0] - 2
     k = 0
     while k < last and value >= peaks[k + 1]:

@@ -14,7 +14,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def push(window: FloatArray, innovation: float) -> None:
-    """Put the newest innovation first in window (N,), and let the oldest go."""
+    """Put the newest innovation first in window (N,), and drop the oldest."""
     for j in range(window.shape[0] - 1, 0, -1):
         window[j] = window[j - 1]
     window[0] = innovation
@@ -24,8 +24,8 @@ def push(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """R of a row from its window (N,), NaN where not yet filled: then nominal; within [least,
-    largest]*nominal.
+    """Return R of a row from its window (N,), limited to [least, largest]*nominal; nominal while
+    the window is not full.
     """
     weight = total = 0.0
     for error in window:

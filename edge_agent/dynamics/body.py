@@ -2,7 +2,7 @@
 
 Legend: Fx, Fy wheel forces in the wheel's frame [N], delta road-wheel angle [rad], m mass [kg], Iz
 yaw inertia [kg m^2], (x, y) wheel position [m], a_x, a_y acceleration of the centre of gravity in
-body axes [m/s^2] (what a level accelerometer there would read), r yaw rate [rad/s]. The velocities
+body axes [m/s^2] (the reading of a level accelerometer there), r yaw rate [rad/s]. The velocities
 follow from v_x' = a_x + r*v_y and v_y' = a_y - r*v_x (paper 004, equation 2, with the sign of the
 errata).
 """
@@ -21,8 +21,8 @@ from schemas.runtime.jit import compiled
 def accelerations(
     row: FloatArray, force_x: FloatArray, force_y: FloatArray, delta: FloatArray
 ) -> tuple[float, float, float]:
-    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad] of
-    shape (4,).
+    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad]
+    of shape (4,).
     """
     total_x = total_y = moment = 0.0
     for wheel in range(4):
@@ -45,8 +45,8 @@ def accelerations(
 def axle_lateral_forces(
     row: FloatArray, ay: float, yaw_acceleration: float, moment_x: float
 ) -> tuple[float, float]:
-    """(front, rear) lateral force [N] of the axles in body axes, from what an accelerometer and a
-    gyroscope measure.
+    """Return (front, rear) lateral force [N] of the axles in body axes, from accelerometer and
+    gyroscope.
 
     moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
     """
@@ -61,8 +61,8 @@ def axle_lateral_forces(
 def advance_velocity(
     vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
 ) -> tuple[float, float]:
-    """(v_x, v_y) [m/s] after `step` [s] of constant a_x, a_y, r: the exact solution, a rotation by
-    -r*step.
+    """Return (v_x, v_y) [m/s] after `step` [s] of constant a_x, a_y, r: the exact solution, a
+    rotation by -r*step.
 
     Heun's rule is its second-order part; Euler's rule costs a factor of four in v_y (errata).
     """

@@ -22,7 +22,7 @@ DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
 @compiled
 def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
-    """(4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel
+    """Return (4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel
     speed (4,) [rad/s].
     """
     out = np.empty((4, 3))
@@ -39,8 +39,8 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
 def _slips(
     radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
 ) -> tuple[float, float]:
-    """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta),
-    sin(delta).
+    """Return the slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at
+    cos(delta), sin(delta).
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
@@ -53,8 +53,7 @@ def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, fl
     """Return the slip stiffness (along [N], across [N/rad]) of a tyre under `load` [N] on friction
     `mu`.
 
-    It is in proportion to load alone, unless the row says otherwise: PROPORTIONAL, QUADRATIC,
-    REAR_SLOPE.
+    It is proportional to load alone, unless the row selects PROPORTIONAL, QUADRATIC or REAR_SLOPE.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
     share = (1.0 + body.proportional * (mu - 1.0)) * by_load
@@ -122,10 +121,10 @@ class WheelInputs(NamedTuple):
 
 @inlined
 def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[float, float, float]:
-    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces.
+    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) from the forces of four Dugoff tyres.
 
-    Written out per wheel, with numbers and no arrays between: this is where the papers' filters
-    spend their time.
+    Written out per wheel, with scalars and no arrays between, because the papers' filters spend
+    most of their time here.
     """
     vx, vy, rate, ax, ay = motion
     cos, sin, omega, force_x, mu = wheels
@@ -166,8 +165,8 @@ def _pull(
     wheel: tuple[float, float, float, float, float, float],
     rear: bool,
 ) -> tuple[float, float]:
-    """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given
-    longitudinal force.
+    """Return the force (forward, left) [N] in body axes of a wheel with load, mu, cos, sin, omega
+    and given longitudinal force.
     """
     load, mu, cos, sin, omega, given_x = wheel
     slip = _slips(body.radius, ahead, aside, cos, sin, omega)

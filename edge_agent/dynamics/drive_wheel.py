@@ -41,7 +41,7 @@ class WheelState(NamedTuple):
 def drive_wheel(
     state: WheelState, settled: float, inertia: float, radius: float, step: float
 ) -> WheelState:
-    """The state after `step` [s] by Euler's rule, as printed (32); settled is tau_u."""
+    """Return the state after `step` [s] by Euler's rule, as printed (32); settled is tau_u."""
     torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope
     return WheelState(
@@ -54,8 +54,8 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at all
-    ordinary slips.
+    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at
+    all ordinary slips.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)
@@ -65,6 +65,6 @@ def slip_share(radius: float, omega: float, along: float) -> float:
 
 @compiled
 def blended(share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray) -> None:
-    """out (4,) = share*model + (1 - share)*observed: the compensated force (33)."""
+    """Compute out (4,) = share*model + (1 - share)*observed: the compensated force (33)."""
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

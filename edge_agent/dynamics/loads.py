@@ -18,7 +18,7 @@ LEAST_LOAD_SHARE = 0.02
 
 @inlined
 def wheel_loads(body: Body, ax: float, ay: float) -> Four:
-    """Loads (fl, fr, rl, rr) [N] at accelerations ax, ay [m/s^2].
+    """Return the loads (fl, fr, rl, rr) [N] at accelerations ax, ay [m/s^2].
 
     The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness
     per load).

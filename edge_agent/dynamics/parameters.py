@@ -38,11 +38,11 @@ class Parameter(IntEnum):
 
 
 def parameter_row(vehicle: Vehicle) -> FloatArray:
-    """The parameters of `vehicle`, shape (15,), indexed by `Parameter`.
+    """Return the parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
     Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per
     newton of load makes them valid for the lightly and the heavily loaded wheel alike. Where the
-    file has a rear stiffness of its own, that one counts: the front axle's difference from it is
+    file has its own rear stiffness, that one is used. The difference of the front axle from it is
     compliance, a state of the default estimator.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
@@ -80,7 +80,7 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 
 class Body(NamedTuple):
-    """Parameters that body and tyres use, as numbers and not as an array: see `inlined`."""
+    """Parameters that body and tyres use, as scalars instead of an array: see `inlined`."""
 
     mass: float
     yaw_inertia: float
@@ -99,7 +99,7 @@ class Body(NamedTuple):
 
 @inlined
 def body(row: FloatArray) -> Body:
-    """The body of a row (15,)."""
+    """Return the body of a row (15,)."""
     p = Parameter
     return Body(
         row[p.MASS],
@@ -124,5 +124,5 @@ Four: TypeAlias = tuple[float, float, float, float]
 
 @inlined
 def four(values: FloatArray) -> Four:
-    """Values (4,) as numbers."""
+    """Return values (4,) as four scalars."""
     return values[0], values[1], values[2], values[3]

@@ -18,8 +18,8 @@ SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip h
 
 @compiled
 def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
-    """(x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to the
-    left.
+    """Return (x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to
+    the left.
     """
     front = wheel < 2
     x = row[Parameter.TO_FRONT] if front else -row[Parameter.TO_REAR]
@@ -31,7 +31,9 @@ def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
 def wheel_velocity(
     row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, delta: float
 ) -> tuple[float, float]:
-    """(v_wx, v_wy) [m/s] of the centre of `wheel`, along and across the wheel's own plane."""
+    """Return (v_wx, v_wy) [m/s] of the centre of `wheel`, along and across the wheel's own
+    plane.
+    """
     x, y = wheel_position(row, wheel)
     ahead = vx - y * yaw_rate
     left = vy + x * yaw_rate
@@ -44,15 +46,15 @@ def wheel_velocity(
 def along_wheel(
     row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float
 ) -> float:
-    """v_wx [m/s] of the centre of `wheel`, for its steering's cosine and sine."""
+    """Return v_wx [m/s] of the centre of `wheel`, for its steering's cosine and sine."""
     x, y = wheel_position(row, wheel)
     return cos * (vx - y * yaw_rate) + sin * (vy + x * yaw_rate)
 
 
 @inlined
 def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
-    """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip
-    angle.
+    """Return (slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the
+    slip angle.
 
     Positive slip_x drives forward, positive slip_y pushes to the left.
     """

@@ -24,8 +24,8 @@ TINY = 1e-12  # below it a slip has no direction and no force
 
 @compiled
 def magic_formula(theta: float, c: float, e: float) -> float:
-    """Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in theta; 1 <
-    c <= 2, e < 1.
+    """Return the Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in
+    theta; 1 < c <= 2, e < 1.
     """
     b = theta / c
     return math.sin(c * math.atan(b - e * (b - math.atan(b))))
@@ -33,8 +33,8 @@ def magic_formula(theta: float, c: float, e: float) -> float:
 
 @compiled
 def magic_formula_inverse(rho: float, c: float) -> float:
-    """theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and beyond
-    the peak, |rho| >= 1.
+    """Return theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and
+    beyond the peak, |rho| >= 1.
     """
     if rho >= 1.0:
         return math.inf
@@ -45,8 +45,8 @@ def magic_formula_inverse(rho: float, c: float) -> float:
 
 @compiled
 def brush(theta: float) -> float:
-    """Brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3, then 1;
-    odd in theta.
+    """Return the brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3,
+    then 1; odd in theta.
     """
     size = min(abs(theta), 3.0)
     return math.copysign(size - size * size / 3.0 + size**3 / 27.0, theta)
@@ -54,7 +54,7 @@ def brush(theta: float) -> float:
 
 @compiled
 def dugoff(theta: float) -> float:
-    """Dugoff curve of theta >= 0: theta up to one half, then 1 - 1/(4*theta)."""
+    """Return the Dugoff curve of theta >= 0: theta up to one half, then 1 - 1/(4*theta)."""
     return theta if theta <= 0.5 else 1.0 - 0.25 / theta
 
 
@@ -67,7 +67,7 @@ def combined_magic(
     c: float,
     e: float,
 ) -> tuple[float, float]:
-    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
+    """Return (Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
 
     slip (along, tan of the slip angle) [1], stiffness (along [N], across [N/rad]), mu [1], load
     [N].
@@ -88,8 +88,8 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as
-    `combined_magic`.
+    """Return (Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve;
+    arguments as in `combined_magic`.
 
     The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it
     has no falling branch.

@@ -7,7 +7,7 @@ Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filte
 innovations and the mismatch's rate by 7 x 5 rules (section 3.1, table 1, see `rules`); shares from
 the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
 
-Friction is no state: it is set by hand (section 4.1), here to DRY, and the prior is reported.
+Friction is not a state: it is set by hand (section 4.1), here to DRY, and the prior is reported.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """
@@ -50,7 +50,7 @@ ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's
 
 
 class AdaptiveMemory(FederatedMemory):
-    """One filter."""
+    """State of one filter."""
 
     actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
     expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances
@@ -58,7 +58,7 @@ class AdaptiveMemory(FederatedMemory):
 
 
 class AdaptiveDesign:
-    """What is set by hand."""
+    """Parameters that are set by hand."""
 
     friction: Annotated[FloatArray, 4]
     adaptive: bool
@@ -94,7 +94,7 @@ which nothing printed measures, by decimetres per second.
 def bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
-    """Return N of these filters on a road whose friction is set."""
+    """Return a bank of N of these filters, on a road whose friction is given."""
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
     design["friction"] = friction
@@ -125,7 +125,7 @@ def _step(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> bool:
 
 @compiled
 def _adapt(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Factors on R and shares for the next sample."""
+    """Compute the factors on R and the shares for the next sample."""
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)
     raw = np.ones(2)

@@ -1,7 +1,7 @@
-"""The estimator bank: N vehicles side by side through one compiled path.
+"""The estimator bank: N vehicles estimated in one pass through one compiled path.
 
-No vehicle's numbers meet another's, and all that is carried lies in the vehicle's own record, so
-results are bit-equal whatever N is and however the samples are cut into calls.
+Vehicles do not share numbers, and everything carried from sample to sample is in the vehicle's own
+record. Therefore results are bit-equal whatever N is and however the samples are split into calls.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ read, and arrays that a step writes before it reads them.
 
 
 class EstimatorBank:
-    """N estimators of one kind; made by `create`."""
+    """N estimators of one kind; `create` makes it."""
 
     def __init__(
         self,
@@ -64,15 +64,15 @@ class EstimatorBank:
         *,
         threads: int = 1,
     ) -> Estimates:
-        """Take the next samples of all vehicles.
+        """Advance all vehicles by the next samples.
 
         Args:
             t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and
-                health says so.
+                health reports it.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
             closes: (T, N), True at the first sample that belongs to a new visit; None for no
                 visits.
-            threads: how many share the vehicles among them; changes no bit of the result.
+            threads: number of threads that share the vehicles; changes no bit of the result.
 
         Returns:
             Estimates at the same samples; none of them is NaN, except evidence away from closes and
@@ -106,16 +106,16 @@ class EstimatorBank:
         return _estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
-        """Return a copy of the field `name` of all filters, (N, ...): for figures of a filter's
-        inside.
+        """Return a copy of the field `name` of all filters, (N, ...), for plots of a filter's
+        internal state.
         """
         return np.array(self._filters[name])
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N,
-        32) each, maximum 0.
+        """Return the current beliefs, log(posterior/uniform), and the evidence of the visit so far;
+        (N, 32) each, maximum 0.
 
-        None where the estimator has no such belief.
+        Return None where the estimator has no such belief.
         """
         if self._beliefs is None:
             return None

@@ -10,7 +10,7 @@ omega x 4] (30) to (32), see `drive_wheel`. Forces: Magic Formula (12), compensa
 [v_x, v_y, r], measurement [r, a_x, a_y] (35), (36). Both with R from a weighted moving window (25),
 see `adaptation.windows`.
 
-Friction is no state: it is set by hand, here to DRY, and the prior is reported.
+Friction is not a state: it is set by hand, here to DRY, and the prior is reported.
 
 A's states are `EstimatorBank.memory("mean")`, the compensated forces `memory("compensated")`;
 figures compare A with B. ELEMENTS lists each element of the paper and every departure with its
@@ -72,7 +72,7 @@ B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of r, a_x, a_y, with some mo
 
 
 class DriveWheelState(IntEnum):
-    """Index of a state of both filters; of a wheel quantity of A, its first wheel."""
+    """Index of a state of both filters; for a wheel quantity of A, the index of its first wheel."""
 
     VX = 0
     VY = 1
@@ -84,7 +84,7 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """One pair of filters."""
+    """State of one pair of filters."""
 
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]
@@ -96,7 +96,9 @@ class CompensatedMemory(PaperMemory):
 
 
 class FrictionSet:
-    """What is set by hand, and arrays that a step writes before it reads them."""
+    """Parameters that are set by hand, and scratch arrays that a step writes before it reads
+    them.
+    """
 
     friction: Annotated[FloatArray, 4]
     points: Annotated[FloatArray, 2 * A_STATES, A_STATES]
@@ -106,8 +108,8 @@ class FrictionSet:
 def bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
 ) -> EstimatorBank:
-    """Return N of these filters on a road whose friction is set; the tyre holds C_f and C_r of
-    table 1.
+    """Return a bank of N of these filters, on a road whose friction is given; the tyre holds C_f
+    and C_r of table 1.
     """
     context = records(FrictionSet, 1)
     context["friction"] = friction
@@ -162,8 +164,8 @@ def _forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces
-    `observed` by A.
+    """Compute the compensated forces (4,) [N] in the motion x (3,), from the tyre model and the
+    forces `observed` by A.
     """
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
@@ -184,7 +186,7 @@ def _forces(
 
 @compiled
 def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """WCKF-A: lateral forces come from the tyre model in B's last motion."""
+    """Run WCKF-A; its lateral forces come from the tyre model at the last motion of B."""
     row = memory.row
     mean = memory.mean
     root = memory.root
@@ -236,7 +238,7 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
 
 @compiled
 def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """WCKF-B: motion by the compensated forces."""
+    """Run WCKF-B: estimate the motion from the compensated forces."""
     row = memory.row
     track = memory.track
     mean = memory.fused

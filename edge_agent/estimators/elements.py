@@ -1,4 +1,4 @@
-"""Elements of the papers: one line per equation, table or figure, and how the code stands to it.
+"""Elements of the papers: one entry per equation, table or figure, with how the code implements it.
 
 Each paper's module holds its list. Documentation and reports are generated from these lists.
 """

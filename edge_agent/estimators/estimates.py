@@ -1,5 +1,5 @@
-"""What a bank reports: numbers per sample and vehicle, written by the kernels, and its columns
-by name.
+"""Output of a bank: numbers per sample and vehicle, written by the kernels, and its columns by
+name.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FlagArray: TypeAlias = NDArray[np.int64]
 
 
 class Column(IntEnum):
-    """Index of a number that a bank reports of a sample; none of them is NaN."""
+    """Index of a reported number of a sample; none of them is NaN."""
 
     VX = 0  # [m/s]
     VY = 1  # [m/s]
@@ -44,7 +44,9 @@ FOUR_FRICTIONS = int(Column.WHEELS) + 12
 
 
 class _View:
-    """A number of all samples, as a view: made when asked for, since a live loop reads few."""
+    """One column of all samples as a view, made on first access because a live loop reads few
+    columns.
+    """
 
     def __init__(self, place: Column) -> None:
         self._place = int(place)
@@ -58,8 +60,8 @@ def _column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says
 
 
 class Estimates:
-    """What a bank reports of T samples of N vehicles; columns are arrays of shape (T, N),
-    documented in `Column`.
+    """Output of a bank for T samples of N vehicles; columns are arrays of shape (T, N), documented
+    in `Column`.
     """
 
     __slots__ = ("evidence", "jumps", "values")
@@ -91,13 +93,13 @@ class Estimates:
 
     @property
     def health(self) -> FlagArray:
-        """(T, N) of schemas.signals.Health."""
+        """Flags of schemas.signals.Health, (T, N)."""
         return self.values[..., Column.HEALTH].astype(np.int64)
 
     @property
     def mu_wheel(self) -> FloatArray | None:
-        """(T, N, 4, 3) median, lower, upper per wheel; None where the estimator has one
-        friction.
+        """Median, lower and upper end of friction per wheel, (T, N, 4, 3); None where the estimator
+        has one friction for all wheels.
         """
         if self.values.shape[-1] == ONE_FRICTION:
             return None

@@ -10,9 +10,9 @@ by (54).
 
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
 friction: see `literal.federated_friction`, which holds the friction filter as printed. On a real
-tyre it is not, so here R is sensor noise and model error, and friction returns to the prior over
-the metres driven: what is not observable is as wide as the prior. ELEMENTS lists each element of
-the paper and every departure with its reason.
+tyre it is not. Therefore R here is sensor noise plus model error, and friction returns to the prior
+over the metres driven, so that an unobservable friction is as wide as the prior. ELEMENTS lists
+each element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
 class JointMemory(FederatedMemory):
-    """One joint filter."""
+    """State of one joint filter."""
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]
@@ -92,7 +92,9 @@ def bank(
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
-    """Return N of these filters, with the paper's tyre and motion setting if they are given."""
+    """Return a bank of N of these filters, with the given tyre and motion setting if there are
+    any.
+    """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)
     return EstimatorBank(filters, records(EmptyRecord, 1), KERNEL, columns=FOUR_FRICTIONS)
@@ -118,8 +120,8 @@ def _step(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa
 
 @compiled
 def share_by_information(first: float, second: float) -> float:
-    """Share of sub-filter 1 [1] from the traces of the two covariances: the better one gets more
-    (54, turned round).
+    """Return the share of sub-filter 1 [1] from the traces of the two covariances: the better
+    sub-filter gets more (54, with the ratio inverted).
     """
     return min(max(second / (first + second), LEAST_BETA), 1.0 - LEAST_BETA)
 

@@ -1,4 +1,4 @@
-"""The health flags as plain integers: compiled kernels do not combine enumerations."""
+"""The health flags as plain integers, because compiled kernels cannot combine enumerations."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ State [v_x, v_y, a_x, a_y, r, mu], input [omega, delta], measurement [a_x, a_y, 
 29); motion (1) to (3), Dugoff tyres (7) to (12), cubature filter (13) to (28), fuzzy factor on R
 (30), sets tuned by ants (31) to (33).
 
-ELEMENTS lists each element of the paper and every departure with its reason. Friction keeps to its
-range and to the prior's spread.
+ELEMENTS lists each element of the paper and every departure with its reason. Friction is limited to
+its range, and its spread to that of the prior.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ LARGEST_FACTOR = 20.0
 
 
 class Setting(NamedTuple):
-    """Variances of the filter and its belief at the start."""
+    """Variances of the filter and its initial state."""
 
     process: tuple[float, ...] = (1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-5)  # Q per STEP_S (errata)
     start: tuple[float, ...] = (
@@ -100,7 +100,7 @@ With Q = .1*I per step the yaw-rate error stays near .13 rad/s, which the printe
 
 
 class FuzzyMemory(PaperMemory):
-    """One filter."""
+    """State of one filter."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -110,8 +110,8 @@ class FuzzyMemory(PaperMemory):
 
 
 class FuzzyContext:
-    """What the filters of a thread share: the setting, and arrays that a step writes before it
-    reads them.
+    """Setting and scratch arrays that the filters of a thread share; a step writes the arrays
+    before it reads them.
     """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
@@ -132,8 +132,8 @@ def bank(
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
 ) -> EstimatorBank:
-    """Return N of these filters; `setting` replaces the one for ordinary sensors and an unknown
-    road.
+    """Return a bank of N of these filters; `setting` replaces the default for ordinary sensors and
+    an unknown road.
     """
     chosen = Setting() if setting is None else setting
     context = records(FuzzyContext, 1)
@@ -154,7 +154,7 @@ def bank(
 
 @compiled
 def _begin(memory: FuzzyMemory, context: FuzzyContext) -> None:
-    """Begin at the speed of the wheels, straight on."""
+    """Start at the speed of the wheels, straight ahead."""
     mean = memory.mean
     root = memory.root
     use = memory.track.inputs
@@ -203,7 +203,7 @@ def _step(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
 
 @compiled
 def _adapt(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
-    """context.adapted = R of this sample, and the factors on R for the next."""
+    """Compute context.adapted = R of this sample, and the factors on R for the next."""
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]
         innovation = memory.track.now[r] - memory.mean[PlanarState.AX + r]

@@ -2,10 +2,10 @@
 
 `aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
 square-root cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
-noise: tuned by the ant colony, untuned, none. Departures from paper 004, whose family it is:
-kinematic prediction, wheel speed as a measurement, force from torque, residuals by total least
-squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states, bounded
-adaptation in the direction of the errata.
+noise: tuned by the ant colony, untuned, none. Departures from paper 004, on which the filter is
+based: kinematic prediction, wheel speed as a measurement, force from torque, residuals by total
+least squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states,
+bounded adaptation in the direction of the errata.
 """
 
 from __future__ import annotations
@@ -60,20 +60,20 @@ def create(
     memberships: Memberships | None = None,
     curve: Curve | None = None,
 ) -> EstimatorBank:
-    """A bank of estimators `name`, one per vehicle.
+    """Return a bank of estimators `name`, one per vehicle.
 
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
-        memberships: the fuzzy sets; needed by the estimators in TUNED, and replacing the untuned
-            ones of others.
+        memberships: the fuzzy sets; required by the estimators in TUNED, and replacing the untuned
+            sets of others.
         curve: of the tyres, in place of the usual one; for the default estimator and its two
             ablations.
 
     Raises:
         InputError: the name is unknown, no vehicle is given, tuned memberships are missing,
-            memberships are given to an estimator that has none, or a curve that is none, or to one
-            that has its own.
+            memberships are given to an estimator that has none, the curve is invalid, or a curve
+            is given to an estimator that has its own.
     """
     if name not in ESTIMATORS:
         raise InputError(

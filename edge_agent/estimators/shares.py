@@ -1,5 +1,5 @@
-"""What every bank does around its kernel: check the samples, and give the vehicles to threads in
-equal shares.
+"""Work around the kernel of every bank: check the samples, and distribute the vehicles to threads
+in equal shares.
 
 Kernels release the interpreter's lock and share no state.
 """
@@ -22,7 +22,7 @@ DOUBLE = np.dtype(np.float64)
 def checked(
     t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
+    """Return t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
 
     Raises:
         InputError: shapes do not agree with the bank or with each other.
@@ -40,8 +40,8 @@ def checked(
 
 
 def in_shares(work: Callable[[int, int, int], None], count: int, threads: int) -> None:
-    """Call work(share, first, last) for `threads` runs of vehicles, together all `count`, at the
-    same time.
+    """Call work(share, first, last) concurrently for `threads` ranges of vehicles that together
+    cover all `count`.
 
     Raises:
         InputError: threads is below 1.

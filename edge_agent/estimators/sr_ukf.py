@@ -7,12 +7,12 @@ measurement update (3.1), posterior factor by downdates (3.2).
 
 State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of freedom are their
 torque balances, taken as measurements: F_x = (T - J*omega')/R. With them each driven wheel is
-observable; with the paper's a_x, a_y, r alone two of four frictions are, at most (errata).
+observable. With the paper's a_x, a_y, r alone, at most two of four frictions are (errata).
 
-The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This one
-is for a car, where nobody gives v_x and v_y: they are states, a_x and a_y are inputs of the
-kinematics, and the wheel torques stand for a_x. ELEMENTS lists each element of the paper and every
-departure with its reason.
+The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This
+filter is for a car, where v_x and v_y are not given: they are states, a_x and a_y are inputs of the
+kinematics, and the wheel torques replace the measurement a_x. ELEMENTS lists each element of the
+paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """One filter."""
+    """State of one filter."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -117,7 +117,7 @@ class UnscentedMemory(PaperMemory):
 
 
 def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
-    """Return N of these filters."""
+    """Return a bank of N of these filters."""
     return EstimatorBank(
         new_filters(UnscentedMemory, vehicles, tyre),
         records(EmptyRecord, 1),
@@ -148,8 +148,8 @@ def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG0
 
 @compiled
 def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
-    """mu (4,) of a point x (7,), which deviates from the mean's by `share` of its own, within
-    the range of friction.
+    """Compute mu (4,) of a point x (7,), within the range of friction; its deviation from the mean
+    is scaled by `share`.
     """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel
@@ -158,7 +158,7 @@ def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> 
 
 @compiled
 def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> tuple[float, float]:
-    """(a_y, yaw acceleration) of the tyres at x (7,)."""
+    """Return (a_y, yaw acceleration) from the tyres at x (7,)."""
     use = track.inputs
     unknown = (math.nan, math.nan, math.nan, math.nan)
     motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])

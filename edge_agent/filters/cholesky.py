@@ -1,9 +1,8 @@
 """The square root of a covariance, and the covariance of a square root.
 
 Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q
-variances (n,). A pivot is what is left of a state's variance when the states before it are known;
-where it is below what is surely there (its own noise), rounding has taken it, and what is surely
-there takes its place.
+variances (n,). A pivot is the variance of a state given the states before it. It cannot be smaller
+than the state's own noise; where rounding makes it smaller, the noise variance replaces it.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from schemas.runtime.jit import compiled, inlined
 
 @inlined
 def factorize_column(a: FloatArray, j: int, least: float) -> None:
-    """Column j of the factor of a (n, n) in place, the columns before it being done; a pivot is at
-    least `least` > 0.
+    """Compute column j of the factor of a (n, n) in place, with the columns before it done; a pivot
+    is at least `least` > 0.
 
-    Only the lower half is read; what is right of the diagonal becomes zero.
+    Only the lower half is read; entries right of the diagonal become zero.
     """
     total = a[j, j]
     for k in range(j):
@@ -37,7 +36,7 @@ def factorize_column(a: FloatArray, j: int, least: float) -> None:
 
 @compiled
 def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> None:
-    """sqrt_cov (n, n) = factor of covariance (n, n), of which the lower half is read."""
+    """Compute sqrt_cov (n, n) = factor of covariance (n, n), of which the lower half is read."""
     n = covariance.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -48,8 +47,8 @@ def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> Non
 
 @compiled
 def multiply(sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray) -> None:
-    """covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,) of
-    independent noise.
+    """Compute covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,)
+    of independent noise.
     """
     n = sqrt_cov.shape[0]
     for i in range(n):
@@ -62,7 +61,7 @@ def multiply(sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray
 
 @compiled
 def variance(sqrt_cov: FloatArray, i: int) -> float:
-    """Variance of state i of a covariance with factor sqrt_cov (n, n)."""
+    """Return the variance of state i of a covariance with factor sqrt_cov (n, n)."""
     total = 0.0
     for j in range(i + 1):
         total += sqrt_cov[i, j] * sqrt_cov[i, j]

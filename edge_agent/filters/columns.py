@@ -1,14 +1,14 @@
-"""The cubature filter with its points side by side, for kernels that step millions of times a
-second.
+"""The cubature filter with its points in adjacent columns, for kernels that step millions of times
+a second.
 
 Legend
     m, L        state's mean (n,), and its lower-triangular square root of the covariance, P = L*L'     (n, n)
     x           points in columns                                                                      (n, 2n)
     q           standard deviations of the process noise, independent                                  (n,)
 
-The same points and the same prediction as `points` and `householder` with `sigma.cubature`, for
-less work: all weights are 1/(2n). Points lie along the fast axis, so that the model moves several
-at once.
+Points and prediction equal those of `points` and `householder` with `sigma.cubature`, with less
+work because all weights are 1/(2n). Points lie along the contiguous axis, so that the model moves
+several at once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
-    """points (n, 2n): column j is m + sqrt(n)*L[:, j], column n + j is m - sqrt(n)*L[:, j]."""
+    """Fill points (n, 2n): column j is m + sqrt(n)*L[:, j], column n + j is m - sqrt(n)*L[:, j]."""
     n = mean.shape[0]
     size = math.sqrt(n)
     for i in range(n):
@@ -35,13 +35,13 @@ def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
 def gather(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
-    """Mean and sqrt_cov of moved points (n, 2n), which become deviations, with process noise
-    pace*q.
+    """Compute mean and sqrt_cov of moved points (n, 2n), which become deviations, with process
+    noise pace*q.
 
-    The mean is the first point and deviations from it, so that large offsets lose no digits. The
-    covariance is summed and factorized, at half the cost of an orthogonal transformation; a pivot
-    cannot be less than its own noise, for what has been taken from it is what others explain of the
-    deviations alone.
+    The mean is the first point plus the mean deviation from it, so that large offsets lose no
+    digits. The covariance is summed and factorized, at half the cost of an orthogonal
+    transformation. A pivot cannot be smaller than its own process noise, because the earlier states
+    explain only the deviations.
     """
     n, count = points.shape
     weight = 1.0 / count

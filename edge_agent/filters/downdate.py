@@ -1,4 +1,4 @@
-"""Removal of a rank from a covariance factor, refused if the covariance does not contain it."""
+"""Rank-one downdate of a covariance factor, refused if the covariance does not contain the rank."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding d
 
 @compiled
 def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> bool:
-    """sqrt_cov (n, n) becomes the factor without column (n,); False, and nothing changed, where
-    there is none.
+    """Change sqrt_cov (n, n) to the factor without column (n,); return False, and change nothing,
+    where there is no such factor.
 
     white (n,) is scratch.
     """
@@ -57,11 +57,12 @@ def update_by_downdate(
     noise_std: FloatArray,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
-    """Measurement update in place as paper 003 does it: L loses the columns of U = P_xz*S^-T/2, one
-    after the other.
+    """Run the measurement update in place as paper 003 does: L loses the columns of U =
+    P_xz*S^-T/2, one after the other.
 
-    Arguments as `householder.update`. Returns what it returns, and whether a downdate was refused:
-    then `update` has done the work, whose orthogonal transformation cannot fail.
+    Arguments as in `householder.update`. Return the same values, and whether a downdate was
+    refused. In that case `update` has done the work, because its orthogonal transformation cannot
+    fail.
     """
     n, points = state_deviations.shape
     rows = innovation.shape[0]

@@ -1,5 +1,5 @@
 """The two operations of a federated filter: the master shares its information, and fuses the
-sub-filters' results.
+results of the sub-filters.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
-    """out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the
+    """Compute out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the
     information.
     """
     gain = 1.0 / math.sqrt(beta)

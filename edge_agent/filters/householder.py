@@ -69,8 +69,8 @@ def predict(
     sqrt_cov: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Mean and sqrt_cov of propagated points (points, n) with process noise factor sqrt_noise (n,
-    n).
+    """Compute mean and sqrt_cov of propagated points (points, n) with process noise factor
+    sqrt_noise (n, n).
 
     Writes mean (n,) and sqrt_cov (n, n); work is (n, points + n) or larger.
     """
@@ -96,7 +96,7 @@ def update(
     noise_std: FloatArray,
     work: FloatArray,
 ) -> tuple[int, float, float]:
-    """Measurement update in place; rows whose innovation is NaN are skipped.
+    """Run the measurement update in place; rows whose innovation is NaN are skipped.
 
     Args:
         mean: m, (n,), changed. sqrt_cov: L, (n, n), changed.

@@ -22,8 +22,8 @@ from schemas.runtime.jit import compiled
 def sigma_points(
     mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray
 ) -> None:
-    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points,
-    n).
+    """Compute points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points
+    (points, n).
     """
     count, n = xi.shape
     for p in range(count):
@@ -36,8 +36,8 @@ def sigma_points(
 
 @compiled
 def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
-    """points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points (points,
-    n).
+    """Compute points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points
+    (points, n).
     """
     axes, size, _ = np.linalg.svd(sqrt_cov)
     count, n = xi.shape
@@ -51,7 +51,7 @@ def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: 
 
 @compiled
 def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large
+    """Compute mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large
     offsets lose no digits.
     """
     count, n = points.shape
@@ -66,8 +66,8 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 def deviations(
     points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
 ) -> None:
-    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from
-    centred deviations.
+    """Compute out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance
+    from centred deviations.
     """
     count, n = points.shape
     for p in range(count):

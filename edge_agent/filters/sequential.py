@@ -6,9 +6,9 @@ Legend
     r, a        variance of the noise, and of the innovation, a = f'*f + r
     nu          innovation, measured minus predicted
 
-No variance is ever subtracted from another, so none can lose its sign. Rows whose noise is
-independent may be taken in one by one in any order; what the next rows deviate by changes with L,
-and `project` changes it alike.
+No variance is ever subtracted from another, so none can become negative. Rows with independent
+noise may be taken in one by one in any order. The deviations f of the remaining rows change with L,
+and `project` updates them in the same way.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def potter(f: FloatArray, noise: float) -> tuple[float, float]:
-    """(a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I -
+    """Return (a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I -
     g*f*f') (Potter 1963).
     """
     a = noise
@@ -33,7 +33,9 @@ def potter(f: FloatArray, noise: float) -> tuple[float, float]:
 
 @inlined
 def project(mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float) -> None:
-    """mean (n,) += L*f*step, root L (n, k or more) <- L*(I - gain*f*f'); f (k,) is zero beyond."""
+    """Compute mean (n,) += L*f*step, root L (n, k or more) <- L*(I - gain*f*f'); f (k,) is zero
+    beyond.
+    """
     for i in range(mean.shape[0]):
         along = 0.0
         for c in range(f.shape[0]):
@@ -53,8 +55,8 @@ def carlson(
     variance: float,
     gain: FloatArray,
 ) -> tuple[float, float]:
-    """Take in a `reading` of state i itself with noise `variance` > 0: (innovation squared over a,
-    a).
+    """Take in a `reading` of state i itself with noise `variance` > 0; return (innovation squared
+    over a, a).
 
     L stays triangular (Carlson 1973): its rows are turned by 2 x 2 rotations whose cosines come
     from sums of squares alone. gain (n,) is scratch.

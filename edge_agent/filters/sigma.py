@@ -1,4 +1,4 @@
-"""Sigma rules: tables of points and weights that prove themselves when built.
+"""Sigma rules: tables of points and weights that are checked when built.
 
 Legend
     n           dimension of the state
@@ -24,11 +24,11 @@ EXACTNESS = 1e-9  # moments may miss by this much; alpha = 1e-3 costs six of the
 
 @dataclass(frozen=True)
 class SigmaRule:
-    """Points and weights of one rule; refuses to exist where its moments are wrong.
+    """Points and weights of one rule; its constructor refuses wrong moments.
 
     Raises:
         InputError: shapes do not agree, a moment up to the second is not exact, or a covariance
-            weight is negative (a square-root filter has no use for one).
+            weight is negative (a square-root filter cannot use one).
     """
 
     name: str
@@ -64,12 +64,12 @@ class SigmaRule:
 
     @property
     def dimension(self) -> int:
-        """n, the dimension of the state."""
+        """Dimension n of the state."""
         return int(self.xi.shape[1])
 
 
 def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
-    """The scaled unscented rule (Julier 2002); a centre without any weight is left out.
+    """Return the scaled unscented rule (Julier 2002); a centre without any weight is left out.
 
     lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i; w_mean_0 = lambda/(n +
     lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).
@@ -95,8 +95,8 @@ def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
 
 
 def cubature(n: int) -> SigmaRule:
-    """The third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i with
-    weights 1/(2n).
+    """Return the third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i
+    with weights 1/(2n).
     """
     if n < 1:
         raise InputError("cubature", "n must be at least 1", "give the dimension of the state")

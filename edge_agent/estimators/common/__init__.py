@@ -1,3 +1,3 @@
-"""What all estimators share: believable readings, what is used of the grip, arrays and records
-of small filters.
+"""Parts that all estimators share: checked readings, grip in use, arrays and records of small
+filters.
 """

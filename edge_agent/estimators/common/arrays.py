@@ -1,5 +1,5 @@
-"""Copying and clearing small arrays by plain loops: a slice assignment costs seconds of
-compilation, each.
+"""Plain loops that copy and clear small arrays: each slice assignment would cost seconds of
+compilation.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def put(target: FloatArray, source: FloatArray) -> None:
-    """target (n,) = source (n,)."""
+    """Copy: target (n,) = source (n,)."""
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @compiled
 def put_square(target: FloatArray, source: FloatArray) -> None:
-    """target (n, n) = source (n, n)."""
+    """Copy: target (n, n) = source (n, n)."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
@@ -25,14 +25,14 @@ def put_square(target: FloatArray, source: FloatArray) -> None:
 
 @compiled
 def clear(target: FloatArray) -> None:
-    """target (n,) = 0."""
+    """Clear: target (n,) = 0."""
     for i in range(target.shape[0]):
         target[i] = 0.0
 
 
 @compiled
 def clear_rows(target: FloatArray) -> None:
-    """target (m, n) = 0."""
+    """Clear: target (m, n) = 0."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = 0.0

@@ -15,7 +15,7 @@ SLOT_S = 0.02
 
 
 class Excitation:
-    """Force over load [1] of the hardest-working wheel, slot by slot."""
+    """Force over load [1] of the wheel that uses most grip, slot by slot."""
 
     time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
     used: Annotated[FloatArray, SLOTS]
@@ -26,7 +26,7 @@ class Excitation:
 
 @compiled
 def begin_excitation(ring: Excitation) -> None:
-    """Nothing has been used so far."""
+    """Reset the ring: no grip has been used so far."""
     ring.largest_time = -math.inf
     for k in range(SLOTS):
         ring.time[k] = -math.inf
@@ -34,7 +34,7 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Take in what is used at `time` [s] and renew `largest`."""
+    """Add the grip used at `time` [s] to the ring and update `largest`."""
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:
         place = (place + 1) % SLOTS
@@ -50,7 +50,7 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _search(ring: Excitation, time: float) -> None:
-    """Renew `largest` from all slots: the one it came from has grown old."""
+    """Find `largest` again from all slots, because the slot it came from has expired."""
     ring.largest = 0.0
     for k in range(SLOTS):
         if ring.time[k] > time - UTILISED_WINDOW_S and ring.used[k] >= ring.largest:

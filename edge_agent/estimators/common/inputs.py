@@ -1,10 +1,10 @@
-"""Readings of one vehicle made fit for a filter that steps once a sample: refusals, gaps,
-replacements, grip used.
+"""Readings of one vehicle, prepared for a filter that steps once per sample: refusals, gaps,
+replacements, grip in use.
 
-A reading that is missing, infinite or unbelievable is NaN in `now`, and that row of a measurement
-is left out. Where a filter takes it as an input it is replaced in `inputs`: accelerations by
-nothing and r*v_x, yaw rate and steering by the last value, torque by the share of m*a_x; a wheel
-without speed stays NaN and is taken to roll freely.
+A reading that is missing, infinite or implausible is NaN in `now`, and that row of a measurement is
+left out. A filter that takes the reading as an input finds a replacement in `inputs`: zero and
+r*v_x for the accelerations, the last value for yaw rate and steering, the share of m*a_x for
+torque. A wheel without speed stays NaN and is assumed to roll freely.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STEPPED = 2
 
 
 class InputTrack:
-    """What is carried of the samples of one vehicle."""
+    """State of one vehicle's input stream, carried from sample to sample."""
 
     started: bool
     time: float  # of the last sample [s]
@@ -53,8 +53,8 @@ class InputTrack:
 def take(
     track: InputTrack, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, int, float]:
-    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED,
-    seconds elapsed).
+    """Process sample (18,) of a vehicle at `time` [s]: return (health flags, REFUSED | BEGUN |
+    STEPPED, seconds elapsed).
     """
     begins = not track.started
     dt = time - track.time
@@ -78,7 +78,7 @@ def take(
 
 @compiled
 def _begin(track: InputTrack) -> None:
-    """Nothing has been seen so far; the wheels are straight."""
+    """Reset the track: no sample has been seen, and the wheels point straight ahead."""
     track.started = True
     track.position_time = -math.inf
     for wheel in range(4):
@@ -88,7 +88,7 @@ def _begin(track: InputTrack) -> None:
 
 @compiled
 def _remember(track: InputTrack) -> None:
-    """The inputs become those of the sample before."""
+    """Store the inputs as those of the previous sample."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
     for wheel in range(4):
@@ -98,7 +98,9 @@ def _remember(track: InputTrack) -> None:
 
 @compiled
 def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
-    """Fill `inputs`; anew: what they were before counts no more."""
+    """Fill `inputs`. If the last argument is True, the previous inputs are not used as
+    replacements.
+    """
     now = track.now
     use = track.inputs
     for k in range(S.YAW_RATE, S.OMEGA):
@@ -122,8 +124,8 @@ def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
 
 @compiled
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
-    """Grip used by the hardest-working wheel now [1]: hypot of torque over radius and load, and
-    lateral g.
+    """Return the grip used now by the wheel that uses most [1]: the hypotenuse of torque over
+    radius and load, and lateral g.
     """
     use = track.inputs
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
@@ -135,8 +137,8 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
 
 @compiled
 def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
-    """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation
-    10).
+    """Return F_x = (T - J*omega')/R [N] of a wheel from inputs that are `step` [s] apart (paper
+    000, equation 10).
     """
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step

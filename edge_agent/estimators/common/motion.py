@@ -1,4 +1,4 @@
-"""What is known of a motion at first, and how its estimate is seen to have gone wrong."""
+"""Initial motion of a filter, and the test that detects a diverged motion estimate."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ FASTEST_TURN = 20.0  # [rad/s]
 
 @compiled
 def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
-    """Whether a filter has diverged whose first states are v_x and v_y, and whose state
-    `yaw_rate` is the yaw rate.
+    """Return True if a filter has diverged. Its first states are v_x and v_y; state `yaw_rate` is
+    the yaw rate.
     """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
     bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
@@ -33,7 +33,9 @@ def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 
 @compiled
 def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
-    """The health flag of a wheel past its peak by longitudinal slip, at the inputs in use."""
+    """Return the health flag of a wheel whose longitudinal slip is past the peak, at the inputs in
+    use.
+    """
     health = 0
     yaw_rate = track.inputs[S.YAW_RATE]
     for wheel in range(4):

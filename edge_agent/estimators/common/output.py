@@ -1,9 +1,8 @@
-"""What every estimator reports, written into the columns of its output; friction as a Gaussian's
-interval.
+"""The output columns that every estimator writes; friction as the interval of a Gaussian.
 
 Friction is reported as the Gaussian's median and 5 % and 95 % quantiles, clipped to the range of
-the friction grid. The papers' filters do not know what a visit's measurements alone say, so their
-bank has no evidence: the agent publishes friction with its interval.
+the friction grid. The papers' filters cannot separate the evidence of one visit from their prior.
+Therefore their bank has no evidence, and the agent publishes friction with its interval.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ def write_motion(
     var_y: float,
     var_rate: float,
 ) -> None:
-    """The motion [m/s, rad/s] with its variances."""
+    """Write the motion [m/s, rad/s] with its variances."""
     speed = max(abs(vx), SLOWEST_M_S)
     output[Column.VX], output[Column.VY], output[Column.YAW_RATE] = vx, vy, yaw_rate
     output[Column.SIDESLIP] = math.atan2(vy, speed)
@@ -45,8 +44,8 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """The motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate` is
-    the yaw rate.
+    """Write the motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate`
+    is the yaw rate.
     """
     write_motion(
         output,
@@ -63,14 +62,14 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
 def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
-    """Grip used, and how the innovations were."""
+    """Write the grip in use and the statistics of the innovations."""
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
 
 
 @compiled
 def write_friction(output: FloatArray, first: int, mu: float, std: float) -> None:
-    """Median, 5 % and 95 % of friction within its range, from column `first` on."""
+    """Write median, 5 % and 95 % of friction within its range, from column `first` on."""
     wide = Z_95 * std
     output[first] = min(max(mu, LOWER), UPPER)
     output[first + 1], output[first + 2] = (
@@ -81,7 +80,7 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
-    """Median, 5 % and 95 % of the uniform prior, from column `first` on: nothing is known of the
+    """Write median, 5 % and 95 % of the uniform prior from column `first` on, for an unknown
     road.
     """
     output[first] = 0.5 * (LOWER + UPPER)
@@ -90,7 +89,9 @@ def write_prior(output: FloatArray, first: int) -> None:
 
 @compiled
 def write_unknown(output: FloatArray) -> None:
-    """What is known before the first usable sample: the prior, and no motion with a wide spread."""
+    """Write the output before the first usable sample: the prior of friction, and zero motion with
+    a wide spread.
+    """
     write_motion(output, 0.0, 0.0, 0.0, UNKNOWN_V_STD**2, 1.0, 1.0)
     output[Column.SIDESLIP_STD] = 1.0
     write_quality(output, 0.0, 0.0, 1.0, 0.0)
@@ -101,7 +102,7 @@ def write_unknown(output: FloatArray) -> None:
 
 @compiled
 def limit_friction(mean: FloatArray, root: FloatArray, i: int, largest_std: float) -> None:
-    """Keep friction, state i, in its range, and its spread within what the range allows."""
+    """Limit friction, state i, to its range, and its spread to `largest_std`."""
     mean[i] = min(max(mean[i], LOWER), UPPER)
     std = math.sqrt(variance(root, i))
     if std > largest_std:

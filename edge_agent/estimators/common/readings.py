@@ -1,4 +1,4 @@
-"""Which readings of a sample are believed, and what their lack means for health."""
+"""Plausibility check of the readings of a sample, and the health flags for missing ones."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 @compiled
 def believe(sample: FloatArray, now: FloatArray) -> int:
-    """now (15,) = the readings of a sample (18,), NaN where missing, infinite or unbelievable;
-    returns health flags.
+    """Fill now (15,) with the readings of a sample (18,), NaN where missing, infinite or
+    implausible; return the health flags.
     """
     odd = 0
     missing = 0
@@ -58,7 +58,7 @@ def believe(sample: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def position_time(sample: FloatArray, time: float, last: float) -> float:
-    """Time [s] of the last position, after a sample (18,) at `time`."""
+    """Return the time [s] of the last position, after a sample (18,) at `time`."""
     return (
         time if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]) else last
     )
@@ -66,14 +66,14 @@ def position_time(sample: FloatArray, time: float, last: float) -> float:
 
 @compiled
 def position_health(time: float, last: float) -> int:
-    """The health flag of a receiver that has been silent for too long."""
+    """Return the health flag of a receiver that has been silent for too long."""
     return 0 if time - last <= POSITION_S else flags.NO_POSITION
 
 
 @compiled
 def rolling_speed(row: FloatArray, now: FloatArray) -> float:
-    """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without
-    any wheel.
+    """Return the second largest rolling speed [m/s], because two wheels may be locked and one may
+    spin; NaN without any wheel.
     """
     first = second = math.nan
     for wheel in range(4):

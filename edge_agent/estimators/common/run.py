@@ -1,8 +1,7 @@
-"""The one way through the samples that every paper's filter goes: take a sample in, begin or step,
-report.
+"""The sample loop of every paper's filter: take a sample in, begin or step, report.
 
-A paper's file is the record of what its filter carries (`PaperMemory` with its own fields), three
-compiled functions and the citation; `kernel_of` makes a bank's kernel of them.
+A paper's module holds the record of its filter (`PaperMemory` with its own fields), three compiled
+functions and the citation. `kernel_of` builds the bank's kernel from them.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """What every paper's filter carries of one vehicle."""
+    """State that every paper's filter carries for one vehicle."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack
@@ -43,13 +42,13 @@ def kernel_of(
     step: Callable[[Memory, Context, float], bool],
     report: Callable[[Memory, Context, FloatArray], float],
 ) -> Kernel:
-    """The kernel of a filter.
+    """Return the kernel of a filter.
 
     Args:
         begin: begins the filter at the sample in memory.track.
-        step: predicts by so many seconds and updates; whether the filter has not diverged.
-        report: writes motion and friction into the output; the friction by which wheels are judged
-            to slide.
+        step: predicts by the given seconds and updates; returns False if the filter has diverged.
+        report: writes motion and friction into the output; returns the friction that decides
+            whether a wheel slides.
     """
 
     @nogil

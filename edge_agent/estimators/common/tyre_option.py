@@ -22,7 +22,7 @@ STIFFNESSES: Final = {"similarity": 0.0, "proportional-to-friction": 1.0}
 
 
 class TyreOption(NamedTuple):
-    """The tyre that a paper's filter takes for true."""
+    """Tyre model that a paper's filter assumes."""
 
     stiffness: str = "similarity"  # a key of STIFFNESSES
     quadratic: float = 0.0  # e
@@ -33,7 +33,7 @@ PROPORTIONAL: Final = TyreOption("proportional-to-friction")
 
 
 def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
-    """Write the option into the rows of the filters.
+    """Write the tyre option into the rows of the filters.
 
     Raises:
         InputError: the stiffness is unknown, or a number is out of range.

@@ -1,10 +1,10 @@
 """The default family: friction as a chain of nodes, each with a square-root cubature filter of the
 motion.
 
-In the order of the data: `intake` (a sample is checked and summed), `block_features` (the sums of a
-block become what the equations need), `node_filter` with `residuals` and `tyre_curve` (one node is
-updated and predicted), `weighing` (what the update means for friction), `mixing` and
-`friction_grid` with `split_sides` (the nodes together), `restart`, `step` (the order of all this),
-`bank` (what is reported). `constants` holds every number, `design` the tables made of them,
-`memory` and `workspace` the records.
+Modules in the order of the data: `intake` checks a sample and adds it to the sums of the block.
+`block_features` computes the inputs of the equations from these sums. `node_filter` with
+`residuals` and `tyre_curve` updates and predicts one node. `weighing` turns the update into weights
+of the friction nodes. `mixing` and `friction_grid` with `split_sides` treat the nodes together.
+Then follow `restart`, `step` (the order of all this) and `bank` (the output). `constants` holds
+every number, `design` the tables made of them, `memory` and `workspace` the records.
 """

@@ -1,4 +1,4 @@
-"""The friction mixture as a bank's kernel, and what it reports."""
+"""The friction mixture as a bank's kernel, and its output."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def mixture_bank(
     spreads: FloatArray | None = None,
     means: FloatArray | None = None,
 ) -> EstimatorBank:
-    """Friction mixtures of vehicles with parameters `rows` (N, 15).
+    """Return friction mixtures of vehicles with parameters `rows` (N, 15).
 
-    `spreads` and `means` (N, STATES) are standard deviations and means of their states' priors,
-    where they are not those of the design.
+    `spreads` and `means` (N, STATES) are standard deviations and means of the priors of their
+    states; without them those of the design are used.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
@@ -88,7 +88,7 @@ def _advance(
 def close_visit(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, evidence: FloatArray
 ) -> None:
-    """Write the evidence of the visit that ends (32,), and begin the next from the prior."""
+    """Write the evidence (32,) of the visit that ends, and begin the next visit from the prior."""
     if not memory.started:
         clear(evidence)
     elif memory.split:
@@ -104,7 +104,7 @@ def close_visit(
 
 @compiled
 def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
-    """Write what the vehicle's filter estimates now, but for health."""
+    """Write the current estimates of the vehicle's filter, except health."""
     if not memory.started:
         report_prior(design, output)
         return
@@ -136,8 +136,8 @@ def _report_friction(friction: Quantiles, upper: float, output: FloatArray, firs
 
 @compiled
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
-    """Write what is known before the first usable sample: the prior, and no motion with a wide
-    spread.
+    """Write the output before the first usable sample: the prior of friction, and zero motion with
+    a wide spread.
     """
     write_unknown(output)
     for k, level in enumerate((0.5, LOWER_END, UPPER_END)):

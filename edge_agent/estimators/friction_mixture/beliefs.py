@@ -1,4 +1,4 @@
-"""What a filter believes now, for those who look on: read, never written."""
+"""Read-only access to the current beliefs of the filters."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def report_beliefs(
     own: FloatArray,
     visit: FloatArray,
 ) -> None:
-    """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both
-    (N, 32), maximum 0.
+    """Write log(posterior/uniform) of each filter, and its evidence of the visit so far; both (N,
+    32), maximum 0.
     """
     design = contexts[0].design
     scratch = contexts[0].scratch

@@ -1,10 +1,9 @@
-"""From the sums of a block to the few numbers that the measurement equations need
-(`BlockFeatures`).
+"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block.
 
-Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from
-a_x shared out with a spread to match (`drive_split.py`). An accelerometer feels slope and bank as
-tyres do: they are force, offsets are not. Lateral axle forces come from m*a_y and Iz*r' (paper 004,
-equation 2; errata 000 on signs and arms).
+Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, a_x
+is shared out over the axles, with a spread to match (`drive_split.py`). An accelerometer feels
+slope and bank as tyres do, so they count as force; offsets of the sensor do not. Lateral axle
+forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs and arms).
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ LIKELY = 2.0  # and of what is unknown of the radii
 
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Fill `features` but for duration and speed, which are given; returns health flags."""
+    """Fill `features` except duration and speed, which the caller sets; return the health flags."""
     row = memory.row
     last = memory.last
     block = memory.block
@@ -76,7 +75,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
 
 @compiled
 def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
-    """Mean of the valid samples of a channel in the block, or `otherwise`."""
+    """Return the mean of the valid samples of a channel in the block, or `otherwise`."""
     return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
 
 
@@ -94,7 +93,7 @@ def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
 
 @compiled
 def _steer_rate(memory: MixtureMemory, duration: float) -> float:
-    """Rate of the mean front steering angle [rad/s]."""
+    """Return the rate of the mean front steering angle [rad/s]."""
     now = memory.last.delta
     before = memory.last.delta_before
     return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)
@@ -102,9 +101,7 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 
 @compiled
 def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> int:
-    """Force, and the part of noise_std that comes from it, of the four wheels; returns health
-    flags.
-    """
+    """Compute force and the force part of noise_std of the four wheels; return the health flags."""
     health = 0
     loads = features.loads
     row = memory.row
@@ -147,7 +144,9 @@ def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures
 
 @compiled
 def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Return the axle whose torque alone is known, front 0 or rear 1; -1 where both or none is."""
+    """Return the only axle whose torque is known, front 0 or rear 1; -1 where both or neither are
+    known.
+    """
     known = 0
     axle = -1
     for k in range(2):
@@ -163,8 +162,9 @@ def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> bool:
-    """Return True if the car brakes, and the known torque of an axle has less than half of what
-    brakes usually give there: a powertrain's torque does not hold the brakes.
+    """Return True if the torque signal of an axle leaves out its brakes: the car brakes, and the
+    known torque has less than half of the usual brake torque of that axle. Powertrain torque does
+    not include the brakes.
     """
     usual = BRAKES_FRONT if axle == 0 else 1.0 - BRAKES_FRONT
     least = 0.5 * usual * memory.row[Parameter.MASS] * features.change
@@ -173,7 +173,7 @@ def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> 
 
 @compiled
 def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> float:
-    """Return the force along [N] of an axle whose torque is known."""
+    """Return the longitudinal force [N] of an axle whose torque is known."""
     row = memory.row
     total = 0.0
     for wheel in range(2 * axle, 2 * axle + 2):
@@ -186,7 +186,9 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 
 @compiled
 def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
-    """side with its derivatives, and load_share of both axles; NaN without a_y."""
+    """Compute the side force with its derivatives, and the load share, of both axles; NaN without
+    a_y.
+    """
     row = memory.row
     loads = features.loads
     delta = memory.last.delta
@@ -215,7 +217,7 @@ def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Side forces whose slip or moment nobody has measured become NaN; returns health flags."""
+    """Set side forces to NaN where slip or moment was not measured; return the health flags."""
     health = 0
     counts = memory.block.counts
     if (
@@ -233,8 +235,8 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Slip noise and force noise meet under the total-least-squares residual with half the
-    variance each.
+    """Combine slip noise and force noise: each enters the total-least-squares residual with half
+    the variance.
     """
     row = memory.row
     constants = design.constants
@@ -295,10 +297,10 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
 def abruptness(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
-    """How far a wheel is from its smoothed speed, moved on by the car's acceleration [m/s]; 0 where
-    it is unknown.
+    """Return how far a wheel is from its smoothed speed, advanced by the car's acceleration [m/s];
+    0 where it is unknown.
 
-    A wheel that spins up or locks goes on for some blocks, a bump is over within one or two.
+    A wheel that spins up or locks stays away for some blocks; a bump is over within one or two.
     """
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
@@ -311,8 +313,8 @@ def abruptness(
 
 @compiled
 def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
-    """Speed ahead [m/s] of the centre of gravity over a wheel that rolls freely; NaN without a
-    reading.
+    """Return the forward speed [m/s] of the centre of gravity, from a wheel that rolls freely; NaN
+    without a reading.
     """
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
@@ -324,8 +326,8 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _inform(constants: Constants, features: BlockFeatures) -> None:
-    """informs_x and informs_y: below some force it is noise of the slip that would say what
-    stiffness is.
+    """Compute informs_x and informs_y. Below some force, the stiffness that slip suggests is only
+    noise.
     """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
@@ -338,11 +340,11 @@ def _inform(constants: Constants, features: BlockFeatures) -> None:
 
 @compiled
 def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> float:
-    """Largest difference between the sides of an axle of slip (as linear force over load) not asked
-    for by force.
+    """Return the largest slip difference between the sides of an axle (as linear force over load)
+    that no force explains.
 
-    Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be
-    is allowed for.
+    Wheels of unequal radius always differ: the estimated difference is subtracted, and its
+    uncertainty is allowed for.
     """
     row = memory.row
     block = memory.block
@@ -376,8 +378,8 @@ def demand(features: BlockFeatures) -> float:
     """Return the larger force over load of the two axles [1]; a missing lateral force counts as
     none.
 
-    An axle is taken as a whole: how its wheels share the force is not measured where an inner wheel
-    is almost unloaded.
+    An axle is taken as a whole, because an almost unloaded inner wheel does not show how the wheels
+    share the force.
     """
     most = 0.0
     for axle in range(2):

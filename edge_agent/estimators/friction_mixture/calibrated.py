@@ -1,4 +1,4 @@
-"""What the calibration of a vehicle file makes of the prior of its states."""
+"""Prior of the filter's states after the calibration of a vehicle file is applied."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make o
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
-    """Standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a vehicle's
-    calibration knows.
+    """Return the standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a
+    vehicle's calibration has a value.
 
-    The calibration's values are no longer in the signals (inputs.correct), so that the means stay.
+    Signals are already corrected by the calibration (inputs.correct), so the means do not change.
     """
     spreads = np.repeat(std[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(spreads, vehicles, strict=True):
@@ -54,8 +54,8 @@ def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
     """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a
     vehicle where it is known.
 
-    Understeer learned from drives counts before that of the vehicle file's axles; without both the
-    mean of all vehicles stays.
+    Understeer learned from drives takes precedence over that of the vehicle file's axles. Without
+    both, the mean of all vehicles is used.
     """
     means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(means, vehicles, strict=True):

@@ -2,7 +2,7 @@
 
 Figures marked (vehicle) follow from how well a vehicle and its sensors are known: mass 3 %, inertia
 5 %, stiffness 10 to 12 %, torque 3 %, white noise and offsets of ordinary inertial sensors. Figures
-marked (errata) are measured wisdom.
+marked (errata) were found by measurement.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class NodeState(IntEnum):
 
 
 class Constants(NamedTuple):
-    """The numbers; above each its unit and its reason. `Constants(name=value)` changes one in a
-    study.
+    """The numbers, each with its unit and reason above it. `Constants(name=value)` changes one for
+    a study.
     """
 
     # [s] one measurement update per block: model error is correlated over more, so nothing is lost

@@ -46,7 +46,7 @@ class MixtureDesign(NamedTuple):
 
 
 def nominal_states(constants: Constants) -> Nominal:
-    """Prior of the states of a node."""
+    """Return the prior of the states of a node."""
     mean = np.zeros(STATES)
     std = np.ones(STATES)
     time = np.full(STATES, np.inf)
@@ -82,8 +82,8 @@ def design_of(
     constants: Constants | None = None,
     curve: Curve | None = None,
 ) -> MixtureDesign:
-    """The tables of a filter; other `constants` are for studies, another `curve` for other
-    tyres.
+    """Return the tables of a filter. Studies pass other `constants`; other tyres need another
+    `curve`.
     """
     mu, prior = node_table(NODES)
     constants = constants or Constants()

@@ -1,10 +1,10 @@
-"""How the force along is shared by front and rear where torque is missing: which axles drive,
-learned from their slip.
+"""Split of the longitudinal force between front and rear axle where torque is missing; the driven
+axles are learned from their slip.
 
-The driven axle of a car that pulls turns faster than the other, by what its force asks of its
-tyres; three kinds of car are told apart within a second of brisk driving. Brakes favour the front
-on all cars. Sums of wheels on low friction look like more force than is asked: an axle may slip
-more than its kind asks for, not less.
+The driven axle of an accelerating car turns faster than the other, by the slip that its force
+needs. Brisk driving separates front, rear and all-wheel drive within a second. Brakes favour the
+front on all cars. On low friction, slip looks like more force than is demanded. Therefore an axle
+may slip more than its kind of drive predicts, but not less.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
-    """Share of the front axle in the force along at a_x [m/s^2], and its spread."""
+    """Return the share of the front axle in the longitudinal force at a_x [m/s^2], and its
+    spread.
+    """
     front = row[Parameter.DRIVE_FRONT]
     spread = SHARE_STD
     if math.isnan(front):
@@ -61,7 +63,7 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 
 @compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Renew the odds of the three kinds by the slip of the axles in the block."""
+    """Update the odds of the three kinds of drive from the slip of the axles in the block."""
     row = memory.row
     odds = memory.drive_odds
     rolling = features.rolling

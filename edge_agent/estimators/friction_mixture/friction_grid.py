@@ -21,8 +21,8 @@ SMALLEST = 1e-12  # a probability that mixing by road change will raise again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
-    """(mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of each
-    cell.
+    """Return (mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of
+    each cell.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), count + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
@@ -39,12 +39,12 @@ def change_road(
     drift: float,
     out: FloatArray,
 ) -> None:
-    """out = w after a change to anywhere with probability hazard and to a neighbour with
+    """Compute out = w after a road change: to anywhere with probability hazard, to a neighbour with
     probability about drift.
 
-    Only the first `chain` nodes have neighbours; the others are left for anywhere with probability
-    `leaving` as well. The exchange between neighbours is in detailed balance with the prior, which
-    therefore stays what it is.
+    Only the first `chain` nodes have neighbours; the others change to anywhere also with
+    probability `leaving`. The exchange between neighbours is in detailed balance with the prior,
+    which therefore does not change.
     """
     count = w.shape[0]
     left = 0.0
@@ -66,7 +66,7 @@ def change_road(
 
 @compiled
 def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
-    """w *= exp(log_likelihood), normalised; log_likelihood (K,) about 0 or below."""
+    """Compute w *= exp(log_likelihood), normalised; log_likelihood (K,) about 0 or below."""
     total = 0.0
     for j in range(w.shape[0]):
         w[j] = max(w[j] * math.exp(log_likelihood[j]), SMALLEST)
@@ -77,8 +77,8 @@ def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 @compiled
 def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
-    """The q-quantile of mu under the density that is linear between nodes and level beyond the
-    outer ones.
+    """Return the q-quantile of mu under the density that is linear between nodes and constant
+    beyond the outer ones.
     """
     count = mu.shape[0]
     total = 0.0
@@ -101,7 +101,7 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 @compiled
 def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
+    """Return the mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
     count = mu.shape[0]
     if j == 0:
         return float((mu[0] - LOWER) * w[0] / prior[0])
@@ -114,7 +114,7 @@ def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
 def visit_evidence(
     mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
 ) -> None:
-    """out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
+    """Compute out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
     count = mu.shape[0]
     top = -math.inf
     j = 0

@@ -1,4 +1,6 @@
-"""The grip in use, and what it forbids: no friction is believed or told below it."""
+"""The grip in use, and the friction values that it rules out: friction below the grip in use is
+neither believed nor reported.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ AT_PEAK = 0.95
 
 @compiled
 def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
-    """Take in measured accelerations [m/s^2] of the last dt [s]."""
+    """Update the grip in use with measured accelerations [m/s^2] of the last dt [s]."""
     size = math.hypot(ax, ay) / GRAVITY
     grip.slow += (1.0 - math.exp(-dt / SLOW_S)) * (size - grip.slow)
     grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
@@ -37,30 +39,30 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
 
 @compiled
 def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
-    """What friction side_mu (2,) pays [nat] for what it lacks of the grip in use."""
+    """Return the penalty [nat] of friction side_mu (2,) for lying below the grip in use."""
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
     return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))
 
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """The upper end of a friction, never below the grip in use: racing tyres pass the grid's
-    1.2.
+    """Return the upper end of a friction, never below the grip in use: racing tyres exceed 1.2, the
+    end of the grid.
     """
     return max(friction.upper, grip.held + ABOVE)
 
 
 @compiled
 def lower_while_sliding(slides: float, used: float, lower: float) -> float:
-    """Return the lower end of a friction whose wheels slide: a sliding tyre may be at its peak.
+    """Return the lower end of friction of sliding wheels: a sliding tyre may be at its peak.
 
-    A tyre that slides gives between its peak force and the smaller force of full sliding. Slip
-    tells which of them only as well as the speed is known, and no wheel rolls that would tell the
-    speed.
+    The force of a sliding tyre lies between its peak and the smaller force of full sliding. Slip
+    separates the two only as well as the speed is known, and in a slide no wheel rolls that would
+    give the speed.
 
     Args:
         slides: membership in "a wheel slides" [1].
-        used: grip that the axle which uses more has used in the last second [1].
-        lower: the end by the belief [1].
+        used: grip in the last second of the axle that uses more [1].
+        lower: lower end by the belief [1].
     """
     return lower - slides * max(lower - AT_PEAK * used, 0.0)

@@ -1,11 +1,12 @@
-"""Ice comes in patches: on bridges, in shade, where water ran. Who has asked for no grip for some
-metres does not know.
+"""Model of short ice patches: on bridges, in shade, where water ran over the road. After a few
+metres without grip demand, the road may be icy again, so the lower end falls. The median is
+unaffected.
 
-The mixture's road changes to anywhere once in hundreds of metres, so that what was learned lasts;
-with it alone the lower end falls to ice long after a patch has been passed. Beside the mixture
-stands, for each node of ice, how probable a patch is here: within the length of a patch it grows to
-what the prior holds there and the mixture lacks, and what speaks against ice here takes it away.
-Only the lower end is told with it: nothing is concluded on a patch.
+The mixture's road changes to anywhere once in hundreds of metres, so that learned friction lasts.
+With the mixture alone, the lower end would fall to ice only long after the car has passed a patch.
+Therefore this module keeps, for each node of ice, the probability that a patch is here. Within the
+length of a patch it grows to the prior's share of that node that the mixture lacks, and evidence
+against ice reduces it. Only the reported lower end uses it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def drive_onto(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
-    """Patches become more probable over `metres`."""
+    """Increase the probability of patches over `metres`."""
     share = 1.0 - math.exp(-metres / design.constants.patch_length)
     for j in range(PATCH_NODES):
         memory.patch[j] += share * (max(design.prior[j] - memory.weight[j], 0.0) - memory.patch[j])
@@ -29,8 +30,8 @@ def drive_onto(memory: MixtureMemory, design: MixtureDesign, metres: float) -> N
 
 @compiled
 def refute(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
-    """Patches (PATCH_NODES,) become less probable where a block speaks less for them than for
-    the mixture (K,).
+    """Reduce the probability of patches (PATCH_NODES,) where a block supports them less than the
+    mixture (K,).
     """
     usual = 0.0
     for j in range(weight.shape[0]):

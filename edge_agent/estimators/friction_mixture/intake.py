@@ -1,9 +1,9 @@
-"""Taking a sample in: refusal of the impossible, the yaw-rate filter, the kinematics and sums of
+"""Intake of a sample: refusal of impossible readings, the yaw-rate filter, kinematics and sums of
 the block.
 
-Missing readings and what replaces them: a_x by zero and a_y by r*v_x, both with a random walk to
-match; yaw rate by the difference of the rear wheels; steering by its last value; the rest is left
-out of the sums.
+Replacements of missing readings: zero for a_x and r*v_x for a_y, both with a random walk to match;
+the difference of the rear wheels for the yaw rate; the last value for steering. Other missing
+readings are left out of the sums.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 def take_sample(
     memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample to the block; returns its health flags and whether the block is whole."""
+    """Add a sample to the block; return its health flags and whether the block is complete."""
     last = memory.last
     dt = time - last.time
     if not dt > 0.0:
@@ -76,7 +76,7 @@ def take_sample(
 
 @compiled
 def begin_block(memory: MixtureMemory) -> None:
-    """Empty the sums; the block begins at the last sample."""
+    """Clear the sums; the block begins at the last sample."""
     last = memory.last
     block = memory.block
     block.time = last.time
@@ -100,7 +100,9 @@ def _clear(gain: VelocityGain) -> None:
 
 @compiled
 def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
-    """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
+    """Run a scalar Kalman filter: random walk, gyroscope, and the rear wheels where the gyroscope
+    is missing.
+    """
     last = memory.last
     now = memory.last.now
     row = memory.row
@@ -122,8 +124,8 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _believed(value: float, used: float, read: float) -> float:
-    """The accelerometer's reading; NaN where it is far from both the last one that was used and
-    the last one read.
+    """Return the accelerometer's reading; NaN where it is far from both the last used and the last
+    read value.
     """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
     return math.nan if jumps else value
@@ -133,10 +135,10 @@ def _believed(value: float, used: float, read: float) -> float:
 def _move(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
-    """Velocity gained since the block began, in the axes of now: the exact solution for inputs
-    constant over dt.
+    """Integrate the velocity gained since the block began, in the current axes: the exact solution
+    for inputs constant over dt.
 
-    ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
+    ax, ay are NaN where they are missing; `turning` is True if the yaw rate is known.
     """
     last = memory.last
     block = memory.block

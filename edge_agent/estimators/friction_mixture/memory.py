@@ -31,7 +31,7 @@ class VelocityGain:
 
 
 class BlockSums:
-    """Sums that a block has gathered since it began."""
+    """Sums over the samples of the current block."""
 
     time: float  # at which it began [s]
     samples: int
@@ -49,7 +49,7 @@ class BlockSums:
 
 
 class LastInputs:
-    """The newest of each input, where it is needed between samples."""
+    """Latest value of each input that is needed between samples."""
 
     time: float  # of the last sample [s]
     position_time: float  # of the last position [s]
@@ -70,7 +70,7 @@ class LastInputs:
 
 
 class GripInUse:
-    """Grip that the accelerometers show in use, over g [1]."""
+    """Grip in use as the accelerometers show it, over g [1]."""
 
     slow: float  # smoothed, for the nodes
     fast: float  # smoothed less
@@ -79,7 +79,7 @@ class GripInUse:
 
 
 class RollingMotion:
-    """Motion that wheels show without a tyre model."""
+    """Motion derived from the wheels without a tyre model."""
 
     moved_time: float  # at which a wheel last turned [s]
     disagreed_time: float  # at which wheels last disagreed [s]
@@ -92,7 +92,7 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Slip that the wheel speeds show by themselves."""
+    """Slip derived from the wheel speeds alone."""
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
@@ -103,7 +103,7 @@ class WheelSlip:
 
 
 class Trust:
-    """Whether any friction explains what is measured."""
+    """State of the test whether any friction explains the measurements."""
 
     # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
     # [1]
@@ -119,7 +119,7 @@ class Trust:
 
 
 class Quantiles:
-    """A friction with its interval."""
+    """Friction with its interval."""
 
     median: float
     lower: float  # 5 %
@@ -127,7 +127,7 @@ class Quantiles:
 
 
 class MixtureMemory:
-    """One filter."""
+    """State of one filter."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     nominal: Nominal  # prior of its states, by what its file knows of them
@@ -178,7 +178,7 @@ class MixtureMemory:
 def new_filters(
     rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray
 ) -> RecordArray:
-    """Filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
+    """Return filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
 
     The prior of their states is `nominal`, with the means and standard deviations `means`,
     `spreads` (N, STATES).

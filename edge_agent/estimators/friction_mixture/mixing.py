@@ -1,4 +1,5 @@
-"""The nodes together: mixing after a road change, moment matching, and nodes that have diverged.
+"""Operations on all nodes: mixing after a road change, moment matching, and replacement of diverged
+nodes.
 
 Legend
     m_j, P_j, w_j   mean (n,), covariance (n, n) and probability of node j
@@ -6,8 +7,9 @@ Legend
     zeta            share of a node's predicted mass that came from anywhere by a road change [1]
 
 The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two
-moments: an improbable node keeps the state of the vehicle and is ready to explain the next sample
-(interacting multiple models, Blom and Bar-Shalom 1988). Covariances are only ever added here.
+moments. An improbable node thus keeps the vehicle's state and is ready to explain the next sample
+(interacting multiple models, Blom and Bar-Shalom 1988). Covariances are only added here, never
+subtracted.
 """
 
 from __future__ import annotations
@@ -39,13 +41,13 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def awake(memory: MixtureMemory) -> int:
-    """How many nodes take part."""
+    """Return the number of active nodes."""
     return ALL_NODES if memory.split else NODES
 
 
 @compiled
 def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Split nodes take part from the first sign of such a road until they have become
+    """Activate the split nodes at the first sign of a split road, and deactivate them once they are
     improbable.
     """
     weight = memory.weight
@@ -72,8 +74,8 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float) -> None:
-    """Road change over `metres`: probabilities flow, and each node is mixed with what came to
-    it.
+    """Apply the road change over `metres`: move probability between nodes, and mix each node with
+    its inflow.
     """
     count = awake(memory)
     constants = design.constants
@@ -112,7 +114,7 @@ def mix(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Mix one node (mean (n,), covariance (n, n), changed in place) with the whole."""
+    """Mix one node (mean (n,), covariance (n, n), changed in place) with the whole mixture."""
     if zeta < LEAST_MIXING:
         return
     n = mean.shape[0]
@@ -134,7 +136,7 @@ def match_moments(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
+    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
     count = weight.shape[0]
     n = mean.shape[1]
     clear(overall_mean)
@@ -160,8 +162,8 @@ def match_moments(
 def reset_diverged(
     mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
 ) -> None:
-    """Give nodes (K, n) whose motion has diverged the state of the most probable one, and no
-    weight.
+    """Give nodes (K, n) whose motion has diverged the state of the most probable node, and weight
+    zero.
     """
     best = int(np.argmax(weight))
     for j in range(weight.shape[0]):

@@ -63,13 +63,14 @@ class NodeUpdate(NamedTuple):
 def update_node(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float
 ) -> NodeUpdate:
-    """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
+    """Run the cubature update of node j with R times `inflation`: its mean and scratch.root[j] are
+    changed.
 
-    R of the axles is larger still where they are distrusted, and where nothing changes: what is
-    wrong of curve and offsets is the same again, and taken for noise it would be averaged into
-    stiffness and shape.
+    R of the axles is larger still where they are distrusted, and where the inputs are steady.
+    Errors of curve and offsets then repeat from block to block; if they were treated as noise, the
+    filter would average them into stiffness and shape.
 
-    Writes its innovation and its theoretical variance without the inflation.
+    Writes the innovation and its theoretical variance without the inflation.
     """
     constants = design.constants
     nominal = memory.nominal
@@ -114,10 +115,10 @@ def update_node(
 
 @compiled
 def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Fill node.derivative of node j, leave node.force as at the mean, and return the price of
+    """Fill node.derivative of node j, leave node.force as at the mean, and return the penalty of
     sliding.
 
-    Leak and offset of a_y move the same forces, so that one derivative tells the other.
+    Leak and offset of a_y move the same forces, so one derivative gives the other.
     """
     constants = design.constants
     curve = design.curve
@@ -173,11 +174,11 @@ def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j:
 def _by_wheel_speeds(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
 ) -> None:
-    """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own
-    speed.
+    """Compute the derivatives by the radii and by the lag of the wheel speeds; the row of a wheel
+    depends on its own speed.
 
-    All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force
-    is as at the mean.
+    All radii are moved at once, because they hardly change the rows of the axles; node.force is as
+    at the mean.
     """
     row = memory.row
     mean = memory.mean[j]
@@ -207,11 +208,11 @@ def _by_wheel_speeds(
 def weigh_slopes(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Fill node.noise with the variances of the rows' noise at node.slip, and return the price of
+    """Fill node.noise with the variances of the rows' noise at node.slip, and return the penalty of
     sliding.
 
-    The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so
-    its density is spread thin.
+    The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
+    so its density is spread thin.
     """
     slip = node.slip
     price = 0.0
@@ -239,20 +240,20 @@ def weigh_slopes(
 
 @compiled
 def unfelt(slope: float) -> float:
-    """Share of slip noise that a residual on a curve of this slope does not feel, of the half it
-    feels on slope 1.
+    """Return the share of slip noise that does not enter a residual on a curve of this slope,
+    relative to the half that enters on slope 1.
 
     Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in
-    variables). Taken for as large on the flat as on the rise, it would favour nodes whose wheels
-    slide: they do not feel it.
+    variables). If it counted as much on the flat as on the rise, it would favour nodes whose wheels
+    slide, because slip noise does not enter their residuals.
     """
     return 0.5 - slope * slope / (1.0 + slope * slope)
 
 
 @compiled
 def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its
-    variance.
+    """Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with
+    its variance.
 
     scratch.root[j] is lower triangular.
     """
@@ -290,8 +291,8 @@ def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: in
 
 @compiled
 def doubted_noise(trust: Trust, constants: Constants) -> float:
-    """Factor on R of the axles: what contradicts shall not move the motion while it is found
-    out.
+    """Return the factor on R of the axles: readings that contradict the model must not move the
+    motion while the test runs.
     """
     if trust.distrust > 0.0:
         return 1.0 + constants.distrust_noise
@@ -300,15 +301,17 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on R of the rear axle's rows: the front axle has met another surface
-    that the rear has not.
+    """Return the factor on R of the rear axle's rows while the front axle is already on another
+    surface.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
 
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """How far what a node believes of vehicle and sensors is from their prior [nat]; mean (n,)."""
+    """Return the distance of a node's vehicle and sensor states from their prior [nat]; mean
+    (n,).
+    """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
         total += 0.5 * ((mean[i] - nominal.mean[i]) / nominal.std[i]) ** 2
@@ -319,10 +322,10 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 def take_rows(
     mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
 ) -> tuple[float, int]:
-    """Take in the innovations node.residual (6,) one by one: half the normalised square with its
-    price, and rows.
+    """Apply the innovations node.residual (6,) one by one; return half the normalised square with
+    its penalty, and the number of rows.
 
-    What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
+    axle_penalty scales the cost of ln det S for the axles; the wheels' rows have no such cost.
     """
     loss = 0.0
     used = 0
@@ -342,10 +345,10 @@ def take_rows(
 
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
-    """Keep what is a property of vehicle or sensor within what it can be; mean (n,).
+    """Limit the states of vehicle and sensors to their possible range; mean (n,).
 
-    Radii are told against each other only: what all share scales the speed, and no sensor here
-    knows that scale.
+    Radii are only observable relative to each other. A common error scales the speed, and no sensor
+    here measures that scale.
     """
     far = constants.farthest
     common = 0.0
@@ -367,7 +370,7 @@ def predict_node(
     scratch.process.
 
     The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)'
-    + diag(noise). What is a property of vehicle or sensor returns to its prior by scratch.keep.
+    + diag(noise). States of vehicle and sensors return to their prior by scratch.keep.
     scratch.root[j] is changed to F*L.
     """
     nominal = memory.nominal

@@ -1,12 +1,11 @@
-"""The interval that is told of a friction: the truth lies below it, and above it, about as often as
-it says.
+"""The reported interval of friction, whose coverage matches its stated level at both ends.
 
-Evidence is tempered, lest the same error count twice; so where much has been measured the belief is
-wider than its errors, and where nothing has been it is the prior, as wide as it should be. The
-level of the upper end goes from the one to the other by what has been learned, the divergence of
-the belief from its prior (Kullback and Leibler 1951), and further in a car that is as its file says
-(`trust.likeness`). Slippery for sure is said of nothing less than the belief itself holds by its
-own 99 %.
+Evidence is tempered so that a repeated error does not count twice. Therefore the belief is wider
+than its errors where much has been measured, and equal to the prior, which has the right width,
+where nothing has been measured. The level of the upper end moves between the two with the amount
+learned, the divergence of the belief from its prior (Kullback and Leibler 1951). It moves further
+for a car that matches its vehicle file (`trust.likeness`). The upper end never falls below a
+slippery friction unless the belief itself holds 99 % below it.
 """
 
 from __future__ import annotations
@@ -47,10 +46,10 @@ def find_interval(
     likeness: float,
     friction: Quantiles,
 ) -> None:
-    """Median and interval of the nodes of one friction (NODES,), where patches (PATCH_NODES,) of
-    ice may be.
+    """Compute median and interval of the nodes of one friction (NODES,), with patches
+    (PATCH_NODES,) of possible ice.
 
-    blended (NODES,) is scratch; `likeness`, 0 to 1, how much the car is as its file says.
+    blended (NODES,) is scratch; `likeness`, 0 to 1, is the agreement of the car with its file.
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
@@ -64,8 +63,8 @@ def find_interval(
 
 @compiled
 def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> float:
-    """Upper end of nodes of one friction with weight (NODES,): above it the truth lies once in
-    twenty times at most.
+    """Return the upper end of nodes of one friction with weight (NODES,): the truth lies above it
+    in at most one case of twenty.
     """
     learned = 0.0
     for j in range(weight.shape[0]):

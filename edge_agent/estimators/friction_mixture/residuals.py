@@ -10,10 +10,10 @@ Legend
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
 Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force
-alike; on the flat and beyond the peak it is the force that decides, so the row of a sliding wheel
-is what its friction is (errata, what made the difference, 1). An axle takes one mean slip; its
-wheels share the side force by load. What a node believes of the vehicle (leak, gain of torque,
-shape of the tyre) corrects the measured force.
+alike. On the flat part and beyond the peak the force decides, so the row of a sliding wheel
+measures its friction (errata, what made the difference, 1). An axle takes one mean slip; its wheels
+share the side force by load. The vehicle states of a node (leak, gain of torque, shape of the tyre)
+correct the measured force.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 @compiled
 def distance(along: float, across: float) -> float:
-    """e of e_a = along and e_b = across; an infinite e_a (force beyond the peak) leaves e_b."""
+    """Return e of e_a = along and e_b = across; an infinite e_a (force beyond the peak) leaves
+    e_b.
+    """
     if math.isinf(along):
         return across
     size = math.sqrt(along * along + across * across)
@@ -51,9 +53,10 @@ def distance(along: float, across: float) -> float:
 
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
-    """Velocity gained (ahead, left) [m/s] with the leak, offsets, slope and bank of state x (n,).
+    """Return the velocity gained (forward, left) [m/s] with the leak, offsets, slope and bank of
+    state x (n,).
 
-    An offset of a_y gains what one of a_x does, turned by a quarter.
+    An offset of a_y has the same effect as one of a_x, rotated by 90 degrees.
     """
     leak_y = x[NodeState.LEAK_Y]
     bias_x = x[NodeState.BIAS_X] + x[NodeState.SLOPE]
@@ -68,8 +71,8 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
 
 @compiled
 def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Change of the force along by the linear force along, at least FLATTEST: 1 at small slip, 0
-    on the flat.
+    """Return the change of the longitudinal force with the linear longitudinal force, at least
+    FLATTEST: 1 at small slip, 0 on the flat.
     """
     square = g_x * g_x + g_y * g_y
     if square < TINY:
@@ -92,8 +95,8 @@ def find_slips(
 ) -> None:
     """Fill node.slip at node.point, a state at the beginning of the block; mean (n,) is the node's.
 
-    A log stiffness is drawn towards the node's mean where the force is too small to tell it from
-    noise of the slip.
+    A log stiffness is drawn towards the node's mean where the force is too small to separate
+    stiffness from slip noise.
     """
     x = node.point
     slip = node.slip
@@ -135,8 +138,8 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
     """Return by how much the front wheels point farther left than measured [rad], with state x
     (n,).
 
-    The front axle yields to its own side force: steering column and bushes of production cars take
-    up to 35 mrad/g.
+    The front axle yields to its own side force: steering column and bushings of production cars
+    yield up to 35 mrad/g.
     """
     lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
     return float(
@@ -177,12 +180,12 @@ def correct_forces(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of
-    torque and shape.
+    """Fill node.force and node.slip_at_force with the measured values, corrected by leak, offsets,
+    gain of torque and shape of node.point.
 
-    Without torque only the sum of both sides is measured; on a split road the slippery side gives
-    SPLIT_LIMIT of its friction at most, and the other side the rest. The unlike forces turn the
-    car, which the axles' side forces hold.
+    Without torque only the sum of both sides is measured. On a split road the slippery side carries
+    at most SPLIT_LIMIT of its friction, and the other side carries the rest. The unequal forces
+    turn the car, and the side forces of the axles balance that moment.
     """
     leak = node.point[NodeState.LEAK_Y]
     shape = node.point[NodeState.SHAPE]
@@ -227,13 +230,13 @@ def correct_forces(
 
 @compiled
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
-    """Return the force over load of one side where `mean` acts on both: alike until the slippery
+    """Return the force over load of one side where `mean` acts on both: equal until the slippery
     side is at its limit.
 
     Args:
-        mean: of both sides, signed [1].
-        most: that this side gives [1].
-        most_other: that the other side gives [1].
+        mean: mean of both sides, signed [1].
+        most: limit of this side [1].
+        most_other: limit of the other side [1].
     """
     size = abs(mean)
     if most < most_other:
@@ -243,7 +246,9 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @compiled
 def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
-    """Linear force over load along `force` where another component acts across it."""
+    """Return the linear force over load in the direction of `force` while the component `other`
+    acts across it.
+    """
     size = math.sqrt(force * force + other * other)
     if math.isnan(size) or size < TINY:
         return force
@@ -259,7 +264,9 @@ def find_residuals(
     node: NodeWorkspace,
     out: FloatArray,
 ) -> None:
-    """out (6,) = e of each row at node.slip and node.force; NaN where its readings are missing."""
+    """Compute out (6,) = e of each row at node.slip and node.force; NaN where its readings are
+    missing.
+    """
     slip = node.slip
     force = node.force
     slip_at_force = node.slip_at_force

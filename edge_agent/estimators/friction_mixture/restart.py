@@ -1,5 +1,5 @@
-"""Beginning, and beginning anew: the first sample, a silence, wheels that have long contradicted
-every node.
+"""Start and restart of a filter: at the first sample, after a gap, and when wheels contradict every
+node for long.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SLOWEST_M_S = 1.5
 def start(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
+    """Start the vehicle at its first sample with a finite time; all of its memory is zero."""
     if not math.isfinite(time):
         return flags.TIME_GAP
     last = memory.last
@@ -95,7 +95,7 @@ def start(
 
 @compiled
 def forget_vehicle(memory: MixtureMemory) -> None:
-    """The overall moments of what is a property of vehicle or sensor become those of its prior."""
+    """Reset the mixture's moments of vehicle and sensor states to their prior."""
     nominal = memory.nominal
     covariance = memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
@@ -108,7 +108,7 @@ def forget_vehicle(memory: MixtureMemory) -> None:
 
 @compiled
 def put_split_to_sleep(memory: MixtureMemory) -> None:
-    """The split nodes take no part any more."""
+    """Deactivate the split nodes."""
     if not memory.split:
         return
     memory.split = False
@@ -122,8 +122,8 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within
-    `spread`.
+    """Set all nodes to `speed` [m/s] or, where that is NaN, keep their own speed with standard
+    deviation `spread`.
     """
     if not math.isnan(speed):
         memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
@@ -143,8 +143,8 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 
 @compiled
 def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
-    """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the
-    motion starts anew.
+    """Bridge a gap of dt [s]: friction is forgotten over the metres driven meanwhile, and the
+    motion restarts.
     """
     last = memory.last
     now = memory.last.now
@@ -168,13 +168,13 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 
 @compiled
 def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Call the motion back where it is far from what wheels tell that agree and roll; returns
+    """Reset the motion where it is far from the speed of wheels that agree and roll; return the
     health flags.
 
-    Where wheels have agreed for long, vehicle and friction are forgotten with the motion. Where
-    wheels have just begun to roll without force, after a slide, only the motion is set: nodes that
-    call them sliding would not find back by themselves, because the tyre curve is flat there. Noise
-    that a slide has raised is no reason for either.
+    Where wheels have agreed for long, vehicle and friction are forgotten together with the motion.
+    Where wheels have just begun to roll without force, after a slide, only the motion is set. Nodes
+    that take these wheels for sliding would not recover on their own, because the tyre curve is
+    flat there. Noise that a slide has raised triggers neither.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):
@@ -198,7 +198,7 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
 @compiled
 def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
     """Return the speed [m/s] of wheels that turn alike and without force, so that they roll; NaN
-    where they do not.
+    where there are none.
     """
     slowest = math.inf
     fastest = -math.inf
@@ -215,8 +215,8 @@ def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
-    """Motion at `speed` [m/s], or where that is NaN at the one believed, and the prior of all
-    else.
+    """Restart the motion at `speed` [m/s], or at the current estimate where that is NaN, and all
+    other states at the prior.
     """
     forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
     restart_motion(memory, speed, LOST_SPREAD_M_S)

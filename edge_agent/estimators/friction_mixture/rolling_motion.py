@@ -1,10 +1,12 @@
-"""Motion that needs no tyre: wheels that stand, wheels that roll alike, a rear axle that follows.
+"""Motion without a tyre model: from wheels that stand, wheels that roll alike, and a rear axle that
+follows.
 
 A tyre beyond its peak does not hold its slip: it locks or spins up within a tenth of a second
-unless something steers it, and never four alike. So four wheels that agree for a second are the
-speed, but for the slip that their force asks of them; without this a lasting offset of an
-accelerometer has one explanation, four wheels sliding on ice, which predicts anything and is never
-left. Likewise a rear axle that is hardly asked for side force does not slide across.
+unless something controls it, and four never do so alike. So four wheels that agree for a second
+give the speed, apart from the slip that their force needs. Without this rule, a lasting
+accelerometer offset has one explanation, four wheels sliding on ice. That explanation predicts
+anything, so the filter would never leave it. In the same way, a rear axle with hardly any side
+force does not slide sideways.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to fo
 
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Renew memory.rolling by the block."""
+    """Update memory.rolling with the block."""
     rolling = memory.rolling
     row = memory.row
     time = memory.last.time
@@ -107,7 +109,7 @@ def _stand(
 def _tell(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
 ) -> None:
-    """Velocities that wheels at `middle` [m/s] tell, and their spreads."""
+    """Return the velocities that wheels at `middle` [m/s] imply, and their spreads."""
     rolling = memory.rolling
     row = memory.row
     pull = features.change / GRAVITY
@@ -134,9 +136,7 @@ def _tell(
 
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Take what the wheels tell of the motion into node j; returns what its disagreement costs
-    it [nat].
-    """
+    """Apply the motion from the wheels to node j; return the penalty for its disagreement [nat]."""
     rolling = memory.rolling
     constants = design.constants
     features = scratch.features
@@ -177,7 +177,7 @@ def _take_velocity(
     direction: tuple[float, float],
     reading: tuple[float, float, float],
 ) -> float:
-    """Take in a velocity along `direction` (x, y): (innovation, variance, huber); half its
+    """Apply a velocity along `direction` (x, y): (innovation, variance, huber); return half its
     normalised square.
     """
     root = scratch.root[j]

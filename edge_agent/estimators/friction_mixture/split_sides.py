@@ -1,8 +1,8 @@
 """Split roads: a low and a high friction under the two sides of the vehicle, either way round.
 
-The frictions of a side are cells of a coarse grid; a node stands for a triangular density about the
-middle of its cell that reaches to the neighbours' middles, so that a friction between two nodes is
-held by both.
+The frictions of a side are cells of a coarse grid. A node represents a triangular density about the
+middle of its cell that reaches to the middles of the neighbours, so that both cover a friction
+between two nodes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Triangle(NamedTuple):
 
 
 def triangles(edges: tuple[float, ...]) -> list[Triangle]:
-    """One per cell, about its middle; the outermost end at the outer edges."""
+    """Return one triangle per cell, about its middle; the outermost ones end at the outer edges."""
     middles = [0.5 * (a + b) for a, b in pairwise(edges)]
     lefts = [edges[0], *middles[:-1]]
     rights = [*middles[1:], edges[-1]]
@@ -54,7 +54,9 @@ def triangles(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """All nodes, where a share `split_prior` of the roads has unlike sides; mu and prior (K,)."""
+    """Return all nodes, where a share `split_prior` of the roads has unequal sides; mu and prior
+    (K,).
+    """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs = []
     mass = []
@@ -75,7 +77,7 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Share of a triangular density in each cell between the edges."""
+    """Return the share of a triangular density in each cell between the edges."""
     left, middle, right, _ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)
     falling = np.clip(right - edges, 0.0, right - middle)
@@ -87,8 +89,8 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """out (K,) = probabilities of the cells of the K nodes, those of the split nodes
-    (SPLIT_NODES, K) shared out.
+    """Compute out (K,) = probabilities of the cells of the K nodes; the probabilities of the split
+    nodes are distributed by `share` (SPLIT_NODES, K).
     """
     chain = out.shape[0]
     for j in range(chain):

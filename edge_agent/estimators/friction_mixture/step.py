@@ -1,9 +1,8 @@
 """One sample of one vehicle: sums of the block, and at the block's end one step of the mixture.
 
-Order at the end of a block: road change per metre and mixing, measurement update of every node at
-the state of the block's beginning, reweighing with the evidence tempered by demand, adaptation of
-R, prediction to the block's end. Between ends of blocks the velocity is carried on by the same
-exact kinematics.
+Order at the end of a block: road change per metre and mixing; measurement update of every node at
+the state of the block's beginning; reweighing with the evidence tempered by demand; adaptation of
+R; prediction to the block's end. Between block ends the same exact kinematics advance the velocity.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ from schemas.runtime.jit import compiled
 def step(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Take one sample (18,); returns health flags of this sample alone."""
+    """Process one sample (18,); return the health flags of this sample alone."""
     if not memory.started:
         return start(memory, design, scratch, time, sample) | flags.RESET
     health, whole = take_sample(memory, design, time, sample)
@@ -86,7 +85,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 @compiled
 def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Predict all nodes to the end of the block, and renew the moments of the mixture."""
+    """Predict all nodes to the end of the block, and update the moments of the mixture."""
     block = memory.block
     constants = design.constants
     nominal = memory.nominal
@@ -128,7 +127,9 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 
 @compiled
 def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Friction with its interval, grip used in the last second, and whether wheels slide."""
+    """Compute friction with its interval, the grip used in the last second, and whether wheels
+    slide.
+    """
     _find_friction(memory, design, scratch)
     note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))
     if not memory.split:
@@ -149,7 +150,9 @@ def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> 
 
 @compiled
 def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Quantiles of the friction under the left wheels, under the right, and of their mean."""
+    """Compute quantiles of the friction under the left wheels, under the right, and of their
+    mean.
+    """
     if memory.split:
         _find_side(memory, design, scratch, LEFT, memory.friction_left)
         _find_side(memory, design, scratch, RIGHT, memory.friction_right)
@@ -177,7 +180,7 @@ def _find_side(
 
 @compiled
 def velocity(memory: MixtureMemory) -> tuple[float, float]:
-    """(v_x, v_y) [m/s] of the mixture now."""
+    """Return the current (v_x, v_y) [m/s] of the mixture."""
     x = memory.overall_mean
     angle = memory.block.angle
     cos = math.cos(angle)

@@ -1,22 +1,22 @@
-"""How far the model is believed: by how strained it is, and whether any friction explains what is
-measured.
+"""Trust in the model: from its strain, and from a test whether any friction explains the
+measurements.
 
-**Strain** is the chi-square of what is believed of vehicle and sensors against its prior, over the
-degrees of freedom that have been learned (Birge 1932). Errors share their cause: where offsets,
-radii, lags and steering are found to be small, the axles' other errors are small as well, and where
-much had to be believed, they are not. So strain scales R of the axles, and is an input of the rules
-that take a share of the evidence on friction.
+**Strain** is the chi-square of the estimated vehicle and sensor states against their prior, over
+the degrees of freedom that have been learned (Birge 1932). Errors share their cause: where offsets,
+radii, lags and steering are small, the other errors of the axles are small as well, and where these
+states are large, they are not. So strain scales R of the axles, and is an input of the rules that
+take a share of the evidence on friction.
 
-**Contradiction** is a test of two hypotheses in sequence (after Page 1954): that the model holds,
-and that the axles' innovations have FACTOR times the variance that it states: late steering, a race
-track's bank. Ice that explains the data is no sign of it, nor is a far belief alone. Likelihood
-ratios add up to `odd` [nat] where they speak against the model, and fade within minutes; a
-straight, on which it could not fail, does not speak for it. At `odd_least` nothing is concluded any
-more: the interval goes back to the prior, the axles have no say in the motion, and what was learned
-meanwhile is forgotten. The test leaves out slides, road believed slippery and walking pace
-(`unexplained`). Then the data test nothing, and the model is tried again after `patience` [s], four
-times as long with each relapse: sensors stay as they are. Motion that had to be called back by the
-wheels is half a contradiction by itself.
+**Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds,
+and that the axles' innovations have FACTOR times the stated variance, as with late steering or a
+race track's bank. Ice that explains the data does not count against the model, nor do unusual
+states alone. Log-likelihood ratios against the model add up to `odd` [nat] and fade within minutes;
+a straight, on which the model cannot fail, does not count for it. At `odd_least` the filter draws
+no conclusions: the interval returns to the prior, the axles do not affect the motion, and states
+learned meanwhile are forgotten. The test leaves out slides, slippery road and walking pace
+(`unexplained`). After `patience` [s] without a possible test the model is tried again, and each
+relapse makes that time four times as long because sensors do not repair themselves. A motion reset
+by the wheels counts as half a contradiction.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ SLOW_PEAK = 6.0
 def judge(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
-    """Update memory.trust by the beliefs, the innovations and the health of the block.
+    """Update memory.trust with the states, the innovations and the health of the block.
 
     `ratio` is the axles' squared innovation of the block over its stated variance.
     """
@@ -93,8 +93,8 @@ def judge(
 
 @compiled
 def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return what of `ratio`, squared innovations over their variance, neither a slide nor slippery
-    road explains.
+    """Return the part of `ratio`, squared innovations over their variance, that neither a slide nor
+    slippery road explains.
 
     A wheel that slides, or a road that is believed slippery, makes the axles' forces unlike those
     of the model for a while. Tight turns at walking pace are outside the model's range.
@@ -118,7 +118,7 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 @compiled
 def strain(cost: float, learned: float, prior: float) -> float:
-    """Chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was
+    """Return chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was
     learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
@@ -126,8 +126,8 @@ def strain(cost: float, learned: float, prior: float) -> float:
 
 @compiled
 def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
-    """How many states of vehicle and sensors have been learned: the share of their prior
-    variance (n,) that is gone.
+    """Return the number of learned states of vehicle and sensors: the share of their prior variance
+    (n,) that is gone.
     """
     total = 0.0
     for i in range(NodeState.LN_KX, covariance.shape[0]):
@@ -137,21 +137,21 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Factor on R of the axles by strain."""
+    """Return the factor on R of the axles by strain."""
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
 
 
 @compiled
 def likeness(trust: Trust, constants: Constants) -> float:
-    """How much the car is as its file says, 0 to 1: 0 from the usual strain on."""
+    """Return the agreement of the car with its vehicle file, 0 to 1; 0 from the usual strain on."""
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 
 
 @compiled
 def credence(trust: Trust, constants: Constants) -> float:
-    """Share of the evidence that is believed: less while a contradiction grows, none once it is
-    believed.
+    """Return the share of the evidence that is used: less while a contradiction grows, none once it
+    is accepted.
     """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 

@@ -38,7 +38,7 @@ class TyreCurve(NamedTuple):
 
 
 def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
-    """Magic Formula of many slips, with slope 1 at none."""
+    """Return the Magic Formula of an array of slips, with slope 1 at zero slip."""
     b = theta / c
     return np.asarray(np.sin(c * np.arctan(b - e * (b - np.arctan(b)))))
 
@@ -50,7 +50,7 @@ falling beyond.
 
 
 def proven(curve: Curve) -> Curve:
-    """A curve that is one: ValueError says what is wrong with it."""
+    """Return the curve if it is valid; raise ValueError with the fault otherwise."""
     theta = np.linspace(0.0, 10.0, 10_001)
     f = np.asarray(curve(theta), dtype=np.float64)
     if f.shape != theta.shape or not np.isfinite(f).all():
@@ -65,7 +65,7 @@ def proven(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Tables of a curve, and of the spread of tyres about it."""
+    """Return the tables of a curve, and of the spread of tyres about it."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)
@@ -84,7 +84,7 @@ def curve_tables(curve: Curve) -> TyreCurve:
 
 @compiled
 def interpolated(table: FloatArray, place: float) -> float:
-    """Value of a table over [0, 1] at `place`, linear between its cells."""
+    """Return the value of a table over [0, 1] at `place`, linear between its cells."""
     cells = table.shape[0] - 1
     scaled = place * cells
     cell = min(int(scaled), cells - 1)
@@ -94,7 +94,7 @@ def interpolated(table: FloatArray, place: float) -> float:
 
 @compiled
 def ratio_at(curve: TyreCurve, theta: float) -> float:
-    """f/theta at theta >= 0; the curve is level beyond the table."""
+    """Return f/theta at theta >= 0; the curve is constant beyond the table."""
     last = curve.ratio.shape[0] - 2
     if theta >= last:
         return float(curve.ratio[last] * last / theta)
@@ -103,5 +103,7 @@ def ratio_at(curve: TyreCurve, theta: float) -> float:
 
 @compiled
 def theta_at(curve: TyreCurve, force: float) -> float:
-    """theta at 0 <= force over mu*F_z on the rising branch; infinite at and beyond the peak."""
+    """Return theta at 0 <= force over mu*F_z on the rising branch; infinite at and beyond the
+    peak.
+    """
     return math.inf if force >= 1.0 else interpolated(curve.inverse, math.sqrt(1.0 - force))

@@ -1,13 +1,12 @@
-"""Grip in use as it is reported: force over load of the harder-working axle, smoothed over
-SMOOTH_S.
+"""Reported grip in use: force over load of the axle that uses more, smoothed over SMOOTH_S.
 
-The evidence on friction is weighed by the demand of a block as it is. A report looks back a second
-for the largest value, and the largest of twenty noisy blocks says more of the sensors than of the
+The evidence on friction is weighed by the demand of each block. A report takes the largest value of
+the last second, and the largest of twenty noisy blocks would reflect the sensors more than the
 tyres.
 
-Where torque is missing, brakes are taken to load the axles alike. ABS and brake-force distribution
-see to that near the limit, and a fixed share would ask more of an unloaded rear axle than any tyre
-gives.
+Where torque is missing, brakes are assumed to load the axles alike. ABS and brake-force
+distribution do so near the limit, and a fixed share would demand more of an unloaded rear axle than
+any tyre can give.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ MOST_USED = 1.5  # [1] more is no tyre of a road car: a bump, or a load that the
 
 @compiled
 def used_grip(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the larger force over load of the two axles [1] and renew the smoothed forces of
-    the memory.
+    """Return the larger force over load of the two axles [1], and update the smoothed forces of the
+    memory.
     """
     share = 1.0 - math.exp(-features.duration / SMOOTH_S)
     most = 0.0

@@ -1,14 +1,14 @@
-"""A friction that jumps inside a visit: what the visit's first part told, before the road became
-another.
+"""Friction jumps inside a visit: the evidence of the first part of the visit, before the surface
+changed.
 
-The visit's own belief starts from the prior and follows the road, so that at the end it tells the
-last surface alone. Beside it the surest belief of the visit so far is kept, by information over the
-prior. Where the belief lies almost whole at frictions that the surest one had excluded, the
-friction has jumped: the surest is the evidence of the part that ends, and the next part begins. A
-belief on its way from one to the other takes nobody's place.
+The belief of a visit starts from the prior and follows the road, so at the end it describes the
+last surface alone. In addition the most informative belief of the visit so far is kept, measured by
+information over the prior. If almost all of the current belief lies at frictions that this kept
+belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the part that
+ends, and the next part begins. A belief in transition between the two replaces neither.
 
 Legend
-    w, s       probabilities of the nodes in the visit, and where it was surest   (K,)
+    w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)
     p          prior of the nodes                                                 (K,)
     D          information, Σ w·ln(w/p) [nat]
 """
@@ -37,15 +37,15 @@ KNOWING = 0.7
 
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
-    """Nothing was told in this part so far."""
+    """Reset the part: it has no evidence yet."""
     put(memory.surest, design.prior)
     memory.information = 0.0
 
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Keep the surest belief; where friction has jumped, write what the part that ends told
-    (32,) and begin another.
+    """Keep the most informative belief; where friction has jumped, write the evidence (32,) of the
+    part that ends and begin another.
     """
     if memory.split:
         return

@@ -44,9 +44,7 @@ def measure(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every node that is awake; note NIS and the predictive log-likelihood of the
-    mixture.
-    """
+    """Update every active node; store NIS and the predictive log-likelihood of the mixture."""
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
     count = awake(memory)
     for group in range(2):
@@ -86,11 +84,11 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 
 @compiled
 def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """scratch.log_likelihood becomes what the block counts for each node [nat].
+    """Replace scratch.log_likelihood by the tempered evidence of the block for each node [nat].
 
-    What falls short of the grip in use pays whatever the demand; nothing is concluded at full
-    distrust. Without accelerations, yaw rate or steering, sliding cannot be told from rolling:
-    nothing is concluded on friction.
+    A node below the grip in use pays its penalty whatever the demand. At full distrust no evidence
+    is used. Without accelerations, yaw rate or steering, sliding cannot be separated from rolling,
+    so there is no evidence on friction either.
     """
     constants = design.constants
     features = scratch.features
@@ -121,12 +119,12 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
 
 @compiled
 def charge(memory: MixtureMemory, node: int, price: float) -> float:
-    """Price [nat] of what a node has come to believe of the vehicle; a refund is at most what has
-    been charged.
+    """Return the penalty [nat] for the vehicle states that a node has moved to; a refund is at most
+    the amount charged before.
 
-    Tempered evidence has charged it in part only, while its state has moved by all that was
-    measured: on gentle drives a low friction would else live on a stiffness or an offset three
-    spreads from what is known, and hardly pay.
+    Tempered evidence charges this cost only in part, while the node's state has moved by the full
+    measurement. Without this penalty, on gentle drives a low friction would survive almost free
+    with a stiffness or an offset three standard deviations from the prior.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
@@ -135,8 +133,8 @@ def charge(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Share of the evidence that slip is worth at low speed: none when creeping, all from twice
-    that speed on.
+    """Return the share of slip evidence that counts at low speed: none at walking pace, all from
+    twice that speed on.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -147,8 +145,8 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 
 @compiled
 def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
-    """Return the membership of the forces in "new": against their smoothed past `usual` (6,),
-    moved on by a block.
+    """Return the membership of the forces in "new": compared with their smoothed past `usual` (6,),
+    which is advanced by a block.
     """
     keep = math.exp(-features.duration / constants.steady_time)
     most = 0.0
@@ -162,7 +160,7 @@ def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) ->
 
 @compiled
 def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Innovation variances in their window, and the factors on R for the next block."""
+    """Update the windowed innovation variances, and the factors on R for the next block."""
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):
         if scratch.theoretical_sum[group] > 0.0:

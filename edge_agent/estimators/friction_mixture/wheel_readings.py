@@ -1,5 +1,5 @@
-"""Readings of a wheel speed: jumps that no wheel makes, and the width of the steps in which it
-is read.
+"""Readings of a wheel speed: impossible jumps, and the width of the steps in which the speed is
+read.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STEP_PACE = 0.1  # share of a new step in the mean
 
 @compiled
 def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
-    """Make NaN of the wheel speeds of readings (15,) that stand far above the others; returns
+    """Set wheel speeds of readings (15,) to NaN where they are far above the others; return the
     health flags.
     """
     slowest = second = math.inf
@@ -45,7 +45,7 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def note_step(last: LastInputs, wheel: int, omega: float) -> None:
-    """Take in how a reading follows the last one: a speed that stands still and jumps is read in
+    """Update the step width with a reading: a speed that stands still and then jumps is read in
     steps.
     """
     change = abs(omega - last.omega[wheel])

@@ -1,4 +1,4 @@
-"""Slip that the wheel speeds show by themselves, without any belief about friction or motion.
+"""Slip derived from the wheel speeds alone, without an estimate of friction or motion.
 
 A wheel slides when it runs at another speed than the other wheels by more than tyre radii explain,
 or when it changes its speed faster than the car does. This is the evidence that anti-lock and
@@ -32,7 +32,7 @@ REAR_LAG_S = 0.1
 
 @compiled
 def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.slip by the wheel speeds of the block."""
+    """Update memory.slip with the wheel speeds of the block."""
     slip = memory.slip
     seen = slip_membership(memory, features)
     slip.begins = max(seen - slip.held, 0.0)
@@ -87,7 +87,7 @@ def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
 
 @compiled
 def wheel_speed(memory: MixtureMemory, features: BlockFeatures, wheel: int) -> float:
-    """Return the speed ahead [m/s] by one wheel, with its radius as believed; NaN without a
+    """Return the forward speed [m/s] from one wheel, with its estimated radius; NaN without a
     reading.
     """
     radius = 1.0 + memory.overall_mean[NodeState.RADIUS + wheel]

@@ -1,3 +1,3 @@
-"""What the papers' filters share: a bank with one Gaussian per vehicle, the intake of samples,
-planar motion.
+"""Parts that the papers' filters share: a bank with one Gaussian per vehicle, the intake of
+samples, planar motion.
 """

@@ -88,13 +88,13 @@ class FederatedMotion:
 
 
 class FederatedMemory(PaperMemory):
-    """What both papers' filters carry."""
+    """State that the filters of both papers carry."""
 
     motion: FederatedMotion
 
 
 class SubFilter(NamedTuple):
-    """A sub-filter in its step, with arrays to work in."""
+    """State of a sub-filter during a step, with scratch arrays."""
 
     number: int  # 0 or 1
     mean: FloatArray
@@ -118,7 +118,7 @@ def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
 
 @compiled
 def begin_motion(memory: FederatedMemory) -> None:
-    """Begin at the speed of the wheels."""
+    """Start at the speed of the wheels."""
     motion = memory.motion
     use = memory.track.inputs
     mean = motion.mean
@@ -220,8 +220,8 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
 
 @compiled
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
-    """Mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x, v_y, ...,
-    x[yaw_rate].
+    """Return the mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x,
+    v_y, ..., x[yaw_rate].
     """
     total = 0.0
     count = 0
@@ -235,15 +235,15 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 
 @compiled
 def doubted(std: float, innovation: float) -> float:
-    """Standard deviation [m/s] of the wheels' speed: spinning or locked wheels count as two of
-    them, at most.
+    """Return the standard deviation [m/s] of the wheels' speed, at most twice `std` for spinning or
+    locked wheels.
     """
     return std if math.isnan(innovation) else max(std, abs(innovation) / FARTHEST)
 
 
 @compiled
 def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[float, float]:
-    """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN
+    """Return (mean of R*omega/(1 + slip), its standard deviation) [m/s], with slip F_x/K; NaN
     without any wheel.
     """
     use = track.inputs

@@ -2,9 +2,9 @@
 z].
 
 Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y, v_y' = a_y - r*v_x (004 prints the
-wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y are what the forces give. z is
-friction (004), or the yaw acceleration, where the papers carry the moment itself (000, 001):
-divided by I_z it is of a size with the others.
+wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y follow from the forces. z is friction
+(004) or the yaw acceleration (000, 001). The papers carry the moment itself; divided by I_z it is
+of the same size as the other states.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ class HeunInputs(NamedTuple):
 
 @compiled
 def substeps(speed: float, dt: float) -> int:
-    """How many equal steps of Heun's rule are stable over `dt` [s] at `speed` [m/s]."""
+    """Return the number of equal steps of Heun's rule that are stable over `dt` [s] at `speed`
+    [m/s].
+    """
     longest = LONGEST_S * min(max(speed / CALM_M_S, SHORTEST_SHARE), 1.0)
     return max(1, math.ceil(dt / longest - 1e-6))
 
@@ -73,14 +75,14 @@ def carry(
     by_torque: bool,
     by_motor: bool = False,
 ) -> None:
-    """Move the states `columns` (6, POINTS) on by `dt` [s], in place; inputs run straight from
-    before to now.
+    """Advance the states `columns` (6, POINTS) by `dt` [s], in place; inputs change linearly from
+    the previous sample to this one.
 
     by_torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and
     friction (4,) is given; the velocity follows a_x and a_y of the state alone, which measurements
-    correct for drag and slopes. Else forces come from slip and z is the friction of all wheels.
-    by_motor: longitudinal forces come from the torque of each axle's motor, half to each wheel; z
-    is still friction.
+    correct for drag and slopes. Otherwise forces come from slip and z is the friction of all
+    wheels. by_motor: longitudinal forces come from the torque of each axle's motor, half to each
+    wheel; z is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
@@ -110,8 +112,8 @@ def carry(
 
 @inlined
 def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs) -> None:
-    """One of Heun's steps of the columns [first, last), in place. Arithmetic alone: the points
-    go side by side.
+    """Apply one of Heun's steps to the columns [first, last), in place. It is pure arithmetic, so
+    that the points are computed in parallel.
     """
     begin, end, step, by_torque = drive
     column_v = columns[0]
@@ -159,13 +161,13 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
 
 @inlined
 def _with(wheels: WheelInputs, mu: Four) -> WheelInputs:
-    """The same inputs on another friction."""
+    """Return the same inputs on another friction."""
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 
 @inlined
 def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
-    """Inputs at a share of the way from the sample before to this one."""
+    """Return the inputs at a share of the way from the previous sample to this one."""
     before = track.inputs_before
     use = track.inputs
     keep = 1.0 - share
@@ -191,7 +193,7 @@ def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelI
 
 @inlined
 def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Longitudinal forces [N] from one motor per axle, (4) to (6) of paper 004."""
+    """Return the longitudinal forces [N] from one motor per axle, (4) to (6) of paper 004."""
     front = _axle(row, track, 0, dt)
     rear = _axle(row, track, 2, dt)
     return front, front, rear, rear
@@ -199,7 +201,7 @@ def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
 
 @inlined
 def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
-    """Half of the force [N] of the axle whose left wheel is `first`."""
+    """Return half of the force [N] of the axle whose left wheel is `first`."""
     use = track.inputs
     before = track.inputs_before
     omega = S.OMEGA + first
@@ -213,7 +215,7 @@ def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
 
 @inlined
 def _forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Longitudinal forces [N] from the wheels' torque."""
+    """Return the longitudinal forces [N] from the wheels' torque."""
     return (
         wheel_force(row, track, 0, dt),
         wheel_force(row, track, 1, dt),

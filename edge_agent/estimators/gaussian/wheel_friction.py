@@ -1,10 +1,10 @@
-"""The friction of four wheels as states of a Gaussian filter: how it is forgotten, and what its
-mean is.
+"""The friction of four wheels as states of a Gaussian filter: forgetting over distance, and its
+mean.
 
 Legend: mu_i friction of a wheel, its prior mean m_0 and standard deviation s_0 (moments of the
 uniform prior), lambda metres after which it is forgotten, rho correlation of the wheels' roads.
-Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda): without
-evidence it is the prior again.
+Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda). Without
+evidence friction returns to the prior.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ SIDE_CORRELATION = 0.9
 
 
 def prior_root() -> FloatArray:
-    """Factor (4, 4) of P_0: wheels of a side alike but for a trace, sides correlated; wheel
-    order fl, fr, rl, rr.
+    """Return the factor (4, 4) of P_0: wheels of a side are almost equal, sides are correlated;
+    wheel order fl, fr, rl, rr.
     """
     same = 0.99
     other = SIDE_CORRELATION
@@ -66,19 +66,19 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 @compiled
 def dependence(demand: float, dt: float) -> float:
-    """Factor on the standard deviation of a sample `dt` [s] after the last, at `demand` [g] of
-    force.
+    """Return the factor on the standard deviation of a sample `dt` [s] after the last, at `demand`
+    [g] of force.
 
-    Model error lasts: many samples are one measurement. Without demand slip's noise is what is
-    left, not friction.
+    Model error lasts, so many samples count as one measurement. Without demand, only slip noise is
+    left, which carries no information on friction.
     """
     return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Share of friction's spread that a measurement at `demand` [g] of force may see: none
-    below, all far above.
+    """Return the share of friction's spread that a measurement at `demand` [g] of force may see:
+    none at low demand, all at high demand.
     """
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)
@@ -86,7 +86,7 @@ def visible_share(demand: float) -> float:
 
 @compiled
 def mean_friction(mean: FloatArray, root: FloatArray, first: int) -> tuple[float, float]:
-    """(mean of the four frictions from state `first` on, its standard deviation)."""
+    """Return (mean of the four frictions from state `first` on, its standard deviation)."""
     total = 0.0
     square = 0.0
     for j in range(first + 4):

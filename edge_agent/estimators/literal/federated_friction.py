@@ -77,7 +77,7 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
 
 
 def _points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Cubature points (8, 4) by singular values."""
+    """Return cubature points (8, 4) by singular values."""
     axes, sizes, _ = np.linalg.svd(covariance)
     spread = np.sqrt(STATES) * (axes * np.sqrt(sizes)).T
     return np.concatenate([mean + spread, mean - spread])
@@ -91,7 +91,7 @@ def _update(
     reading: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after a sub-filter's measurement (42) to (48)."""
+    """Return mean and covariance after a sub-filter's measurement (42) to (48)."""
     predicted = outcomes.mean(axis=0)
     apart = outcomes - predicted
     off = points - mean

@@ -1,17 +1,18 @@
-"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and
-its comparator.
+"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and its
+comparator.
 
 State mu_fl, mu_fr, mu_rl, mu_rr, a random walk. Measurement [a_x, a_y, r] (section 3.1): yaw rate
-over a sample, so the row is its difference r' [rad/s^2]. With `torque_rows` the torque balances of
-the wheels follow, F_x of each wheel: without them two of four frictions are visible straight on.
+over a sample, so the row is its difference r' [rad/s^2]. With `torque_rows` the torque balance of
+each wheel follows, F_x of that wheel. Without these rows, only two of four frictions are observable
+on a straight road.
 
 Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0,
 d = sum of w*e_i.
 
 Square root (section 3.2): roots by singular values. With the printed alpha = .001 the centre has a
 weight of -10^6, which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta -
-alpha^2)*d*d' exactly, and there all weights are positive. That is the form used here, in either
-precision.
+alpha^2)*d*d' exactly, and there all weights are positive. This form is used here, in both
+precisions.
 
 Covariance (section 3.1, "UKF"): the textbook sums with weights of 10^6, whose digits cancel. In
 single precision the covariance then loses its Cholesky factor, and the last one that existed is
@@ -61,7 +62,8 @@ UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)
 @dataclass(frozen=True)
 class FrictionRun:
     """Friction of the wheels over a drive (T, 4), and the share of the steps whose covariance had
-    no factor."""
+    no factor.
+    """
 
     mu: FloatArray
     lost: float
@@ -116,12 +118,12 @@ class _Model:
         self.bend = self.kind(np.sqrt(setting.beta - setting.alpha**2))
 
     def points(self, mean: FloatArray, root: FloatArray) -> FloatArray:
-        """Points (9, 4) of the state."""
+        """Return points (9, 4) of the state."""
         spread = self.spread * root.T
         return np.concatenate([mean[None], mean + spread, mean - spread])
 
     def outcomes(self, k: int, points: FloatArray) -> FloatArray:
-        """Measurements (9, rows) of the points at sample `k`."""
+        """Return measurements (9, rows) of the points at sample `k`."""
         force = self.forces.tyre(k, points)
         felt = self.forces.accelerations(k, force)
         if not self.setting.torque_rows:
@@ -130,8 +132,9 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are never
-    negative."""
+    """Return axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are
+    never negative.
+    """
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes
 
@@ -139,7 +142,7 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """One step in square-root form; the covariance is not used."""
+    """Run one step in square-root form; the covariance is not used."""
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
     points = model.points(mean, axes * sizes)
     outcomes = model.outcomes(k, points)
@@ -159,7 +162,7 @@ def _square_root_step(
 
 
 def _factor(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
-    """(Cholesky factor, False), or (the last one, True) where there is none."""
+    """Return (Cholesky factor, False), or (the last one, True) where there is none."""
     try:
         return np.asarray(np.linalg.cholesky(covariance)), False
     except np.linalg.LinAlgError:
@@ -169,7 +172,7 @@ def _factor(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]
 def _covariance_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """One step of the textbook filter."""
+    """Run one step of the textbook filter."""
     root, lost = _factor(covariance, root)
     points = model.points(mean, root)
     mean = model.mean_weights @ points
