@@ -1,11 +1,11 @@
-"""Where visits begin and end: satellite fixes and yaw -> the cell and sector that a vehicle is in,
-sample by sample.
+"""Begin and end of visits: from satellite fixes and yaw to the cell and sector of a vehicle, sample
+by sample.
 
 A visit begins with a fix in a new cell or heading sector. Fixes jitter, and a road may run along a
-border, so a visit is left only when a fix lies clearly outside: CELL_MARGIN beyond the cell,
-SECTOR_KEEP beyond the sector. Without a fix for FIX_HELD_S the vehicle is nowhere (cell -1).
-Without yaw the course over ground serves. Pure; what must be carried between blocks is a
-`CellTrack` per vehicle. Any split of the samples gives the same result.
+border. So a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond the cell, or
+SECTOR_KEEP beyond the sector. Without a fix for FIX_HELD_S the vehicle is in no cell (cell -1).
+Without yaw the course over ground is used. Pure: state between blocks is a `CellTrack` per vehicle.
+Any split of the samples gives the same result.
 """
 
 from __future__ import annotations
@@ -32,9 +32,7 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """What is carried of one vehicle between blocks, as a record; NaN where nothing was received
-    yet.
-    """
+    """State of one vehicle between blocks, as a record; NaN where nothing was received yet."""
 
     fix_time: float  # of the last fix [s]
     latitude: float  # of it [deg]
@@ -68,12 +66,12 @@ class ReceiverSample:
 
 
 class Located(NamedTuple):
-    """Per sample, shape (T, N).
+    """Visits per sample, shape (T, N).
 
-    closes: True at the first sample of a new visit, or of being nowhere.
-    inside, outside: True where a fix of this very sample lies in the visited cell, or beside it.
-    cell, sector: quadint z21 and heading sector, -1 when nowhere.
-    latitude, longitude [deg], yaw [rad]: as last received, NaN when too old.
+    closes: True at the first sample of a new visit, or of being in no cell. inside, outside: True
+    where a fix of this sample lies inside or outside the visited cell. cell, sector: quadint z21
+    and heading sector, -1 when in no cell. latitude, longitude [deg], yaw [rad]: as last received,
+    NaN when too old.
     """
 
     closes: BoolArray
@@ -87,7 +85,7 @@ class Located(NamedTuple):
 
 
 def new_tracks(vehicles: int) -> RecordArray:
-    """Tracks (N,) of vehicles that have received nothing yet."""
+    """Return tracks (N,) of vehicles that have received nothing yet."""
     tracks = records(CellTrack, vehicles)
     for name in tracks.dtype.names or ():
         tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan
@@ -103,10 +101,10 @@ def locate(
         tracks: (N,) of the block before.
         t: (T, N) [s].
         signals: (T, N, channels).
-        lost: gives the held fixes up, which ends every visit.
+        lost: drops the held fixes, which ends every visit.
 
     Returns:
-        the tracks to carry on, and what was found.
+        the tracks for the next block, and the visits per sample.
     """
     after = tracks.copy()
     if lost:
@@ -127,7 +125,7 @@ def locate(
 
 
 def _fixes(signals: FloatArray) -> RecordArray:
-    """The receiver's part of signals (T, N, channels), as records (T, N)."""
+    """Return the receiver's part of signals (T, N, channels), as records (T, N)."""
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
@@ -155,7 +153,7 @@ def _course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 @compiled
 def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
-    """Whether a fix still belongs to the visit, margins included."""
+    """Return True if a fix still belongs to the visit, margins included."""
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
     off = np.mod(yaw - track.sector * (np.pi / 2) + np.pi, 2 * np.pi) - np.pi
@@ -168,7 +166,7 @@ def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 @compiled
 def _receive(track: CellTrack, fix: ReceiverSample, now: float) -> None:
-    """Remember what a sample brings."""
+    """Store the readings of a sample."""
     if np.isfinite(fix.yaw):
         track.yaw_time = now
         track.yaw = fix.yaw
@@ -194,7 +192,7 @@ def _begin(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
 def _follow(
     t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located
 ) -> None:
-    """Sequential core of `locate`; moves the tracks on and fills `located`."""
+    """Sequential core of `locate`: advance the tracks and fill `located`."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
             track = tracks[n]

@@ -1,9 +1,9 @@
-"""Controller flags that cannot be true carry no weight: a lamp that always burns, a bit that was
-decoded wrongly.
+"""Filter for implausible controller flags, such as a lamp that is always on or a wrongly decoded
+bit. Such a flag counts as unknown.
 
-A flag counts as unknown
+A flag is implausible
 
-- until it was read as off for OFF_S in this trip: what never was off tells nothing;
+- until it was read as off for OFF_S in this trip: a flag that is never off carries no information;
 - while the vehicle has stood for STANDING_S with the flag on: no controller acts on wheels that do
   not turn;
 - while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S
@@ -59,7 +59,7 @@ class FlagRecord:
 
 
 def new_flag_records(vehicles: int) -> RecordArray:
-    """Records (N, len(FLAGS)) of vehicles whose flags nobody has read."""
+    """Return records (N, len(FLAGS)) of vehicles whose flags have not been read."""
     made = records(FlagRecord, vehicles, len(FLAGS))
     made["time"] = np.nan
     return made
@@ -68,16 +68,16 @@ def new_flag_records(vehicles: int) -> RecordArray:
 def trusted_context(
     before: RecordArray, t: FloatArray, signals: FloatArray, context: FloatArray
 ) -> tuple[RecordArray, FloatArray]:
-    """Take out the flags that cannot be true.
+    """Remove the implausible flags.
 
     Args:
         before: (N, len(FLAGS)) records of the block before.
         t: (T, N) [s].
-        signals: (T, N, channels), of which the wheel speeds tell whether the vehicle stands.
+        signals: (T, N, channels); the wheel speeds show whether the vehicle stands.
         context: (T, N, len(CONTEXT)).
 
     Returns:
-        the records to carry on, and the context with NaN in the place of flags that are doubted.
+        the records for the next block, and the context with NaN for implausible flags.
     """
     after = before.copy()
     checked = context.copy()
@@ -93,7 +93,9 @@ def trusted_context(
 
 
 def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
-    """Flags that are doubted now: index of the vehicle, name of the flag, and why."""
+    """Yield the flags that are doubted now: index of the vehicle, name of the flag, and the
+    reason.
+    """
     return [
         (
             int(n),
@@ -110,8 +112,8 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Sequential core of `trusted_context`: moves the records on, and takes doubtful flags out
-    of the context.
+    """Sequential core of `trusted_context`: advance the records, and remove doubtful flags from the
+    context.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
@@ -133,7 +135,7 @@ def _check(
 
 @compiled
 def _count(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
-    """One more known sample of a flag, `dt` [s] after the one before."""
+    """Count one more known sample of a flag, `dt` [s] after the previous one."""
     keep = np.exp(-dt / MEMORY_S)
     record.known = record.known * keep + dt
     record.active = record.active * keep + (dt if on else 0.0)

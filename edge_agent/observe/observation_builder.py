@@ -1,7 +1,8 @@
-"""Estimates -> what is published: one observation per cell visit, and states at a set rate.
+"""Records for publication, built from estimates: one observation per cell visit, and states at a
+set rate.
 
 For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is
-advanced with these `closes`, and `observe` makes the records. What must be carried is an
+advanced with these `closes`, and `observe` makes the records. State between blocks is an
 `OpenVisits`. Any split of the samples gives the same records in the same order. Pure.
 """
 
@@ -46,8 +47,8 @@ EXCLUDED_NATS: Final = (
 
 
 class RecordBlock(NamedTuple):
-    """Records of one kind: wire columns (n, …), the vehicle's index (n,), and which are to be
-    sent at once (n,).
+    """Records of one kind: wire columns (n, …), the vehicle's index (n,), and True for each record
+    to send at once (n,).
     """
 
     kind: Kind
@@ -118,7 +119,7 @@ class OpenVisits:
 
     @staticmethod
     def start(vehicles: int) -> OpenVisits:
-        """No visit yet."""
+        """Return the state before any visit."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
@@ -133,10 +134,11 @@ def observe(
     signals: FloatArray | None = None,
     context: FloatArray | None = None,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states.
+    """Return the records of a block with times (T, N) [ns UTC]: the carried visits, observations,
+    states.
 
-    Without `signals` (T, N, channels) observations do not tell how the grip was used, and without
-    `context` (T, N, len(CONTEXT)) they tell nothing of controllers and surroundings.
+    Without `signals` (T, N, channels) observations do not contain how the grip was used. Without
+    `context` (T, N, len(CONTEXT)) they contain nothing of controllers and surroundings.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -155,8 +157,8 @@ def observe(
 class SampleNotes(NamedTuple):
     """Context of samples.
 
-    row, told: where the friction became another within a visit (T, N), and what its part before
-    told: row of (k, 32). context: (T, N, len(CONTEXT)); no rows where nothing is known.
+    row, told: where friction changed within a visit (T, N), and the evidence of the part before:
+    row of (k, 32). context: (T, N, len(CONTEXT)); no rows where nothing is known.
     """
 
     row: IntArray  # -1: nowhere
@@ -175,7 +177,7 @@ def _notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
 
 
 def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
-    """What visits take from the estimates and the accelerometers, as records (T, N)."""
+    """Return the inputs of visits from the estimates and the accelerometers, as records (T, N)."""
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
@@ -195,8 +197,8 @@ def _visit(
     ended: Records[Visit],
     position_std: float,
 ) -> int:
-    """Sequential core: add each sample to its visit, write out a visit when the next begins;
-    returns how many.
+    """Sequential core: add each sample to its visit, and write a visit out when the next begins;
+    return the number written.
     """
     count = 0
     for k in range(time.shape[0]):
@@ -228,7 +230,7 @@ def _visit(
 
 @compiled
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
-    """A record becomes a visit without a sample."""
+    """Start a visit without a sample in a record."""
     visit.enter_time = time
     visit.cell = cell
     visit.sector = sector
@@ -255,7 +257,7 @@ def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """The friction has become another: what was used before counts as far as the part that ends
+    """Begin a part after a change of friction: earlier grip counts only as far as the ended part
     did not exclude it.
     """
     most = mugrid.UPPER
@@ -274,7 +276,7 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 @compiled
 def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
-    """One more sample of a visit."""
+    """Add one sample to a visit."""
     _feel(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
@@ -303,8 +305,8 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """What the accelerometers feel `dt` [s] after the sample before; a visit without them rules
-    nothing out.
+    """Update the grip felt by the accelerometers `dt` [s] after the last sample; a visit without
+    them excludes no friction.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -326,10 +328,10 @@ def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
 
 
 def _directions(ended: RecordArray) -> dict[str, FloatArray]:
-    """The grip used along and across the vehicle, (n,): shared out by squared acceleration; NaN
+    """Return the grip used along and across the vehicle, (n,): divided by squared acceleration; NaN
     where there was none.
 
-    The sign is that of the direction with more of it: a visit that braked and then drove is one of
+    The sign is that of the direction with more of it: a visit that braked and then drove counts as
     braking or driving.
     """
     along = ended["driving"] + ended["braking"]
@@ -347,8 +349,8 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 
 def _used(ended: RecordArray) -> FloatArray:
-    """Grip used in visits (n,): the window may hold the cell before; where friction jumped, that
-    of the least part.
+    """Return the grip used in visits (n,). Its window may reach into the previous cell; where
+    friction jumped, that of the part with least grip is used.
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))
@@ -408,10 +410,10 @@ def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 
 
 def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
-    """Bytes (n, 32) of visits; (n, 0) of a bank without evidence.
+    """Return likelihood bytes (n, 32) of visits; (n, 0) of a bank without evidence.
 
     A visit that the bank did not follow from its start is flat. Where the friction jumped in the
-    cell it was one or the other, and the larger likelihood counts.
+    cell, either value may be right, so the larger likelihood counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)
@@ -425,7 +427,9 @@ def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.u
 def _states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """The first sample of each time slot, where the position is known; moves `after.slot` on."""
+    """Return the first sample of each time slot where the position is known; advance
+    `after.slot`.
+    """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])
     after.slot[:] = slot[-1] if len(slot) else after.slot

@@ -1,7 +1,8 @@
-"""The estimation loop's one step: where are the vehicles, what do they estimate, what is published.
+"""One step of the estimation loop: positions of the vehicles, estimates, and records for
+publication.
 
-The same for one car and a fleet, live and replayed: a block of samples in, estimates and records
-out.
+The step is the same for one car and a fleet, live and replayed: a block of samples in, estimates
+and records out.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 
 
 class Seen(NamedTuple):
-    """Where the vehicles were at a block's end, each (N,): [deg], yaw [rad from east], [m/s],
+    """Position of the vehicles at a block's end, each (N,): [deg], yaw [rad from east], [m/s],
     [ns]; NaN: unknown.
     """
 
@@ -39,8 +40,8 @@ class Seen(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """What the vehicles believed at a block's end, each (N,): quantiles of mu, grip used, [ns];
-    NaN: unknown.
+    """Beliefs of the vehicles at a block's end, each (N,): quantiles of mu, grip used, [ns]; NaN:
+    unknown.
     """
 
     mu: FloatArray
@@ -68,8 +69,8 @@ class Pipeline:
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
-        """Estimates, observations and states of a block of at least one sample, the latter two
-        without trip ends.
+        """Return estimates, observations and states of a block of at least one sample; the records
+        leave out the ends of trips.
         """
         self._tracks, located = locate(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
@@ -101,14 +102,14 @@ class Pipeline:
         return estimates, self._ends.cut(observations), self._ends.cut(states)
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """What the estimators believe now, and the evidence of the visits so far; see
+        """Return the current beliefs of the estimators, and the evidence of the visits so far; see
         `EstimatorBank.beliefs`.
         """
         return self._bank.beliefs()
 
     def doubted_flags(self) -> list[tuple[int, str, str]]:
-        """Controller flags that carry no weight now: index of the vehicle, name of the flag, and
-        why.
+        """Return the controller flags that carry no weight now: index of the vehicle, name of the
+        flag, and the reason.
         """
         return doubted_flags(self._flags)
 

@@ -1,10 +1,9 @@
-"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not
-published.
+"""Privacy of trip ends: observations near the beginning and the end of a trip are not published.
 
-Where somebody parks identifies them. A record passes when the trip's beginning lies `metres` and
-`seconds` behind it, and its end at least as far ahead; so it waits until the vehicle has driven on.
-A trip is the life of a pipeline: what waits when it ends is never published. Pure; with both at
-zero every record passes at once.
+A parking place identifies its owner. A record may be published once the trip's beginning lies
+`metres` and `seconds` behind it, and its end at least as far ahead; so it waits until the vehicle
+has driven on. A trip is the life of a pipeline: records that wait when it ends are never published.
+Pure; with both at zero every record passes at once.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 
 class TripEnds:
-    """The cut for N vehicles. Call `drive` with each block, then `cut` with its records.
+    """The filter of trip ends for N vehicles. Call `drive` with each block, then `cut` with its
+    records.
 
     Args:
         vehicles: N.
@@ -41,7 +41,7 @@ class TripEnds:
         return self._metres == 0.0 and self._ns == 0
 
     def drive(self, time: IntArray, speed: FloatArray) -> None:
-        """Move on by a block: time (T, N) [ns], speed (T, N) [m/s]."""
+        """Advance by a block: time (T, N) [ns], speed (T, N) [m/s]."""
         if self._off:
             return
         if self._began is None:
@@ -56,7 +56,9 @@ class TripEnds:
         self._forget()
 
     def cut(self, records: RecordBlock) -> RecordBlock:
-        """Those of the records, and of the earlier ones that waited, that may be published now."""
+        """Return those of the records, and of the earlier waiting ones, that may be published
+        now.
+        """
         if self._off or self._began is None:
             return records
         waiting = self._waiting.get(records.kind)
@@ -70,7 +72,7 @@ class TripEnds:
         return _selected(both, begun & passed)
 
     def _forget(self) -> None:
-        """Drop the way before the oldest record that waits."""
+        """Drop the track before the oldest waiting record."""
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
         ]
@@ -79,7 +81,9 @@ class TripEnds:
             del self._times[0], self._odometers[0]
 
     def _odometer(self, time: IntArray, vehicle: IntArray) -> FloatArray:
-        """How far each vehicle had driven at a time, (n,), between the ends of blocks."""
+        """Return the distance that each vehicle had driven at a time, (n,), interpolated between
+        the ends of blocks.
+        """
         times = np.vstack(self._times)
         odometers = np.vstack(self._odometers)
         out = np.empty(len(time))

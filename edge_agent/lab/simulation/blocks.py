@@ -1,4 +1,4 @@
-"""A simulated fleet as an endless source of blocks, with its truth handed to a recorder."""
+"""A simulated fleet as an endless source of blocks; a recorder receives the ground truth."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
 def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
-    """Blocks of BLOCK_S without end; simulated time begins at the moment the first block is
-    asked for.
+    """Yield blocks of BLOCK_S without end; simulated time starts when the first block is
+    requested.
     """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0

@@ -1,8 +1,8 @@
 """Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control
 and ESC.
 
-They act in steps of the plant, on slip that they know exactly: only their action is modelled, not
-their sensors.
+They act in steps of the plant and know the slip exactly: only their action is modelled, not their
+sensors.
 
     ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half
            of the limit, and gets it back, fast up to NEARLY of the torque at which it let go, then
@@ -59,13 +59,13 @@ HELD_RATE: Final = 2.0  # of these, per second
 
 @compiled
 def slip_limit(p: FloatArray, i: int) -> float:
-    """Slip at which the control of wheel `i` begins to let go."""
+    """Return the slip at which the control of wheel `i` begins to release the brake."""
     return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
 
 
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
-    """Move all controllers in `x` on by `dt` [s], by the slips in `w` and the inputs `u`."""
+    """Advance all controllers in `x` by `dt` [s], from the slips in `w` and the inputs `u`."""
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
     x[Motion.ESC_LEFT] = max(x[Motion.ESC_LEFT] - dt, 0.0)
@@ -88,7 +88,7 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Move the brake torque that ABS lets through at wheel `i` on by `dt` [s]."""
+    """Advance the brake torque that ABS allows at wheel `i` by `dt` [s]."""
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
     slip = w[Wheel.SLIP, i]
@@ -121,8 +121,8 @@ def spins(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
 
 @compiled
 def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
-    """Cut or give back the engine's torque; whether a driven wheel spins, or is dragged to a
-    slip, now.
+    """Cut or restore the engine's torque; return True if a driven wheel spins now, or is dragged to
+    a slip.
     """
     acts = drags = False
     for i in range(4):

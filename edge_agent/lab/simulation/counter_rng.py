@@ -1,10 +1,10 @@
-"""Random numbers without a state: the number is a hash of (key, counter).
+"""Stateless random numbers: each number is a hash of (key, counter).
 
-A generator that is carried along would couple a vehicle's noise to how many vehicles there are and
-to how a drive is cut into blocks. A counter-based generator (Salmon et al., "Parallel random
-numbers: as easy as 1, 2, 3", SC 2011) does not: sample k of channel c of a vehicle is the same
-number whoever asks for it, in whatever order. The hash is the finaliser of SplitMix64 (Steele, Lea,
-Flood, OOPSLA 2014).
+A stateful generator would make a vehicle's noise depend on the number of vehicles and on the way a
+drive is cut into blocks. A counter-based generator (Salmon et al., "Parallel random numbers: as
+easy as 1, 2, 3", SC 2011) does not: sample k of channel c of a vehicle is the same number in
+whatever order numbers are requested. The hash is the finaliser of SplitMix64 (Steele, Lea, Flood,
+OOPSLA 2014).
 
 Counters must be non-negative.
 """
@@ -30,7 +30,7 @@ ONE: Final = np.uint64(1)
 
 
 def checked_seed(seed: int) -> int:
-    """The seed itself.
+    """Return the seed.
 
     Raises:
         InputError: it is negative.
@@ -41,7 +41,7 @@ def checked_seed(seed: int) -> int:
 
 
 def key_of(*seeds: int) -> np.uint64:
-    """A key from non-negative integers, e.g. (seed, vehicle number): different lists give
+    """Return a key from non-negative integers, e.g. (seed, vehicle number): different lists give
     unrelated streams.
     """
     return np.uint64(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0])
@@ -49,7 +49,7 @@ def key_of(*seeds: int) -> np.uint64:
 
 @compiled
 def mixed(key: np.uint64, counter: np.uint64) -> np.uint64:
-    """64 random bits of `counter` in the stream `key`."""
+    """Return 64 random bits of `counter` in the stream `key`."""
     z = key + (counter + ONE) * STEP
     z = (z ^ (z >> SHIFTS[0])) * MULTIPLY_1
     z = (z ^ (z >> SHIFTS[1])) * MULTIPLY_2
@@ -58,14 +58,14 @@ def mixed(key: np.uint64, counter: np.uint64) -> np.uint64:
 
 @compiled
 def uniform(key: np.uint64, counter: int) -> float:
-    """A number strictly between 0 and 1."""
+    """Return a number strictly between 0 and 1."""
     return (float(mixed(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
 
 
 @compiled
 def normal(key: np.uint64, counter: int) -> float:
-    """A standard normal number (Box and Muller, 1958); uses the hashes 2·counter and 2·counter +
-    1 of the stream.
+    """Return a standard normal number (Box and Muller, 1958); uses the hashes 2·counter and
+    2·counter + 1 of the stream.
     """
     first = TWO * np.uint64(counter)
     u = (float(mixed(key, first) >> DROP) + 0.5) * UNIT

@@ -1,11 +1,11 @@
-"""The driver of a simulated vehicle: follows a route for ever, brakes before junctions, is caught
-out by black ice.
+"""The driver of a simulated vehicle: follows a route without end, brakes before junctions, and is
+surprised by black ice.
 
-He aims at a point ahead on his lane (pure pursuit), and at a speed from the lane's profile and his
-budget q: the share of the grip he *believes* in that he likes to use, at most what is comfortable.
-His belief follows the looks of the road ahead, falls fast when he feels a wheel slide, and comes
-back slowly. Now and then somebody ahead makes him brake. Other vehicles are not seen: each drives
-as if alone, so that a drive does not depend on how many there are.
+The driver aims at a point ahead on the lane (pure pursuit), and at a speed from the lane's profile
+and the budget q. The budget is the share of the *believed* grip that the driver likes to use, at
+most a comfortable value. The belief follows the looks of the road ahead, falls fast when wheels
+slide, and recovers slowly. From time to time traffic ahead makes the driver brake. Other vehicles
+are not seen: each drives as if alone, so that a drive does not depend on their number.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Driver(IntEnum):
 
 
 class Route(IntEnum):
-    """Where one driver is on his route (int64)."""
+    """Position of one driver on the route (int64)."""
 
     LANE = 0
     POINT = 1  # the next point of the lane
@@ -102,7 +102,7 @@ STOP_DRAW: Final = (
 
 @compiled
 def ways_of(ways: IntArray, lane: int) -> int:
-    """How many ways there are to go on from a lane."""
+    """Return the number of ways that lead on from a lane."""
     count = 0
     while count < ways.shape[1] and ways[lane, count] >= 0:
         count += 1
@@ -111,10 +111,10 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 @compiled
 def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Move the route state `g` on to where the vehicle is; at the end of a lane choose the next
-    turn by chance.
+    """Advance the route state `g` to the vehicle's position; at the end of a lane choose the next
+    turn at random.
 
-    Returns how far it still is to the next point [m], at most the distance between points.
+    Return the distance to the next point [m], at most the distance between points.
     """
     points, first, size, spacing, ways = lanes
     while True:
@@ -136,9 +136,10 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 
 @compiled
 def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
-    """Where the route is `distance` [m] further on: the row of a point, and metres beyond it.
+    """Return the place `distance` [m] further along the route: the row of a point, and metres
+    beyond it.
 
-    Beyond the next lane he takes the first way.
+    Beyond the next lane the route takes the first way.
     """
     _, first, size, spacing, ways = lanes
     lane = g[Route.LANE]
@@ -156,20 +157,20 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
 
 @compiled
 def budget(d: FloatArray) -> float:
-    """q [m/s^2]: what the driver is ready to ask of the tyres."""
+    """Return q [m/s^2], the acceleration that the driver is ready to demand from the tyres."""
     style = d[Driver.STYLE] * (CAREFUL if heeds(d) and d[Driver.WARNED_START] <= 0.0 else 1.0)
     return float(min(style * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
 
 
 @compiled
 def cruise(d: FloatArray) -> float:
-    """Speed he keeps on an open road [m/s]: slower where he believes it slippery."""
+    """Return the speed on an open road [m/s]: lower where the driver believes it slippery."""
     return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
 
 @compiled
 def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Take in how the road ahead looks, and whether wheels slide."""
+    """Update the driver's belief with the looks of the road ahead, and with sliding wheels."""
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
     for i in range(4):
@@ -181,7 +182,7 @@ def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
 
 @compiled
 def heed(d: FloatArray, vx: float, dt: float) -> None:
-    """The stretch that he was warned of comes nearer, and is passed."""
+    """Advance the warned stretch: it comes nearer, and is passed."""
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
         d[Driver.WARNED_START] -= vx * dt
@@ -190,14 +191,14 @@ def heed(d: FloatArray, vx: float, dt: float) -> None:
 
 @compiled
 def heeds(d: FloatArray) -> bool:
-    """Whether he acts on a warning now."""
+    """Return True if the driver acts on a warning now."""
     return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
 
 
 @compiled
 def alerted(t: float, key: Key) -> float:
-    """How hard somebody ahead makes him brake now, as a share of his budget; 0 for most of the
-    time.
+    """Return how hard traffic ahead makes the driver brake now, as a share of the budget; 0 most of
+    the time.
     """
     window = int(t / ALERT_S)
     if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:
@@ -207,7 +208,9 @@ def alerted(t: float, key: Key) -> float:
 
 @compiled
 def stops(t: float, share: float, key: Key) -> bool:
-    """Whether he is stopping or waiting now; he does so in this share of the ALERT_S."""
+    """Return True if the driver is stopping or waiting now, which is so in this share of the
+    ALERT_S.
+    """
     window = int(t / ALERT_S)
     return bool(
         share > 0.0
@@ -218,11 +221,11 @@ def stops(t: float, share: float, key: Key) -> bool:
 
 @compiled
 def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
-    """Square of the speed [m^2/s^2] with which he means to come to the stretch that he was warned
-    of.
+    """Return the square of the speed [m^2/s^2] that the driver aims for at the start of a warned
+    stretch.
 
-    As he was told, and so that he need not brake on it for what comes next by more than he expects
-    it to bear.
+    It is the advised speed, limited so that later points of the route need no more braking on the
+    stretch than its expected grip allows.
     """
     row, _ = ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
@@ -239,7 +242,7 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
 def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
-    """Longitudinal acceleration [m/s^2] that he asks for."""
+    """Return the longitudinal acceleration [m/s^2] that the driver demands."""
     vx = x[Motion.VX]
     q = budget(d)
     reach = max(2.0, 0.5 * vx)
@@ -288,8 +291,8 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as
-    tyres and engine can.
+    """Return the force [N] for an acceleration while gravity pulls with `along` [m/s^2], within the
+    limits of tyres and engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
@@ -303,8 +306,8 @@ def wished_force(
 def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
-    """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres
-    follow.
+    """Return the mean road-wheel angle [rad] of the circle through a point ahead, within the range
+    that the front tyres can follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
@@ -335,12 +338,12 @@ def drive(
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Move a driver (d, g) and his route on by one sample: afterwards d[STEER], d[FORCE] are what
-    arms and foot do.
+    """Advance a driver (d, g) and the route by one sample: afterwards d[STEER], d[FORCE] are the
+    actual controls.
 
-    world: lanes and friction; `w` is what the wheels did at the last sample; now: time [s], length
-    of the sample [s] and how much gravity accelerates him [m/s^2]; keys are those of his route and
-    of his alerts.
+    world: lanes and friction; `w` holds the wheels at the last sample; now: time [s], length of the
+    sample [s] and the acceleration by gravity [m/s^2]; keys are those of the route and of the
+    alerts.
     """
     d, g = driver
     lanes, friction = world

@@ -1,4 +1,4 @@
-"""Sensor faults: what may go wrong with a channel, as one table of kind -> effect on a drive."""
+"""Sensor faults as one table: kind -> effect on a channel of a drive."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Fault:
 
     @property
     def indices(self) -> list[int]:
-        """Which channels of a block are meant."""
+        """Return the channels of a block that the fault affects."""
         if self.channel in CHANNELS:  # "yaw" is a channel of its own, and not the yaw rate
             return [CHANNELS.index(self.channel)]
         return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]
@@ -53,24 +53,24 @@ Effect = Callable[[FloatArray, BoolArray, float], None]
 
 
 def silent(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """No reading."""
+    """Return no readings."""
     values[when] = np.nan
 
 
 def stuck(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """The last reading before the fault is repeated."""
+    """Repeat the last reading before the fault."""
     if when.any():
         first = int(np.argmax(when))
         values[when] = values[max(first - 1, 0)]
 
 
 def spike(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Every tenth reading is off by `size`."""
+    """Add `size` to every tenth reading."""
     values[np.flatnonzero(when)[::10]] += size
 
 
 def bias(values: FloatArray, when: BoolArray, size: float) -> None:
-    """A step of the offset by `size`."""
+    """Add a step of `size` to the offset."""
     values[when] += size
 
 
@@ -84,7 +84,9 @@ FAULTS: Final[dict[str, Effect]] = {
 
 
 def apply_faults(t: FloatArray, signals: FloatArray, faults: tuple[Fault, ...]) -> FloatArray:
-    """A copy of the signals (T, 18) at times t (T,) with the faults in it, in their order."""
+    """Return a copy of the signals (T, 18) at times t (T,) with the faults applied in their
+    order.
+    """
     faulty = signals.copy()
     for fault in faults:
         when = (t >= fault.start) & (t < fault.end)

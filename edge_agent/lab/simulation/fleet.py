@@ -1,4 +1,4 @@
-"""Many vehicles that drive on a road network for ever, in one compiled kernel."""
+"""A fleet of vehicles that drive on a road network without end, in one compiled kernel."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ GOLDEN = (
 
 @dataclass(frozen=True)
 class Truth:
-    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction,
+    """Ground truth of a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction,
     |F|/(μ F_z).
 
     ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre
@@ -100,7 +100,7 @@ def run(
     steps: int,
     timing: tuple[float, int],
 ) -> FloatArray:
-    """Records (T, N, RECORD) of the next `steps` samples; the states are carried on in place.
+    """Return records (T, N, RECORD) of the next `steps` samples; the states are advanced in place.
 
     states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes,
     tables of friction and of relief; keys: of routes and of alerts (N,); timing: sample period [s]
@@ -143,7 +143,7 @@ def run(
 
 
 class SimulatedFleet:
-    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and in a
+    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and the
     vehicle's number alone.
 
     Args:
@@ -224,8 +224,8 @@ class SimulatedFleet:
         self.truth = _truth(np.empty((0, vehicles, RECORD)), self.scenario.air_temperature)
 
     def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
-        """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then
-        that of this block.
+        """Simulate the next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is
+        then that of this block.
         """
         if steps < 1:
             raise InputError("steps", f"{steps} samples cannot be had", "give a positive number")
@@ -252,8 +252,8 @@ class SimulatedFleet:
         return t, signals
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
-        """Where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart,
-        `length` [m] or more.
+        """Return where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart,
+        over `length` [m] or more.
         """
         network = self.scenario.network
         key = self._keys[0][k]
@@ -272,8 +272,8 @@ class SimulatedFleet:
         return self.scenario.to_latlon(line[:, 0], line[:, 1])
 
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
-        """Tell the driver of vehicle k of a slippery stretch, from and to so far ahead [m]; (0,
-        0): there is none.
+        """Warn the driver of vehicle k of a slippery stretch, from and to a distance ahead [m]; (0,
+        0) cancels the warning.
         """
         d = self._states[1][k]
         if d[Driver.WARNED_END] <= 0.0:
@@ -283,8 +283,8 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Which vehicles are rough, (N,): evenly spread, and vehicle k is or is not however many
-    there are.
+    """Return which vehicles are rough, (N,): evenly spread; the answer for vehicle k does not
+    depend on the number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
@@ -331,9 +331,7 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Vehicles where the network has them start, rolling at walking pace, each with a driver of
-    his own.
-    """
+    """Place vehicles at the network's starts, rolling at walking pace, each with its own driver."""
     count = len(rngs)
     vehicles = np.zeros((count, STATES))
     wheels = np.zeros((count, len(Wheel), 4))

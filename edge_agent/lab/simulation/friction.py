@@ -1,9 +1,9 @@
-"""Friction of the road as a field over position and time: a background, and oriented rectangles
-laid upon it.
+"""Friction of the road as a field over position and time: a background with oriented rectangles on
+top.
 
-A later patch lies on top of an earlier one. Each patch says what its grip *is* (`mu`) and what a
-driver takes it for (`looks`): black ice looks like the road around it, which is why drivers respond
-late.
+A later patch lies on top of an earlier one. Each patch has its true grip (`mu`) and the grip that a
+driver expects from its appearance (`looks`). Black ice looks like the road around it, which is why
+drivers respond late.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Patch:
     """A rectangle of road surface.
 
     `x, y` centre [m]; `length` along the direction `angle` [rad, counter-clockwise from x] and
-    `width` across [m]; `mu` its friction; `looks` the friction a driver expects of it (None: what
-    lies beneath); present for `start` <= t < `end` [s].
+    `width` across [m]; `mu` its friction; `looks` the friction that a driver expects from its
+    appearance (None: that of the surface beneath); present for `start` <= t < `end` [s].
     """
 
     name: str
@@ -73,7 +73,9 @@ class PatchColumn(IntEnum):
 
 
 def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
-    """Rows for `look_up`, shape (1 + patches, 10); the background is the first, endless patch."""
+    """Return rows for `look_up`, shape (1 + patches, 10); the background is the first, endless
+    patch.
+    """
     everywhere = Patch("background", 0.0, 0.0, math.inf, math.inf, background, looks=background)
     table = np.empty((1 + len(patches), len(PatchColumn)))
     for row, p in zip(table, (everywhere, *patches), strict=True):
@@ -85,8 +87,8 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
-    """Column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that says something
-    about it.
+    """Return column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that defines
+    it.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]
@@ -108,7 +110,7 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
 def look_up_many(
     table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray
 ) -> FloatArray:
-    """`look_up` for arrays of one length."""
+    """Return `look_up` for arrays of one length."""
     values = np.empty(x.size)
     for i in range(x.size):
         values[i] = look_up(table, column, t[i], x[i], y[i])

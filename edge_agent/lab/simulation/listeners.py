@@ -1,5 +1,5 @@
-"""Simulated drivers who are warned: where they will drive, what they are told, and that they
-slow down for it.
+"""Simulated drivers who receive warnings and slow down for them; their routes and the warnings they
+hear.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ EVERY: Final = 10  # blocks between two looks at the route
 
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
-    """Which drivers are warned, (N,): spread evenly over those of smooth and of rough vehicles.
+    """Return which drivers are warned, (N,): spread evenly over those of smooth and of rough
+    vehicles.
 
     Raises:
-        InputError: no share.
+        InputError: the share is not between 0 and 1.
     """
     if not 0.0 <= share <= 1.0:
         raise InputError("warned", f"{share} is not a share", "give a number from 0 to 1")
@@ -39,10 +40,10 @@ class WarnedDrivers:
 
     Args:
         fleet: the vehicles.
-        share: of them, from 0 to 1; vehicle k is or is not however many there are.
+        share: of them, from 0 to 1; the choice of vehicle k does not depend on their number.
 
     Raises:
-        InputError: no share.
+        InputError: the share is not between 0 and 1.
     """
 
     def __init__(self, fleet: SimulatedFleet, share: float) -> None:
@@ -53,24 +54,24 @@ class WarnedDrivers:
         self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
     def listens(self, k: int) -> bool:
-        """Whether vehicle k is warned."""
+        """Return True if vehicle k is warned."""
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:
-        """Where vehicle k will drive."""
+        """Return where vehicle k will drive."""
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
-        """A warning for a driver; from any thread. He acts on it from the next block on, after
-        his reaction.
+        """Store a warning for a driver; may be called from any thread. The driver acts on it from
+        the next block on, after the reaction time.
         """
         self._warnings.put((self._number[name], warning))
 
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """The blocks, with the drivers told between them what was heard; `hear` is called before
-        each.
+        """Yield the blocks; between them hand the drivers their warnings. `hear` is called before
+        each block.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
@@ -80,12 +81,12 @@ class WarnedDrivers:
             self.act()
 
     def refresh(self) -> None:
-        """Look where the drivers will go."""
+        """Update the routes of the drivers."""
         for k in self.warned.nonzero()[0].tolist():
             self._routes[k] = GivenRoute(*self._fleet.route_ahead(k, ROUTE_M))
 
     def act(self) -> None:
-        """Hand the drivers what was heard for them."""
+        """Hand the stored warnings to their drivers."""
         while not self._warnings.empty():
             k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself

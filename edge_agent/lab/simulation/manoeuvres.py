@@ -1,7 +1,7 @@
-"""The manoeuvres: what the driver of a test track does, as one table of name -> manoeuvre.
+"""The manoeuvres of a test-track driver, as one table of name -> manoeuvre.
 
-A manoeuvre is a function of the moment, giving the mean road-wheel angle [rad] and the longitudinal
-acceleration that is asked for [m/s^2]. The test track starts at the origin and leads along x.
+A manoeuvre is a function of the moment that returns the mean road-wheel angle [rad] and the
+demanded longitudinal acceleration [m/s^2]. The test track starts at the origin and leads along x.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 @dataclass(frozen=True)
 class Moment:
-    """Knowledge of a driver: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked
-    for [m/s].
+    """Information of a driver at an instant: time [s], pose [m, m, rad], speed [m/s], and demanded
+    speed [m/s].
 
-    Speed control by hub motors also knows `lost` [m], the integral of the error of speed, and
-    `gain` [m/s^2], the acceleration.
+    Speed control by hub motors also uses `lost` [m], the integral of the error of speed, and `gain`
+    [m/s^2], the acceleration.
     """
 
     t: float
@@ -43,7 +43,7 @@ Control = Callable[[Moment], tuple[float, float]]
 
 
 class TimedFriction(NamedTuple):
-    """Friction that changes in time, under all wheels at once (paper 003, section 4.2.4)."""
+    """Friction that changes over time, under all wheels at once (paper 003, section 4.2.4)."""
 
     before: float
     after: float
@@ -62,7 +62,7 @@ wheel, or of time.
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One row of the table; `friction` and `speed` are what is usual for it and may be replaced."""
+    """One row of the table; `friction` and `speed` are defaults that may be replaced."""
 
     control: Control
     speed: float  # [m/s] at the start, and to be held unless the control does otherwise
@@ -72,17 +72,17 @@ class Manoeuvre:
 
 
 def jump(before: float, after: float, at: float) -> Callable[[float, float], float]:
-    """A friction that changes at `at` [m] along the track."""
+    """Return a friction that changes at `at` [m] along the track."""
     return lambda x, _y: before if x < at else after
 
 
 def split(left: float, right: float) -> Callable[[float, float], float]:
-    """A friction that differs between the left and the right of the track."""
+    """Return a friction that differs between the left and the right of the track."""
     return lambda _x, y: left if y > 0.0 else right
 
 
 def hold(now: Moment, speed: float | None = None) -> float:
-    """Acceleration that brings the vehicle back to `speed`, or to the one that was asked for."""
+    """Return the acceleration that brings the vehicle back to `speed`, or to the demanded speed."""
     error = (now.speed if speed is None else speed) - now.vx
     if now.motors is not None:
         return speed_demand(now.motors, error, now.lost if speed is None else 0.0, now.gain)
@@ -90,7 +90,9 @@ def hold(now: Moment, speed: float | None = None) -> float:
 
 
 def steer_to(now: Moment, target_x: float, target_y: float) -> float:
-    """Pure pursuit (Coulter, CMU-RI-TR-92-01): the steering of the circle through a point ahead."""
+    """Return the steering of the circle through a point ahead by pure pursuit (Coulter,
+    CMU-RI-TR-92-01).
+    """
     dx = target_x - now.x
     dy = target_y - now.y
     ahead = math.cos(now.yaw) * dx + math.sin(now.yaw) * dy
@@ -100,31 +102,31 @@ def steer_to(now: Moment, target_x: float, target_y: float) -> float:
 
 
 def preview(now: Moment) -> float:
-    """How far ahead a driver looks [m]."""
+    """Return the preview distance of a driver [m]."""
     return max(4.0, 0.6 * now.vx)
 
 
 def smooth_step(u: float) -> float:
-    """0 before u = 0, 1 after u = 1, and bends without a kink between (3u² − 2u³)."""
+    """Return 0 before u = 0, 1 after u = 1, and 3u² − 2u³ between them, which has no kink."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 
 
 def lane_change_path(s: float) -> float:
-    """Lateral position [m] of a double lane change at distance s: gates like those of ISO
-    3888-1, 3.5 m over.
+    """Return the lateral position [m] of a double lane change at distance s: gates like those of
+    ISO 3888-1, 3.5 m over.
     """
     return 3.5 * (smooth_step((s - 20.0) / 30.0) - smooth_step((s - 75.0) / 25.0))
 
 
 def double_lane_change(now: Moment) -> tuple[float, float]:
-    """Into the other lane and back, the speed held."""
+    """Change to the other lane and back at constant speed."""
     ahead = now.x + preview(now)
     return steer_to(now, ahead, lane_change_path(ahead)), hold(now)
 
 
 def slalom(now: Moment) -> tuple[float, float]:
-    """Around cones 18 m apart."""
+    """Drive around cones 18 m apart."""
     ahead = now.x + preview(now)
     return steer_to(
         now, ahead, 1.2 * math.sin(math.pi * ahead / 18.0) * smooth_step(ahead / 18.0)
@@ -132,37 +134,39 @@ def slalom(now: Moment) -> tuple[float, float]:
 
 
 def sine(now: Moment) -> tuple[float, float]:
-    """Steering to and fro with half a hertz, amplitude for 4 m/s^2 of a bicycle without slip."""
+    """Steer to and fro at half a hertz, with the amplitude for 4 m/s^2 of a bicycle model without
+    slip.
+    """
     amplitude = min(WHEELBASE * 4.0 / now.speed**2, 0.15)
     return amplitude * math.sin(math.pi * max(now.t - 1.0, 0.0)), hold(now)
 
 
 def acceleration(now: Moment) -> tuple[float, float]:
-    """Full throttle after one second."""
+    """Apply full throttle after one second."""
     return 0.0, 8.0 if now.t >= 1.0 else hold(now)
 
 
 def braking(now: Moment) -> tuple[float, float]:
-    """A stop with anti-lock control after one second, down to walking pace."""
+    """Brake with anti-lock control after one second, down to walking pace."""
     return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
         now, now.speed if now.t < 1.0 else 1.5
     )
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
-    """The same stop, kept straight by the driver while one side pulls."""
+    """Brake in the same way; the driver keeps the car straight while one side pulls."""
     return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
 
 
 def gentle_braking(now: Moment) -> tuple[float, float]:
-    """2 m/s^2 after one second, down to walking pace."""
+    """Brake with 2 m/s^2 after one second, down to walking pace."""
     return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
         now, now.speed if now.t < 1.0 else 1.5
     )
 
 
 def constant_radius(now: Moment) -> tuple[float, float]:
-    """A circle of 40 m radius to the left, entered straight (ISO 4138)."""
+    """Drive a circle of 40 m radius to the left, entered straight (ISO 4138)."""
     radius = 40.0
     look = preview(now)
     angle = math.atan2(now.x, radius - now.y) + look / radius
@@ -170,17 +174,17 @@ def constant_radius(now: Moment) -> tuple[float, float]:
 
 
 def straight(now: Moment) -> tuple[float, float]:
-    """Straight on at constant speed: it tells nothing of the road."""
+    """Drive straight on at constant speed, which carries no information on the road."""
     return steer_to(now, now.x + preview(now), 0.0), hold(now)
 
 
 def j_turn(now: Moment) -> tuple[float, float]:
-    """One step of the steering after one second, held (ISO 7401)."""
+    """Step the steering after one second and hold it (ISO 7401)."""
     return 0.06 * smooth_step((now.t - 1.0) / 0.3), hold(now)
 
 
 def two_lane_changes(now: Moment) -> tuple[float, float]:
-    """A double lane change, and another from 110 m on."""
+    """Drive a double lane change, and another from 110 m on."""
     ahead = now.x + preview(now)
     return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(
         now
@@ -188,29 +192,31 @@ def two_lane_changes(now: Moment) -> tuple[float, float]:
 
 
 def accelerating_sine(now: Moment) -> tuple[float, float]:
-    """Sine steering, from six seconds on 5 m/s faster."""
+    """Steer in a sine, from six seconds on 5 m/s faster."""
     return sine(now)[0], min(hold(now, now.speed + 5.0 * smooth_step((now.t - 6.0) / 4.0)), 2.0)
 
 
 def gaining_lane_changes(now: Moment) -> tuple[float, float]:
-    """Lane changes while gaining 10 m/s within fifteen seconds."""
+    """Change lanes while gaining 10 m/s within fifteen seconds."""
     return two_lane_changes(now)[0], min(
         hold(now, now.speed + 10.0 * smooth_step(now.t / 15.0)), 2.0
     )
 
 
 def gaining_slalom(now: Moment) -> tuple[float, float]:
-    """The slalom while gaining 7 m/s within fifteen seconds."""
+    """Drive the slalom while gaining 7 m/s within fifteen seconds."""
     return slalom(now)[0], min(hold(now, now.speed + 7.0 * smooth_step(now.t / 15.0)), 2.0)
 
 
 def low_turn(now: Moment) -> tuple[float, float]:
-    """60 degrees of the steering wheel within .3 s, held; road wheel one sixteenth of it."""
+    """Turn the steering wheel by 60 degrees within .3 s and hold it; the road wheel turns by one
+    sixteenth of that.
+    """
     return math.radians(60.0) / 16.0 * smooth_step(now.t / 0.3), hold(now)
 
 
 def firm_acceleration(now: Moment) -> tuple[float, float]:
-    """0.6 g after one second, kept straight."""
+    """Accelerate with 0.6 g after one second; the driver keeps the car straight."""
     return steer_to(now, now.x + preview(now), 0.0), 0.6 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
@@ -248,12 +254,14 @@ def stop_and_go(now: Moment) -> tuple[float, float]:
 
 
 def throttle(_now: Moment) -> tuple[float, float]:
-    """3 m/s^2 from the first sample on, wheels straight: "throttle opening of 0.3" of paper 003."""
+    """Accelerate with 3 m/s^2 from the first sample on, wheels straight: "throttle opening of 0.3"
+    of paper 003.
+    """
     return 0.0, 3.0
 
 
 def kmh(speed: float) -> float:
-    """[m/s] of a speed in km/h."""
+    """Convert a speed from km/h to m/s."""
     return speed / 3.6
 
 

@@ -1,5 +1,5 @@
-"""How devices sit in real cars: tilted mounts, steering off its zero, unlike wheels, coarse
-counters, clocks apart.
+"""Errors of devices mounted in real cars: tilted mounts, steering offset, unequal wheels, coarse
+counters, clock offsets.
 
 Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place), so that none moves
 another)
@@ -10,7 +10,7 @@ another)
     ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
     Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are
              counted
-    τ        each device tells of the moment τ ago
+    τ        each device reports the moment τ ago
 
 Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to
 .54 m/s^2, steering 1 to 17 mrad, gains of steering off by 3 % at speed and 5 to 15 % at .3 to .5
@@ -82,7 +82,7 @@ class Misaligned(IntEnum):
 
 
 def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
-    """Misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
+    """Return the misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
     key = key_of(seed, index, MOUNT_STREAM)
     row = np.zeros(COLUMNS)
     row[Misaligned.ROUGH] = float(size != ALIGNED)
@@ -105,15 +105,15 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """How many samples back the latest clock of the rows (N, COLUMNS) speaks of, and one more."""
+    """Return how many samples back the latest clock of the rows (N, COLUMNS) reaches, plus one."""
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
 
 
 @compiled
 def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
-    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them,
-    the first before all.
+    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them;
+    earlier times get the first record.
     """
     whole = math.floor(samples)
     share = samples - whole
@@ -141,7 +141,9 @@ def misalign(mounted: FloatArray, signals: FloatArray) -> None:
 
 @compiled
 def counted(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
-    """Wheel speeds in steps, none of a wheel that stands; and no torque where there is none."""
+    """Quantise wheel speeds into steps, with zero for a wheel that stands; remove torque where the
+    car has none.
+    """
     step = mounted[Misaligned.STEP]
     for i in range(4):
         if record[RecordColumn.OMEGA + i] == 0.0:

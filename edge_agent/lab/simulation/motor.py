@@ -52,12 +52,12 @@ class Pmsm(NamedTuple):
 
 
 def speed_demand(motor: Pmsm, error: float, summed: float, acceleration: float) -> float:
-    """Return the acceleration [m/s^2] that the PID asks for.
+    """Return the acceleration [m/s^2] that the PID demands.
 
     Args:
-        error: speed that is wanted less the true one [m/s].
+        error: demanded speed minus the true one [m/s].
         summed: its integral over time [m].
-        acceleration: true one [m/s^2]; it stands for the derivative of the error.
+        acceleration: true one [m/s^2]; it replaces the derivative of the error.
     """
     return motor.proportional * error + motor.integral * summed - motor.derivative * acceleration
 
@@ -72,7 +72,7 @@ def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: 
     """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque
     at the wheel [N m].
 
-    wanted: torque at the wheel that is asked for [N m].
+    wanted: demanded torque at the wheel [N m].
     """
     per_ampere = 1.5 * motor.pole_pairs * motor.flux
     aim = wanted / (motor.gear * per_ampere)

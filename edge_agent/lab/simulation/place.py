@@ -13,26 +13,26 @@ from schemas.thresholds import EARTH_RADIUS_M
 
 @dataclass(frozen=True)
 class Origin:
-    """Where x = y = 0 lies [deg, WGS 84]."""
+    """Position of x = y = 0 [deg, WGS 84]."""
 
     latitude: float
     longitude: float
 
     @property
     def per_metre(self) -> tuple[float, float]:
-        """Degrees of latitude per metre north and of longitude per metre east."""
+        """Return degrees of latitude per metre north and of longitude per metre east."""
         north = float(np.degrees(1.0 / EARTH_RADIUS_M))
         return north, north / float(np.cos(np.radians(self.latitude)))
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(latitude, longitude) [deg] of the points (x, y) [m]."""
+        """Return (latitude, longitude) [deg] of the points (x, y) [m]."""
         north, east = self.per_metre
         return self.latitude + np.asarray(y) * north, self.longitude + np.asarray(x) * east
 
     def from_latlon(
         self, latitude: FloatArray, longitude: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """(x, y) [m] of the points given in degrees."""
+        """Return (x, y) [m] of the points given in degrees."""
         north, east = self.per_metre
         return (np.asarray(longitude) - self.longitude) / east, (
             np.asarray(latitude) - self.latitude

@@ -1,4 +1,4 @@
-"""The vehicle that is driven: a planar body on four wheels with Magic Formula tyres.
+"""The simulated vehicle: a planar body on four wheels with Magic Formula tyres.
 
 It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have
 another shape, their stiffness grows less than the load, its loads follow the accelerations with a
@@ -17,15 +17,15 @@ lag, it rolls, drags and resists rolling.
     the left
 
 An accelerometer feels all forces but gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where the
-vehicle stands. The load that is transferred goes by what is felt, and the loads add up to the
+vehicle stands. The load transfer follows the felt acceleration, and the loads add up to the
 weight's part that is normal to the road.
 
-K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle
-Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
+K does not depend on μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and
+Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
 
-A vehicle may have tyres that relax (RELAXATION: four fifths of the slip is built up over that
-length) and controllers that work in cycles and are reported (ABS_HZ: `controllers.py`). Without
-them slip control is smooth, as it was before.
+A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip builds up
+over that length) and controllers that work in cycles and report it (ABS_HZ: `controllers.py`).
+Without them slip control is smooth.
 
 Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with
 the secant slope of the tyre in the denominator a wheel step is stable at any speed. The tyre's
@@ -67,7 +67,9 @@ STILL: Final = 0.02
 
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
-    """(g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the road."""
+    """Return (g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the
+    road.
+    """
     ahead = u[Control.TILT, 0]
     left = u[Control.TILT, 1]
     share = 1.0 / math.sqrt(1.0 + ahead * ahead + left * left)
@@ -76,14 +78,14 @@ def gravity(u: FloatArray) -> tuple[float, float, float]:
 
 @compiled
 def stiffness_per_load(slope: float, degression: float, load: float, at_rest: float) -> float:
-    """K/F_z of a wheel under `load` [N] that carries `at_rest` [N] when standing."""
+    """Return K/F_z of a wheel under `load` [N] that carries `at_rest` [N] when standing."""
     return slope * max(1.0 - degression * (load / at_rest - 1.0), SOFTEST)
 
 
 @compiled
 def allowed(slip: float, limit: float) -> float:
-    """Share of the torque that slip control lets through: all up to `limit`, nothing from twice
-    the limit.
+    """Return the share of the torque that slip control allows: all up to `limit`, nothing from
+    twice the limit.
     """
     return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
 
@@ -116,8 +118,8 @@ def wheel_torques(
 
 @compiled
 def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Let the tyres build up slip for `dt` [s] over their relaxation length, after the wheels
-    have turned.
+    """Let the slip of the tyres build up for `dt` [s] over their relaxation length, after the
+    wheels have turned.
     """
     for i in range(4):
         along, across = wheel_velocity(
@@ -185,7 +187,7 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
 def body_accelerations(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray
 ) -> tuple[float, float, float]:
-    """(a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw
+    """Return (a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw
     acceleration [rad/s^2].
 
     `w` is filled.
@@ -208,10 +210,10 @@ def turn_wheels(
     gain: float,
     yaw_acceleration: float,
 ) -> None:
-    """One linearly implicit Euler step of the wheel speeds in `x`: every torque that falls with ω
-    damps it.
+    """Apply one linearly implicit Euler step to the wheel speeds in `x`: every torque that falls
+    with ω damps it.
 
-    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: how the ground's speed changes under the
+    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: the change of the ground's speed under the
     wheels.
     """
     radius = p[Parameter.RADIUS]
@@ -241,8 +243,8 @@ def turn_wheels(
 
 @compiled
 def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope,
-    and so are the tyres.
+    """Return True if the brakes hold a vehicle that stands: brakes and tyres are stronger than
+    engine and slope.
     """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
@@ -260,8 +262,8 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 
 @compiled
 def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """One step of a vehicle that is `held`: only the suspension still moves, to where the slope
-    wants it.
+    """Apply one step to a vehicle that is `held`: only the suspension still moves, to its balance
+    on the slope.
     """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
@@ -276,7 +278,7 @@ def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 def advance(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
 ) -> None:
-    """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is
+    """Advance the state `x` by `substeps` steps of `dt` [s] with constant inputs `u`; `w` is
     scratch.
     """
     along, across, _ = gravity(u)
@@ -363,13 +365,13 @@ def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], sp
 
 
 def substeps_of(rate_hz: float) -> int:
-    """How many equal plant steps of at most LONGEST_SUBSTEP make one sample."""
+    """Return the number of equal plant steps of at most LONGEST_SUBSTEP in one sample."""
     return max(1, math.ceil(round(1.0 / (rate_hz * LONGEST_SUBSTEP), 9)))
 
 
 @compiled
 def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
-    """Where wheel `i` stands on the ground, (x, y) [m]."""
+    """Return the position of wheel `i` on the ground, (x, y) [m]."""
     ahead, left = wheel_position(p, i)
     c = math.cos(x[Motion.YAW])
     s = math.sin(x[Motion.YAW])
@@ -378,5 +380,7 @@ def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
 
 @compiled
 def strongest_pull(p: FloatArray, vx: float) -> float:
-    """Largest driving force of the engine [N]: its power, and below 5 m/s the gearbox."""
+    """Return the largest driving force of the engine [N]: limited by its power, and below 5 m/s by
+    the gearbox.
+    """
     return float(p[TrueParameter.POWER] / max(vx, 5.0))

@@ -1,4 +1,6 @@
-"""The vehicles of the simulator: what they truly are, and what their vehicle file says of them."""
+"""The vehicles of the simulator: their true parameters, and the vehicle files that describe
+them.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,10 @@ STIFFNESSES: Final = {"proportional-to-friction": 1.0}  # name -> TrueParameter.
 
 @dataclass(frozen=True)
 class TrueVehicle:
-    """A vehicle as it is: its parameters, and what no vehicle file tells.
+    """True parameters of a vehicle, including those that no vehicle file contains.
 
     The tyre's shape c and curvature e give peaks between θ = 2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e
-    .1) and a falling branch; an estimator with the textbook shape is wrong about it by 5 to 15 % of
+    .1) and a falling branch. An estimator with the textbook shape is wrong about it by 5 to 15 % of
     the force in between.
     """
 
@@ -70,7 +72,7 @@ class TrueVehicle:
             )
 
     def row(self) -> FloatArray:
-        """The parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and
+        """Return the parameters for `plant`, shape (PARAMETERS,), in the order of `Parameter` and
         `TrueParameter`.
         """
         drive = self.vehicle.drive_split_front
@@ -118,8 +120,8 @@ def car(
     radius: float,
     drive_front: float,
 ) -> Vehicle:
-    """A vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17 per
-    radian.
+    """Return a vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17
+    per radian.
     """
     load = mass * GRAVITY / 4.0
     return Vehicle(
@@ -200,7 +202,7 @@ KNOWN: Final = {
 
 
 def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
-    """A preset by name, or a vehicle with ordinary tyres from its parameters.
+    """Return a preset by name, or a vehicle with ordinary tyres from its parameters.
 
     Raises:
         InputError: there is no preset of that name.
@@ -219,8 +221,8 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
 
 
 def matched(vehicle: TrueVehicle) -> TrueVehicle:
-    """The vehicle without what the papers' model leaves out: drag, rolling resistance, lagging
-    loads, degressive tyres.
+    """Return the vehicle without effects that the papers' model leaves out: drag, rolling
+    resistance, lagging loads, degressive tyres.
 
     The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
     """
@@ -238,8 +240,8 @@ def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehic
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
-    """What the vehicle file says: the true parameters, each off by a normal error of the size in
-    KNOWN.
+    """Return the content of the vehicle file: the true parameters, each with a normal error of the
+    size in KNOWN.
     """
     file_values = {
         name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std))
@@ -249,8 +251,8 @@ def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:
-    """Vehicle number `index` of a fleet: the presets in turn, each with its own load, tyres and
-    suspension.
+    """Return vehicle number `index` of a fleet: the presets in turn, each with its own load, tyres
+    and suspension.
     """
     base = list(PRESETS.values())[index % len(PRESETS)]
     extra = rng.uniform(0.0, 0.12)  # passengers and luggage

@@ -1,5 +1,5 @@
-"""Records: the truth of one sample of one vehicle, as sensors read it and judges compare with
-it.
+"""Records: the truth of one sample of one vehicle, from which sensors are simulated and estimates
+are judged.
 """
 
 from __future__ import annotations

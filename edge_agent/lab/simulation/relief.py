@@ -1,5 +1,5 @@
-"""Relief: how the road rises, as the gradient of one height over the plane, and the crossfall of
-its lanes upon it.
+"""Relief: the slope of the road as the gradient of one height over the plane, and the crossfall of
+its lanes.
 
 Legend
     h       height [m] over x (east) and y (north) [m]
@@ -54,7 +54,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Relief:
-    """What the ground is like: `waves` that add up, `crossfall` of every lane [1], `banking` per
+    """Shape of the ground: `waves` that add up, `crossfall` of every lane [1], `banking` per
     curvature [m].
     """
 
@@ -64,8 +64,8 @@ class Relief:
 
     @property
     def table(self) -> FloatArray:
-        """Rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves with
-        columns A.
+        """Return rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves
+        with columns A.
         """
         table = np.zeros((1 + len(self.waves), len(WaveColumn)))
         table[0, :2] = self.crossfall, self.banking
@@ -95,8 +95,8 @@ class WaveColumn(IntEnum):
 
 @compiled
 def cross_slope(table: FloatArray, curvature: float) -> float:
-    """How much a lane of that `curvature` [1/m] rises to its left [1]: crossfall, and less in a
-    bend to the left.
+    """Return how much a lane of that `curvature` [1/m] rises to its left [1]: the crossfall, and
+    less in a bend to the left.
     """
     return float(table[0, 0] - table[0, 1] * curvature)
 
@@ -105,8 +105,8 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
 def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
-    """∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left of
-    `heading` (cos, sin).
+    """Return ∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left
+    of `heading` (cos, sin).
     """
     east = -left * heading[1]
     north = left * heading[0]
@@ -127,7 +127,7 @@ def gradient(
 
 @compiled
 def tilt(east: float, north: float, yaw: float) -> tuple[float, float]:
-    """Rise per metre ahead of a vehicle of that heading [rad], and to its left."""
+    """Return the rise per metre ahead of a vehicle of that heading [rad], and to its left."""
     c = math.cos(yaw)
     s = math.sin(yaw)
     return c * east + s * north, c * north - s * east
@@ -137,12 +137,12 @@ LEVEL: Final = Relief()
 
 
 def level(_seed: int) -> Relief:
-    """No slope, no crossfall."""
+    """Return a relief without slope or crossfall."""
     return LEVEL
 
 
 def rolling(seed: int) -> Relief:
-    """Waves of 3 % along the road, 300 and 120 m long."""
+    """Return waves of 3 % along the road, 300 and 120 m long."""
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
         tuple(Wave(0.03, length, 0.0, _turn(key, k)) for k, length in enumerate((300.0, 120.0)))
@@ -150,17 +150,17 @@ def rolling(seed: int) -> Relief:
 
 
 def stepped(seed: int) -> Relief:
-    """Slopes of 4 % up and down in turn, 60 m each, with kinks between."""
+    """Return slopes of 4 % up and down in turn, 60 m each, with kinks between."""
     return Relief((Wave(0.04, 120.0, 0.0, _turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),))
 
 
 def banked(_seed: int) -> Relief:
-    """A crossfall of 4 %, and none along."""
+    """Return a crossfall of 4 % without longitudinal slope."""
     return Relief(crossfall=0.04)
 
 
 def hilly(seed: int) -> Relief:
-    """Everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean,
+    """Return everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean,
     steps, crossfall.
     """
     key = key_of(seed, RELIEF_STREAM)
@@ -184,7 +184,7 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
-    """The relief of that name with a lasting `slope` [1] along the track added.
+    """Return the relief of that name with a lasting `slope` [1] along the track added.
 
     Raises:
         InputError: there is none of that name, or the slope is too steep.

@@ -1,11 +1,10 @@
 """Roads as lanes: centre lines of straights and arcs, one lane each way on the right, and
 connectors through junctions.
 
-lane       a directed polyline, points about a metre apart, with heading and curvature
-connector  a lane through a junction, from the end of one lane to the start of one of another road
-profile    v²/q at each point [m]: the square of the speed that a driver may have there who allows
-           himself q m/s^2 across and BRAKING·q along, knowing where he will turn; it scales with q,
-           so one profile serves all
+lane a directed polyline, points about a metre apart, with heading and curvature connector a lane
+through a junction, from the end of one lane to the start of one of another road profile v²/q at
+each point [m]: the squared speed of a driver who allows q m/s^2 across and BRAKING·q along and
+knows the coming turns; it scales with q, so one profile serves all
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ class Network:
     """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from
     `first[k]` on.
 
-    `ways[k]` (MOST_WAYS,) are the lanes one may go on to, -1 where there are fewer; `spacing[k]`
+    `ways[k]` (MOST_WAYS,) are the lanes that follow lane k, -1 where there are fewer; `spacing[k]`
     [m] between points. Lanes before number `roads` are roads, the others connectors. `starts`
     (vehicles,) are the lanes at whose beginnings vehicles start; None: they are spread over the
     roads.
@@ -78,16 +77,16 @@ class Network:
 
     @property
     def road_length(self) -> float:
-        """Length of all roads [m], each counted once."""
+        """Return the length of all roads [m], each counted once."""
         return float(((self.size - 1) * self.spacing)[: self.roads].sum() / 2.0)
 
     def lane(self, k: int) -> FloatArray:
-        """The points of lane k."""
+        """Return the points of lane k."""
         return self.points[self.first[k] : self.first[k] + self.size[k]]
 
 
 def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, ...]) -> Network:
-    """Lanes and connectors of the roads between `junctions` (name -> (x, y) [m]).
+    """Return lanes and connectors of the roads between `junctions` (name -> (x, y) [m]).
 
     Raises:
         InputError: a road leads to an unknown junction, or a junction leaves a lane without a way
@@ -131,8 +130,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
 
 
 def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
-    """A line through the corners whose inner ones are arcs of `radius`, points a quarter of a
-    metre apart, (n, 2).
+    """Return a line through the corners whose inner ones are arcs of `radius`, points a quarter of
+    a metre apart, (n, 2).
     """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
@@ -158,22 +157,24 @@ def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
 
 
 def resampled(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
-    """The same line with equally spaced points, about `spacing` [m] apart, ends kept."""
+    """Return the same line with equally spaced points, about `spacing` [m] apart, with its ends
+    kept.
+    """
     run = _run(line)
     even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))
     return np.column_stack([np.interp(even, run, line[:, 0]), np.interp(even, run, line[:, 1])])
 
 
 def shifted_right(line: FloatArray, offset: float) -> FloatArray:
-    """The line moved to its right by `offset` [m]."""
+    """Return the line moved to its right by `offset` [m]."""
     direction = np.gradient(line, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return line + offset * np.column_stack([direction[:, 1], -direction[:, 0]])
 
 
 def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
-    """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other
-    without a kink.
+    """Return the way through a junction: a cubic Bezier curve that leaves one lane and joins the
+    other without a kink.
     """
     p0 = arriving[-1]
     p3 = leaving[0]
@@ -192,12 +193,12 @@ def _unit(v: FloatArray) -> FloatArray:
 
 
 def _run(line: FloatArray) -> FloatArray:
-    """Distance along a line at each of its points."""
+    """Return the distance along a line at each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def _within(line: FloatArray, setback: float) -> IntArray:
-    """Indices of the points that are at least `setback` from both ends."""
+    """Return the indices of the points that are at least `setback` from both ends."""
     run = _run(line)
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
 
@@ -208,12 +209,12 @@ def network_of(
     roads: int,
     allowed: list[FloatArray] | None = None,
 ) -> Network:
-    """Lanes with headings, curvatures and profiles.
+    """Return a network of lanes with headings, curvatures and profiles.
 
     Args:
         lanes: equally spaced points of each, (n, 2) [m]; the first `roads` of them are roads, the
             others connectors.
-        ways: lanes that one may go on to from each; none where all drives end before it does.
+        ways: lanes that follow each lane; none where all drives end before it does.
         allowed: v²/q [m] that traffic leaves at each point of each lane, (n,); None: as bends and
             junctions allow.
     """
@@ -235,7 +236,9 @@ def network_of(
 
 
 def _lane_table(lane: FloatArray) -> FloatArray:
-    """Points of one lane with heading and smoothed curvature; the profile is still empty."""
+    """Return the points of one lane with heading and smoothed curvature; the profile is still
+    empty.
+    """
     step = np.gradient(lane, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     width = int(SMOOTHING_M / SPACING_M)
@@ -250,7 +253,7 @@ def _plan(
 ) -> None:
     """Fill the profiles from their ends backwards until nothing changes.
 
-    No point may need more braking than the budget leaves beside the cornering there.
+    No point may need more braking than the part of the budget that the cornering there leaves.
     """
     while True:
         before = [table[0, LanePoint.PROFILE :].copy() for table in tables]

@@ -1,5 +1,5 @@
-"""Scenarios: a road network, the friction on it over time, and where on earth it lies, as one
-table.
+"""Scenarios as one table: a road network, the friction on it over time, and its position on
+earth.
 """
 
 from __future__ import annotations
@@ -63,23 +63,23 @@ class Scenario:
 
     @cached_property
     def network(self) -> Network:
-        """The lanes of the roads."""
+        """Return the lanes of the roads."""
         return build_network(self.junctions, self.roads)
 
     @cached_property
     def table(self) -> FloatArray:
-        """The patches for `friction.look_up`."""
+        """Return the patches for `friction.look_up`."""
         return friction_table(self.background, self.patches)
 
     @property
     def events(self) -> tuple[Patch, ...]:
-        """What appears while one drives, in the order of time."""
+        """Return the patches that appear during the drive, in the order of time."""
         return tuple(
             sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start)
         )
 
     def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
-        """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
+        """Return μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
         # copies: numpy warns who looks whether a broadcast view may be written, and the compiler
         # does at a first call
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
@@ -88,19 +88,19 @@ class Scenario:
         ).reshape(x.shape)
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(latitude, longitude) [deg]."""
+        """Return (latitude, longitude) [deg]."""
         return self.origin.to_latlon(x, y)
 
     def from_latlon(
         self, latitude: FloatArray, longitude: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """(x, y) [m]."""
+        """Return (x, y) [m]."""
         return self.origin.from_latlon(latitude, longitude)
 
 
 def demo() -> Scenario:
-    """Four streets from a crossing to a winding ring: dry in the north-east, wet, snow, ice, slush
-    along one street.
+    """Return the demonstration: four streets from a crossing to a winding ring, with dry road in
+    the north-east, wet, snow and ice, and slush along one street.
 
     At 70 s black ice appears on the eastern street where drivers brake before the crossing and
     accelerate out of it.
@@ -156,9 +156,10 @@ def demo() -> Scenario:
 
 
 def hills() -> Scenario:
-    """The demonstration's town on hills: one height over the plane, crossfall, and banked bends.
+    """Return the demonstration's town on hills: one height over the plane, crossfall, and banked
+    bends.
 
-    Slopes reach 8 %; where it is icy they are gentle, or nobody would come up again.
+    Slopes reach 8 %; on ice they are gentle, because otherwise no car could climb them.
     """
     relief = Relief(
         (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
@@ -174,11 +175,11 @@ def hills() -> Scenario:
 
 
 def frost() -> Scenario:
-    """The town on hills in the first frost: at 35 s black ice appears at five places of its eastern
-    half.
+    """Return the town on hills in the first frost: at 35 s black ice appears at five places of its
+    eastern half.
 
-    For the demonstration: every driver meets the new ice several times, so warned and unwarned ones
-    can be compared.
+    Used by the demonstration: every driver meets the new ice several times, so that warned and
+    unwarned drivers can be compared.
     """
     town = hills()
     kept = tuple(patch for patch in town.patches if not math.isfinite(patch.start))
@@ -202,11 +203,11 @@ def frost() -> Scenario:
 
 
 def drawn(seed: int) -> Scenario:
-    """The demonstration's town with other frictions and other hills, drawn by the seed: for
-    figures.
+    """Return the demonstration's town with other frictions and other hills, drawn by the seed, for
+    evaluations.
 
-    What is dry, wet, snow and ice there lies anywhere in the usual range of its kind; no road is
-    one that anybody tuned on, and black ice appears at 30 s.
+    Dry, wet, snowy and icy places have a friction anywhere in the usual range of their kind. No
+    road of it was used for tuning, and black ice appears at 30 s.
     """
     key = key_of(checked_seed(seed), DRAWN_STREAM)
     usual = demo()
@@ -244,9 +245,9 @@ def drawn(seed: int) -> Scenario:
 def winter(seed: int) -> Scenario:
     """Return the town `drawn` by the seed with winter on its lanes.
 
-    On each lane lies one of these: black ice where drivers brake before a junction, or in a bend;
-    ice under the left or under the right wheels alone; two ruts of slush; or nothing. No ice is
-    seen; slush looks wet.
+    Each lane has one of these: black ice where drivers brake before a junction, or in a bend; ice
+    under the left or under the right wheels alone; two ruts of slush; or nothing. Drivers do not
+    see ice; slush looks wet.
     """
     town = drawn(seed)
     key = key_of(checked_seed(seed), WINTER_STREAM)
@@ -323,7 +324,7 @@ def _lay_patch(
 
 
 def tiny() -> Scenario:
-    """A triangle of three streets, half of it snow, an ice patch at 5 s: for tests."""
+    """Return a triangle of three streets for tests: half of it snow, an ice patch at 5 s."""
     return Scenario(
         name="test",
         about="a triangle of 300 m, half of it snow; ice appears at 5 s",
@@ -341,8 +342,8 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), fr
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the same in
-    winter.
+    """Return the scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the
+    same in winter.
 
     Raises:
         InputError: there is none.

@@ -1,10 +1,10 @@
-"""What the sensors say of a true record: white noise, constant offsets, gains, a wandering
-position, missing readings.
+"""Sensor model: readings of a true record with white noise, constant offsets, gains, a wandering
+position and missing readings.
 
-The sets that begin with "rough" are those of real cars: `misaligned.py` says what they have on top,
-and from where. Every random number is a hash of (vehicle key, sample number, channel), so a reading
-depends neither on how a drive is cut into blocks nor on the other vehicles. Only the satellite
-receiver's wander is carried from block to block.
+The sets that begin with "rough" are those of real cars: `misaligned.py` describes their further
+errors and the sources. Every random number is a hash of (vehicle key, sample number, channel), so a
+reading depends neither on how a drive is cut into blocks nor on the other vehicles. Only the
+satellite receiver's wander is carried from block to block.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7
 
 
 class ErrorColumn(IntEnum):
-    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel;
-    then the rest.
+    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel; then
+    the rest.
     """
 
     WHITE = 0
@@ -147,7 +147,7 @@ ERRORS: Final = int(ErrorColumn.MOUNTED) + COLUMNS
 
 
 def sensors_named(name: str | Sensors) -> Sensors:
-    """The set of that name.
+    """Return the set of that name.
 
     Raises:
         InputError: there is none.
@@ -162,8 +162,8 @@ def sensors_named(name: str | Sensors) -> Sensors:
 
 
 def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
-    """Errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and gain are
-    drawn here.
+    """Return the errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and
+    gain are drawn here.
     """
     north, east = origin.per_metre
     white = np.zeros(len(CHANNELS))
@@ -192,7 +192,7 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
 
 
 def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
-    """Keys of the white noise and of the dropouts of vehicle `index`."""
+    """Return the keys of the white noise and of the dropouts of vehicle `index`."""
     return key_of(seed, index, WHITE_STREAM), key_of(seed, index, SILENCE_STREAM)
 
 
@@ -223,8 +223,8 @@ def read_late(
     rate_hz: float,
     signals: FloatArray,
 ) -> None:
-    """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which
-    row `lead` is now.
+    """Fill `signals` (18,) with the delayed readings of each device; records (T, 32), of which row
+    `lead` is now.
     """
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
@@ -239,7 +239,7 @@ def read_late(
 
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
-    """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their
+    """Advance the receiver's slow errors `wander` (3,) to the next fix; the first has their
     long-run spread.
     """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
@@ -257,10 +257,10 @@ def sense(
     keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
 ) -> FloatArray:
-    """Signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were read
-    before.
+    """Return signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were
+    read before.
 
-    `wander` (N, 3) is carried on; keys: two uint64 arrays (N,), of the noise and of the dropouts;
+    `wander` (N, 3) is advanced; keys: two uint64 arrays (N,), of the noise and of the dropouts;
     clock: number of the first sample that is read, rate [Hz] and `lead`.
     """
     white, silence = keys

@@ -1,5 +1,5 @@
-"""One manoeuvre of one vehicle: a signal log with truth beside it, and the vehicle file that
-belongs to it.
+"""Simulation of one manoeuvre of one vehicle: a signal log with ground truth, and the vehicle file
+that belongs to it.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ def simulate_manoeuvre(
     Args:
         name: a key of MANOEUVRES.
         mu: friction; the manoeuvre's usual one if not given.
-        speed: [m/s], likewise.
-        duration_s: [s], likewise.
+        speed: [m/s]; also the manoeuvre's usual one if not given.
+        duration_s: [s]; also the manoeuvre's usual one if not given.
         vehicle: a key of PRESETS, or the true vehicle itself.
         road: a key of ROADS, drawn by the seed, or a relief.
         slope: rise per metre along the track [1] that is added to it.
@@ -167,7 +167,9 @@ def _drive(
     rate_hz: float,
     samples: int,
 ) -> FloatArray:
-    """True records (T, RECORD) of the drive; the driver gives as much more gas as a slope takes."""
+    """Return the true records (T, RECORD) of the drive; the driver adds the throttle that a slope
+    needs.
+    """
     p = truth.row()
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
@@ -221,7 +223,7 @@ def _moment(t: float, x: FloatArray, speed: float) -> Moment:
 def _sensed(
     records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
 ) -> FloatArray:
-    """Signals (T, 18) of the records of one vehicle."""
+    """Return the signals (T, 18) of the records of one vehicle."""
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))
@@ -231,7 +233,7 @@ def _sensed(
 
 
 def _table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
-    """The log: NaN readings become nulls, truth has none."""
+    """Return the log: NaN readings become nulls, truth has none."""
     columns = {"t": pa.array(t)}
     columns |= {name: pa.array(signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
     return pa.table(columns | {name: pa.array(records[:, column]) for name, column in TRUTH})

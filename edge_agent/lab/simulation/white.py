@@ -1,4 +1,4 @@
-"""The noise of paper 004's experiments: white, on a_x, a_y and the yaw rate, and on nothing else.
+"""The noise of paper 004's experiments: white, on a_x, a_y and the yaw rate only.
 
 Constant noise has one variance on all three. Variable noise follows table 2 on a_y alone, as the
 paper says.
@@ -18,7 +18,7 @@ SCHEDULE_S: Final = 2.0  # each for two seconds: a period of six
 
 
 def scheduled(t: FloatArray) -> FloatArray:
-    """Variance at the times t (T,) [s] by the SCHEDULE."""
+    """Return the variance at the times t (T,) [s] by the SCHEDULE."""
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
 
