@@ -1,11 +1,10 @@
-"""The fleet service: many vehicles' evidence in, one map of grip out.
+"""The fleet service: it fuses the reports of many vehicles into one map of grip.
 
     import fleet_service
     print(fleet_service.ask_archive("archive", "worst").to_pandas())
     print(fleet_service.ask_map("tcp/127.0.0.1:7447", bbox=(11.9, 57.6, 12.1, 57.8)).to_pandas())
 
-The names of `__all__` are what other programs may rely on; they are loaded when they are first
-asked for.
+Other programs may rely on the names in `__all__`. Each is loaded at its first use.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: the time.
-        slack: how far beyond it a report may lie, given what the archive has seen.
+        slack: how far beyond `now` the time of a report may lie, given the times in the archive.
         doubt: how much further a report may lie without being refused for good.
         least: lower bound of the true time.
         sure: True if time alone may end standing alerts.

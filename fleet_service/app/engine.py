@@ -93,7 +93,7 @@ class Engine:
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state by what the archive holds; call it in
+        """Call `before`, then replace the state by that of the archive; call it in
         `run_between_segments`.
 
         Raises:

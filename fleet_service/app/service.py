@@ -165,7 +165,7 @@ class Service:
         return holding.lost
 
     def _hanging(self) -> str | None:
-        """Return what has died or hangs next to the worker, so that only a restart helps."""
+        """Return the part outside the worker that died or hangs, so that only a restart helps."""
         if self.engine.settlement.hangs_s >= HANGS_S:
             return (
                 f"a segment write has been in progress for {self.engine.settlement.hangs_s:.0f} s"
@@ -175,7 +175,9 @@ class Service:
         return "upkeep has ended" if self._upkeep.has_ended else None
 
     def _works(self) -> bool:
-        """Return True if this service can do for its regions what a successor could do."""
+        """Return True if this service serves its regions: a router is connected and the worker
+        turns.
+        """
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at
         return (

@@ -137,7 +137,7 @@ def load_state(
     if (
         config.public_vehicles > 1
     ):  # after a checkpoint that does not have them nothing is shown until so many came
-        kept = begin.beside.get(VISITORS)
+        kept = begin.extra_tables.get(VISITORS)
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads())

@@ -142,9 +142,9 @@ def _force_exit_when_stuck(
 ) -> None:
     """End a service whose shutdown hangs, on a frozen router or a long compaction.
 
-    Whatever it is doing may end at any instant: senders keep what is not acknowledged. The exit
-    code is that of a normal end. The lease is released, because a standby would otherwise wait
-    until it expires.
+    Every running operation may be interrupted, because vehicles keep each report until it is
+    acknowledged. The exit code is that of a normal end. The lease is released, because a standby
+    would otherwise wait until it expires.
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):

@@ -101,7 +101,7 @@ def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
 def valhalla(
     lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()
 ) -> dict[str, Any]:
-    """Return what is merged into a Valhalla request for a route."""
+    """Return the fields to merge into a Valhalla request for a route."""
     features = [
         {
             "type": "Feature",

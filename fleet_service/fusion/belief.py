@@ -1,16 +1,17 @@
-"""One cell's belief: what time does to it, and what a vote does. Compiled; every function works on
-one row of 32 bins.
+"""Belief of one cell, and its change by time and by a vote. Compiled; every function works on one
+row of 32 bins.
 
 Legend
-    p    belief about what the fleet takes the road for: probability of each bin (32,)
+    p    belief about the fleet's common reading of the road: probability per bin  (32,)
     q    a belief at rest: its bins in 16 bits, the largest 65 535               (32,)
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle takes μ_i for μ_j)                (32, 32), rows sum to 1
     L̃    B·L over its mean: the vote of a vehicle with an error of its own       (32,)
-    s    strength of a vote: what part of it is new, trusted and surely here    [-]
+    s    strength of a vote: its new part, times trust and P(it belongs here)   [-]
     h    P(the road changed since), 1 - exp(-Δt / CHANGE_S)                     [-]
 
-Arithmetic is in single precision, half as long as double: a belief is a guess of two digits.
+Arithmetic is in single precision, which takes half the memory of double: two digits of a belief are
+significant.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def bias_kernel() -> FloatArray:
 
 
 def _taps() -> Float32Array:
-    """B by diagonals: (2·REACH + 1, 32), so that bins stand beside each other."""
+    """Return B by diagonals, (2·REACH + 1, 32), so that the bins are contiguous in memory."""
     kernel = bias_kernel()
     taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
     for i in range(_BINS):

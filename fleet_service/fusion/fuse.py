@@ -39,14 +39,15 @@ SLIPPERY_WEIGHTS: Final = tuple(
 
 
 class Updated(NamedTuple):
-    """What became of observations (n,), and what changed.
+    """Outcome of an update for each observation (n,), and the slots that changed.
 
     Attributes:
-        late: whether each came after the checkpoint, or was one too many and so not fused.
-        late_by: how much later than its own a late one was fused [ns]; 0 for one in time or not
+        late: True for an observation that came after the checkpoint, or was one too many and so not
             fused.
-        weight: that was used; 0 where nothing was fused.
-        slots: that changed, (k,).
+        late_by: how much later than its own time a late one was fused [ns]; 0 for one in time or
+            not fused.
+        weight: weight that was used; 0 where nothing was fused.
+        slots: slots that changed, (k,).
     """
 
     late: BoolArray
@@ -56,7 +57,7 @@ class Updated(NamedTuple):
 
 
 class Before(NamedTuple):
-    """What `Updated` held the first time, when an archive is replayed."""
+    """Values of `Updated` at the first fusion, used when an archive is replayed."""
 
     late: BoolArray
     late_by: IntArray
@@ -64,15 +65,16 @@ class Before(NamedTuple):
 
 
 class Fusion:
-    """Beliefs of all cells, and what is needed to go on.
+    """Beliefs of all cells, and the state that later updates need.
 
     Args:
-        lateness_s: L [s]; an observation older than the checkpoint is late, and fused as old news.
+        lateness_s: L [s]; an observation older than the checkpoint is late, and is fused with aged
+            evidence.
 
     Attributes:
         store: cells, windows, pairs and vehicles.
         standings: of the vehicles, the oldest first.
-        reports: the weather that may still be asked for.
+        reports: the weather that a later update may still need.
     """
 
     def __init__(self, lateness_s: float) -> None:
@@ -136,14 +138,14 @@ class Fusion:
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
     def update(self, o: Observations, before: Before | None = None) -> Updated:
-        """Take in observations in any order.
+        """Fuse observations in any order.
 
-        A late one is taken at the checkpoint, as what it tells of the road at that time
+        A late one is fused at the checkpoint, with its evidence aged to that time
         (`late.aged_evidence`).
 
         Args:
             o: the observations.
-            before: what `Updated` held the first time, when an archive is replayed.
+            before: values of `Updated` at the first fusion, when an archive is replayed.
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)

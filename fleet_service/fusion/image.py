@@ -1,9 +1,9 @@
-"""All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the
-fusion was. Pure.
+"""Complete state of a fusion as plain arrays, and back, so that a restored fusion continues exactly
+where the snapshot was taken. Pure.
 
-A column is a one-dimensional array, records are a column of bytes. Columns of one length belong
-together: `Image` is a table of tables, by name. LAYOUT says what the bytes mean, by every field's
-name, place and order of bytes.
+A column is a one-dimensional array; records are a column of bytes. Columns of equal length form a
+table, and `Image` maps names to tables. LAYOUT describes the bytes: name, place and byte order of
+every field.
 """
 
 from __future__ import annotations

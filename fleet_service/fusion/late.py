@@ -1,16 +1,16 @@
-"""What comes later than the checkpoint: fused at the checkpoint, as what it tells of the road at
-that time. Pure.
+"""Observations that arrive after the checkpoint. Each is fused at the checkpoint, with its
+likelihood aged from the time of the visit to the checkpoint. Pure.
 
-A road that changes is a Markov chain which leaves the uniform belief uniform and in which both
-directions of time are alike (a diffusion that reflects at the ends, and a change to anything). So
-the likelihood of the road at the checkpoint, given what was measured at time t before it, is
+A road that changes is a Markov chain which leaves the uniform belief uniform and which is
+reversible: a diffusion that reflects at the ends, and a change to anything. So the likelihood of
+the road at the checkpoint, given a measurement at time t before it, is
 
-    L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = what forgetting makes of L over C - t
+    L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = forgetting applied to L over C - t
 
-and a late visit to a cell where nobody was meanwhile is fused as it would have been in time. Where
-others were, it counts beside them as an old word about the road now. Late visits stand in the
-window like all others, the newest first, so that of one vehicle's own the newest counts, and their
-order of arrival between two checkpoints is nothing.
+If no other vehicle visited the cell meanwhile, the result equals that of an observation in time.
+Otherwise the late visit counts in addition to the others, as an old report about the road now. Late
+visits stand in the window like all others, the newest first. So the newest of a vehicle's own
+visits counts, and the order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations

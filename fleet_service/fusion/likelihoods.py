@@ -1,5 +1,5 @@
-"""What one visit says about μ: from a likelihood, a posterior with interval, or the grip used.
-Vectorised, pure.
+"""Likelihood of μ from one visit: from a log-likelihood, a posterior with interval, or the grip
+used. Vectorised, pure.
 
 Legend
     ℓ    log-likelihood on the friction grid, maximum 0        (n, 32), nats
@@ -61,11 +61,12 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
 
 
 def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
-    """Likelihoods (n, 32) that do not claim less than the grip used (n,) supports: of both what
-    says more, bin by bin.
+    """Return likelihoods (n, 32) that claim at least as much as the grip used (n,) supports: in
+    each bin the more informative of the two.
 
-    An estimator whose model is contradicted says nothing about the road, yet its accelerometers
-    felt what was used. The two are of one visit, so that they are not multiplied.
+    An estimator reports an uninformative likelihood when its model is contradicted, but the grip
+    that its accelerometers measured still holds. Both come from one visit, so they are not
+    multiplied.
     """
     out = steps.copy()
     _support(out, np.asarray(used, np.float64), _bounds())

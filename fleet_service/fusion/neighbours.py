@@ -1,30 +1,34 @@
-"""A belief as it is read: what time did to it, what slippery neighbours tell, and what all values
-share. Compiled.
+"""A belief as it is read: aged to the time of reading, combined with messages of slippery
+neighbours, and widened by the error that all values share. Compiled.
 
-A surface rarely ends with a cell: snow and ice lie in stretches. So a cell near which others were
-found slippery is more probably slippery than one of which nobody knows anything. Each side of a
-cell, before, behind, and the other direction of the road, sends it one message, of the neighbour
-there that tells most:
+A surface rarely ends with a cell: snow and ice lie in stretches. So a cell with slippery neighbours
+is more probably slippery than a cell without any information. Each side of a cell (before, behind,
+and the other direction of the road) sends it one message, from the most informative neighbour on
+that side:
 
     m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
 
-and the cell is read as K·(b·m·m·m) over its sum. Messages come from what a neighbour's own visitors
-told, never from what it was told, so that nothing goes round; and they are made when the map is
-read, so that no cell's own belief depends on another's. What all values share is shared with the
-neighbours' too: K comes last, once. Only slippery neighbours tell: a cell that nobody tested is not
-dry because others are (a message of grip would say so), and cells that know nothing send nothing (s
-< s₀). The least of m is 1 - w, .1 beside ice: a cell whose own visitors found grip keeps it. A
-neighbour with grip lets nothing past it: there the stretch has ended. Where nobody was but perhaps
-(see `space`), nothing is told.
+and the cell is read as K·(b·m·m·m) over its sum.
+
+Messages use only the reports of a neighbour's own visitors, never messages that it received, so no
+information travels in a circle. They are computed when the map is read, so that no cell's own
+belief depends on another's. The common error also applies to the neighbours' values, so K comes
+last, once.
+
+Only slippery neighbours send messages. An untested cell is not dry because others are (a message of
+grip would say so), and cells without information send nothing (s < s₀). The least value of m is 1 -
+w, .1 next to ice: a cell whose own visitors found grip keeps it. A neighbour with grip lets no
+message pass: the stretch has ended there. A cell that was only perhaps visited (see `space`)
+receives no message.
 
 Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one
 step.
 
 Legend
-    b      what the fleet takes the cell for, by its own reports                          (32,)
+    b      belief about the cell from its own reports                                     (32,)
     n      belief about the road of a neighbour, by its own reports                       (32,)
     s      P(slippery) of n
-    p₀     what is believed of a road of the region that nobody measured                  (32,)
+    p₀     prior of a road of the region that nobody measured                             (32,)
     K      shared kernel, see `shared`                                                    (32, 32)
     d      cells from one to the other; 1 to the other direction's
 """
@@ -166,8 +170,7 @@ def _kept(live: Rows, row: int) -> float:
 
 @refcount_free
 def _aged(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """What the fleet takes a slot's road for, with what time did to it until `now` [ns], into the
-    scratch; returns the row of its region's prior."""
+    """Age a slot's belief to `now` [ns] into the scratch; return the row of its region's prior."""
     cells = live.cells
     p = scratch[P]
     unpack(live.belief, slot, p)

@@ -40,13 +40,13 @@ class Observations:
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN
             to read them in `evidence`.
-        used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not tell.
+        used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not report it.
         manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
-        limited: (n,) whether a slip controller intervened at so little grip used that only slippery
+        limited: (n,) True if a slip controller intervened at so little grip used that only slippery
             road explains it.
         other: (n, k) other cells in which the vehicle may have been instead, -1 where there is
             none.
-        other_share: (n, k) probability that it was there; what is left belongs to `cell`.
+        other_share: (n, k) probability that it was there; the rest belongs to `cell`.
     """
 
     time: IntArray

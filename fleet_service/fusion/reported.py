@@ -1,8 +1,8 @@
-"""Values as they were reported: mean, standard deviation and P(slippery) of a likelihood. Compiled,
-pure.
+"""Values as vehicles reported them: mean, standard deviation and P(slippery) of a likelihood.
+Compiled, pure.
 
-Whether vehicles agree, whether one reports something new, and whom an alert may call a source is
-judged by what was reported; what is made of it for the belief (`belief.convolve_bias`) is wider.
+The reported values decide three questions: do vehicles agree, is a report new, and which vehicle
+may an alert name as its source. The belief uses a wider likelihood (`belief.convolve_bias`).
 """
 
 from __future__ import annotations

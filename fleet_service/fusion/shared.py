@@ -1,28 +1,30 @@
-"""The error that all values of a place have in common, and what is left of a belief when it is
-integrated out. Pure.
+"""Error that all values of a place have in common, and the belief after it is integrated out. Pure.
 
-Vehicles that do the same in the same place err alike: by the tyre's shape, which they assume, and
-the more, the less of the grip they used; by what else belongs to the manoeuvre. No number of them
-averages it out; other manoeuvres do, and who uses more. So a belief is about what the *fleet* takes
-a road for, and whoever reads it gets the road:
+Vehicles that do the same manoeuvre in the same place err alike. One cause is the tyre's shape,
+which they assume: its error grows as the share of grip used falls. Others depend on the manoeuvre.
+More vehicles do not average this error out; other manoeuvres and a larger share of grip do. So the
+stored belief is about the *fleet's* common reading of a road, and a reader of the map gets the road
+itself:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
-    σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where
-    μ_j < μ_i σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
-    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ
-                                                                                   w_k)²/Σ w_k²
+    σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
+           where μ_j < μ_i
+    σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
+    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
+    n_eff = (Σ w_k)²/Σ w_k²
 
-The error of the shape is one-sided, since only what reads low falls enough towards the upper end to
-be a value. Its slope is what `trust.shape_of` finds, and SHAPE_DOUBT. For an alarm it is the upper
-end of what that may be, so that the larger doubt of an alarm ends once the fleet's shape is known.
+The error of the shape is one-sided, since only a reading that is too low falls enough towards the
+upper end to be a value. Its slope is the one found by `trust.shape_of`, and SHAPE_DOUBT. An alarm
+uses the upper end of the slope's range, so that the larger doubt of an alarm ends once the fleet's
+shape is known.
 
-A sender states all of its error, and what of that does not show between senders that do the same is
-what they share: σ_s² = SHARED_PART·stated², relative, of the cell's values by weight; a =
-SHARED_ALWAYS.
+A sender states its whole error. The part of it that does not show between senders of the same
+manoeuvre is the part they share: σ_s² = SHARED_PART·stated², relative, of the cell's values by
+weight; a = SHARED_ALWAYS.
 
 Legend
-    ū     grip used by who gave values, mean by weight
-    w_k   weight of the values of manoeuvre k, as far as it is not renewed
+    ū     grip used by the vehicles that gave values, mean by weight
+    w_k   weight of the values of manoeuvre k that newer values have not replaced
 """
 
 from __future__ import annotations
@@ -105,8 +107,8 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 def shared_kernel(
     used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
 ) -> FloatArray:
-    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is
-    stated, (32, 32).
+    """Return K, (32, 32), for a mean grip used, a number of kinds of manoeuvre and the shared part
+    of the stated error.
     """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
@@ -131,8 +133,8 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
 
 
 def _table(slope: float) -> Float32Array:
-    """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds
-    them, (…, 32, 32).
+    """Return the kernels transposed, so that the bins of a road are contiguous in memory;
+    `kernel_of` finds them, (…, 32, 32).
     """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
@@ -181,7 +183,9 @@ def kernel_of(cells: RecordArray, row: int) -> int:
 def read_road(
     kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray
 ) -> None:
-    """Belief about the road of a belief `p` (32) about what the fleet takes it for; sums to one."""
+    """Compute the belief about the road from a belief `p` (32) about the fleet's common reading;
+    sums to one.
+    """
     kernel = kernels[kernel_of(cells, row)]
     for i in range(mugrid.BINS):
         road[i] = 0.0
@@ -199,8 +203,9 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the
-    gentler or wider it is, the less it counts."""
+    """Add an entry's value to its cell: manoeuvre, grip used, and the error it shares with others;
+    a value with less grip used or a wider interval counts less.
+    """
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)

@@ -1,10 +1,10 @@
-"""Where a visit may have been instead: its fix's error spreads it over the cells before and behind.
-Vectorised, pure.
+"""Position error of a visit: it spreads the visit over the cells before and behind. Vectorised,
+pure.
 
 Legend
     σ      standard deviation of the position along the heading     (n,), m
     w      length of a cell along the heading                        (n,), m
-    π_k    P(what was learned belongs to the k-th cell further on)   (n,)
+    π_k    P(the measurement belongs to the k-th cell further on)    (n,)
     G(x)   x·Φ(x) + φ(x), the integral of the normal distribution function
 
 A visit lies anywhere in its cell, so that π_k is a uniform of width w and a normal error, seen by

@@ -1,23 +1,23 @@
-"""What vehicles are worth, from what others found in the same cells. Pure, compiled where per row.
+"""Trust in vehicles, from comparison with other vehicles in the same cells. Pure, compiled where
+per row.
 
 Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
-(`agreed`). Every other one counts once, however often they met, and in the measure of its own
-trust. So a group that agrees only with itself is as large as the number of its members and no
-larger, in however many cells it drives alone; and once the many distrust it, its word about others
-is worth nothing.
+(`agreed`). Every other vehicle counts once, however often they met, weighted by its own trust. So a
+group that agrees only with itself counts by the number of its members, in however many cells it
+drives alone. Once the majority distrusts it, its reports about others have no weight.
 
-No error of a vehicle is learned from its differences to others. Only differences show there, and an
-error that value and grip used have in common looks like a slope of the one over the other.
-Differences of a vehicle with itself, at two visits to one cell, are free of it: they show how
-values fall with the grip that was left unused (`shape_of`).
+No error of a vehicle is learned from its differences to others. Such differences show only relative
+errors, and an error that value and grip used have in common looks like a slope of the one over the
+other. Differences between two visits of one vehicle to one cell do not contain that error: they
+show how values fall with the grip that was left unused (`shape_of`).
 
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
-    m    how much the other counts: its trust, TRUST_HEARD_LEAST at least
+    m    how much the other counts: its trust, at least TRUST_HEARD_LEAST
     g    share that agreed, (a₀ + Σ m·ā) / (n₀ + Σ m)
     T    trust, clip((g - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
-    r    weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION), T at the least known
+    r    weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION), T for the least known
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ def compare(
     entries: RecordArray,
     entry: int,
 ) -> None:
-    """Compare a value with those that others gave here lately; it takes the place of its vehicle's
-    own, or the oldest.
+    """Compare a value with those that others gave here lately; it replaces the earlier value of its
+    vehicle, or the oldest one.
 
-    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere, or comes
-    late, is compared with nobody.
+    `names` (V,) are the vehicles' numbers, by index. A value that is late, or more probably belongs
+    to another cell, is compared with none.
     """
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:
@@ -151,7 +151,7 @@ def _note_shape(
 
 @refcount_free
 def _own_variance(mean: float, std: float) -> float:
-    """Relative variance of a value beside its bias."""
+    """Return the relative variance of a value without its bias."""
     return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
@@ -190,10 +190,10 @@ def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: fl
 
 
 def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
-    """Standing of the vehicles (V,) from an epoch on, from whom they met and how these stood
-    `before`.
+    """Return the standing of the vehicles (V,) from an epoch on, from their meetings and the
+    standing of the vehicles they met, `before`.
 
-    In an established service, who has met few that are trusted is a newcomer.
+    In an established service, a vehicle that has met few trusted vehicles is a newcomer.
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _weigh(peers, before.weight, weight)

@@ -63,9 +63,10 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
-    """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch.
+    """Set the kind of an entry's vote and its mean, deviation and P(slippery); leave its likelihood
+    in the scratch.
 
-    What was `reported` (3,) is a value, and described as it was reported, whatever of it is used.
+    A `reported` value (3,) is described as it was reported, even if only a part of it is used.
     """
     evidence = entries[entry].evidence
     likelihood = scratch[LIKELIHOOD]
@@ -104,10 +105,10 @@ def _clear(scratch: Bins) -> None:
 
 @refcount_free_inlined
 def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """How much of a vote is new, from what its vehicle reported here before: in the window, or
-    before the checkpoint.
+    """Compute how much of a vote is new, from earlier reports of its vehicle here: in the window,
+    or before the checkpoint.
 
-    Times are whole seconds from either, so that it does not matter which.
+    Times are whole seconds from either, so that the result is the same for both.
     """
     kind = int(entries[entry].kind)
     pair = entries[entry].pair
@@ -309,7 +310,7 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
-    """Visits and vehicles; who was probably elsewhere is not counted."""
+    """Count visits and vehicles; a visit that was probably elsewhere is not counted."""
     if entries[entry].share < c.HERE_SHARE:
         return
     cells[row].visits += np.uint32(1)

@@ -1,12 +1,12 @@
-"""The observations of the lateness window: kept per cell in order of time, in the belief whatever
-order they come in.
+"""The observations of the lateness window, per cell in order of time. The belief contains them in
+that order, in whatever order they arrive.
 
-A slot's live row is its belief after everything. While it has observations younger than the
-checkpoint it has a window: these observations, and its base, the row as it was before them. An
-observation at the end of the order updates the live row; one in between makes the window stale, and
-once a batch is in, stale windows are computed anew from their bases. When all of a window is older
-than the checkpoint the live row is what the base would be, and the window is given back. Both rows
-see the same operations in the same order, so that they agree bit for bit.
+A slot's live row is its belief after all observations. While the slot has observations younger than
+the checkpoint it has a window: these observations, and its base, the row as it was before them. An
+observation at the end of the order updates the live row. One in between makes the window stale, and
+after the batch all stale windows are computed again from their bases. When all of a window is older
+than the checkpoint, the live row equals the base after a commit, and the window is freed. Both rows
+go through the same operations in the same order, so that they agree bit for bit.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """What becomes of a batch: observations left out (n,), observations seen (n,), windows to be
-    computed anew (k,).
+    """Marks of a batch: observations left out (n,), observations seen (n,), windows that must be
+    computed again (k,).
     """
 
     left_out: BoolArray
@@ -159,7 +159,7 @@ def _absorb(
 
 @refcount_free_inlined
 def _enter(state: State, arrivals: Arrivals, row: int) -> int:
-    """A free entry takes what is known of an observation."""
+    """Fill a free entry with the data of an observation."""
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
@@ -181,11 +181,11 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch all that votes `begin` to `end` will touch; last what lies behind a number that has
-    to come first.
+    """Prefetch all memory that votes `begin` to `end` will touch; last the records whose place is
+    known only after another load.
 
-    No branch waits for memory: a processor that guesses it wrongly forgets what it has fetched
-    meanwhile.
+    No branch waits for memory, because a processor that mispredicts it discards its
+    prefetches.
     """
     live = state.live
     base = state.base

@@ -1,3 +1,3 @@
-"""`fleet-service evaluate`: simulated fleets through the real fusion, beside the truth and
-simple rules.
+"""`fleet-service evaluate`: simulated fleets through the real fusion, compared with the truth and
+with simple rules.
 """

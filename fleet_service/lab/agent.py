@@ -1,4 +1,4 @@
-"""The synthetic vehicle: what an honest but imperfect agent says about a stretch of road. Pure.
+"""The synthetic vehicle: reports of an honest but imperfect agent about a stretch of road. Pure.
 
 Legend
     μ      friction of the road                                                      (n,)
@@ -12,7 +12,7 @@ Legend
 
 An excited visit (s ≥ .6) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it
 is calibrated, also where e is correlated with that of the visit before, since each visit's e alone
-is standard normal (a real agent tempers to get there). An unexcited one sends "at least what I
+is standard normal (a real agent tempers to get there). An unexcited one sends "at least the grip
 used", with a slope above it that is the sender's own and stays within half a nat (contract of the
 log-likelihood). Both are rounded to the wire's bytes.
 """
@@ -48,19 +48,19 @@ BOUND_STD: Final = 0.05  # what the agent admits
 
 
 class ErrorModel(NamedTuple):
-    """How a fleet errs; the first fleet's as default.
+    """Error model of a fleet; the defaults are those of the first fleet.
 
     Attributes:
         bias: standard deviation of the vehicles' relative errors.
-        common: of what all vehicles of a place share, relative.
-        by_manoeuvre: of what those share who do the same there, relative.
+        common: of the relative error that all vehicles share in a place.
+        by_manoeuvre: of the relative error shared by vehicles with the same manoeuvre there.
         tails: degrees of freedom of a visit's noise, Student's; infinite: normal.
         stated: standard deviation that a vehicle states over the one it has.
         share: of the grip, least and most, that an excited visit uses.
         low: how much too low a value reads, for each share of the grip that was left.
         tyres: relative error of all tyres of the fleet.
         half: further relative error of every second vehicle.
-        alike: share of the passes of a place that do what most do there.
+        alike: share of the passes of a place that do the most frequent manoeuvre.
     """
 
     bias: float = BIAS_RELATIVE
@@ -102,8 +102,9 @@ class Errors:
 
 
 class Passes(NamedTuple):
-    """What visits (n,) do: vehicle, friction, error shared in the place, share of the grip used,
-    noise, manoeuvre, and whether they are excited."""
+    """Properties of visits (n,): vehicle, friction, error shared in the place, share of the grip
+    used, noise, manoeuvre, and True where they are excited.
+    """
 
     vehicle: IntArray
     mu: FloatArray
@@ -116,8 +117,9 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,), and in which
-    manoeuvre (n,); log-likelihood (n, 32)."""
+    """Reports of visits: readings z and σ (n,), NaN where unexcited; grip used (n,), and its
+    manoeuvre (n,); log-likelihood (n, 32).
+    """
 
     reading: FloatArray
     std: FloatArray

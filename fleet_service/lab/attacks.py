@@ -1,11 +1,11 @@
-"""Attacks on the map: what a few can do that the honest vehicles alone would not have let happen.
+"""Attacks on the map: changes that a few attackers cause compared with the honest vehicles alone.
 
 The attackers of `random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
 honest, and so trusted, until the attack begins. `newcomers` are new names. `replayed` goes through
 the service's admission: old messages again, other vehicles' messages on an own key, and old visits
-under an own name. Counted are cells whose alert differs from that of the same drive without the
-attack at any minute of it: dry or wet ones (μ > CLEARLY_DRY) that are raised, icy ones (μ <
-CLEARLY_ICY) that are suppressed, with ENOUGH honest excited vehicles.
+under an own name. A cell is counted if its alert differs from that of the same drive without the
+attack at any minute: dry or wet cells (μ > CLEARLY_DRY) that are raised, icy ones (μ < CLEARLY_ICY)
+that are suppressed, with ENOUGH honest excited vehicles.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """What they truly learn, reported of a place elsewhere in the town."""
+    """Report the attackers' true measurements at a place elsewhere in the town."""
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
     return Visits(

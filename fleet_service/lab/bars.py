@@ -14,7 +14,7 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """What a figure is held against; `bar` None is shown only."""
+    """Bar of a figure; with `bar` None the figure is only shown."""
 
     bar: float | tuple[float, float] | None
     better: Side

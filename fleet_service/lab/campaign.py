@@ -91,7 +91,7 @@ def drives_end_to_end(quick: bool) -> Drives:
 
 
 def holds(found: Sequence[Figure]) -> bool:
-    """Whether every bar holds; a figure that is missing does not."""
+    """Return True if every bar holds; a missing figure does not."""
     return all(figure.holds for figure in found if figure.bar is not None)
 
 

@@ -115,7 +115,7 @@ class AlertWatch:
     late: int = 0
 
     def snapshot(self, minute: int) -> None:
-        """Note what the map says at a minute."""
+        """Record the map's alerts at a minute."""
         now = START + minute * 60 * NS
         slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
         known = slots >= 0

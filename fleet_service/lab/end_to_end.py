@@ -1,8 +1,8 @@
 """End to end: simulated vehicles with the real estimator, their observations through the fusion,
-beside the truth.
+compared with the truth.
 
-The vehicles are driven by a command of the deployment, since the service does not know the agent;
-what it writes is read.
+A command of the deployment drives the vehicles, since the service does not know the agent. This
+module reads the files that it writes.
 """
 
 from __future__ import annotations
@@ -132,10 +132,11 @@ def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
 
 
 def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
-    """Alerts on wet and dry road: those with no slippery road near, and those in a cell beside one.
+    """Count alerts on wet and dry road: those with no slippery road near, and those in a cell next
+    to slippery road.
 
-    Slippery is what any vehicle truly found below SURE_GRIP there before the alert. A fix is metres
-    off and a cell ten metres wide: who is warned of the cell beside the ice is warned rightly.
+    Slippery is a cell where any vehicle truly found less than SURE_GRIP before the alert. A fix is
+    metres off and a cell ten metres wide, so a warning in the cell next to the ice is correct.
     """
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu = visits["mu"].to_numpy()
@@ -185,7 +186,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """What was reported on a way, beside the truth."""
+    """Return the reports of a way together with the truth."""
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     enter = truth["enter_time"].cast(pa.int64()).to_numpy()
@@ -227,7 +228,7 @@ def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Whether all that was truly visited of a slot had one friction, (slots,)."""
+    """Return True for each slot in which all visits truly had one friction, (slots,)."""
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()
     known = slot >= 0

@@ -1,5 +1,5 @@
-"""What must hold to rounding: the order of arrival, the replay from an archive; and what
-unexcited visits cannot do.
+"""Properties that must hold to rounding: the result is independent of the order of arrival, and
+equal in a replay from an archive. Also measures how far unexcited visits lower an upper end.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""How long a dry road stays dry on the map: what a planner may assume so long after the last
-pass. Pure.
+"""Fading of a dry road: the lower end of the map's interval that a planner gets some time after the
+last pass. Pure.
 """
 
 from __future__ import annotations

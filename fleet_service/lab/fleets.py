@@ -1,5 +1,5 @@
-"""Fleets with and without misbehaving vehicles: coverage, error, alerts, and the rules beside
-them.
+"""Fleets with and without misbehaving vehicles: coverage, error and alerts, compared with the rules
+of `rules`.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One campaign: share of vehicles that always claim `claim`; from which minute it counts, and
-    how long it is.
+    """One campaign: share of vehicles that always claim `claim`; the minute from which it counts,
+    and its length.
 
-    Vehicles are judged by what they did before, so where some misbehave coverage and error count
+    Vehicles are judged by their earlier reports. So where some misbehave, coverage and error count
     from `begin` on: by then every vehicle has some 200 visits, a day of a car's life. The rates of
-    alerts count as soon as each vehicle has EARLIER visits, two minutes after the service knew
-    nobody; `…_settled` are those from `begin` on.
+    alerts count as soon as each vehicle has EARLIER visits, two minutes after the service knew no
+    vehicle; `…_settled` are those from `begin` on.
     """
 
     name: str
@@ -66,7 +66,7 @@ AT: Final = (5, 10, 20, 30, 40)
 
 @dataclass
 class Found:
-    """What a campaign found over its seeds."""
+    """Results of a campaign over its seeds."""
 
     ours: list[Scores] = field(default_factory=list)
     theirs: list[list[Scores]] = field(default_factory=lambda: [[] for _ in rules.RULES])
@@ -77,7 +77,7 @@ class Found:
 
 
 def one(fleet: Fleet, seed: int, found: Found) -> None:
-    """Drive one seed and note what the map shows."""
+    """Drive one seed and record the map's answers."""
     rng = np.random.default_rng([seed, 1])
     place = town.build(rng, fleet.minutes, CHANGING)
     errors = Errors.draw(rng, VEHICLES)

@@ -1,9 +1,10 @@
-"""Fleets that err otherwise than the fusion assumes, and the sharpness of one that does not. Pure.
+"""Fleets whose errors differ from the fusion's assumptions, and the sharpness of one that does not.
+Pure.
 
-Each fleet gets to know itself on half of the roads and is judged on the other half, which nobody
-knew: so that the number of excited vehicles of a cell is what the map had to go by. Towns, ways and
-errors are drawn by judging seeds. One fleet errs as no model says: as the real estimator did on
-whole ways (`resampled`).
+Each fleet gets to know itself on half of the roads and is judged on the other half, which no
+vehicle visited before. So the map of a cell there rests only on the cell's excited vehicles. Towns,
+ways and errors are drawn by judging seeds. One fleet follows no error model: it errs as the real
+estimator did on whole ways (`resampled`).
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class AskedWay(NamedTuple):
 
 
 def moments(folder: Path) -> list[AskedWay]:
-    """What a map made of a way says at MOMENTS, as far as it lasts."""
+    """Return the map's answers about a way at each of MOMENTS that the way reaches."""
     o = end_to_end.observations_in(end_to_end.read(folder / OBSERVATIONS))
     visits = pq.read_table(folder / TRUTH)
     begin = int(o.time.min())

@@ -1,17 +1,17 @@
-"""Errors as the real estimator makes them: what it reported on whole ways, drawn again for the
-visits of a town. Pure.
+"""Errors of the real estimator: its reports on whole ways, resampled for the visits of a town.
+Pure.
 
-The synthetic vehicle of `agent` errs as the fusion assumes, which flatters it. Here each vehicle of
-a town is one of those of the ways, with all that persists in it (offsets, a tilted sensor, tyres),
-and each of its visits is one that this vehicle made on a road nearly as slippery, excited or not as
-the town's visit is:
+The synthetic vehicle of `agent` errs as the fusion assumes, which flatters the fusion. Here each
+vehicle of a town is one of those of the ways, with all that persists in it (offsets, a tilted
+sensor, tyres). Each of its visits is one that this vehicle made on a road nearly as slippery,
+excited or not as the town's visit is:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w: forces scale with the grip, so value, interval and grip used do, and ℓ(x)
              becomes ℓ(x/c)
 
-A pass over the border of a surface is drawn as any other. What all vehicles of one place share is
-not kept, for each visit is drawn by itself: of that the whole ways tell.
+A pass over the border of a surface is drawn as any other. The error that all vehicles of one place
+share is not kept, because each visit is drawn by itself; the whole ways cover it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class DrivenVisits(NamedTuple):
 
 
 def driven(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
-    """Observations of a way, columns as `end_to_end.read` gives them, beside the truth at the
+    """Return observations of a way, columns as `end_to_end.read` gives them, with the truth at the
     middle of each.
     """
     vehicle = observations["vehicle"].astype(np.int64)

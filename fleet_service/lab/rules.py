@@ -1,8 +1,8 @@
-"""The rules that people would use instead, each a mean and a variance per cell. Pure, compiled.
+"""Simpler rules for comparison, each a mean and a variance per cell. Pure, compiled.
 
-All of them get what an agent of such a system would send: the *posterior* (m, P) of its own filter,
-which carries what it believed in the cell before. Each lets its variance grow between reports as
-the fusion's own drift does.
+All of them get the reports that an agent of such a system would send: the *posterior* (m, P) of its
+own filter, which carries its belief from the cell before. Each lets its variance grow between
+reports as the fusion's own drift does.
 
     newest report         the last posterior
     inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information

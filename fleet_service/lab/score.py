@@ -1,6 +1,4 @@
-"""How good an answer was: coverage, error, interval score, by the number of excited vehicles.
-Pure.
-"""
+"""Scores of answers: coverage, error, interval score, by the number of excited vehicles. Pure."""
 
 from __future__ import annotations
 
@@ -187,8 +185,8 @@ def by_surface(s: Scores) -> dict[str, float]:
 
 
 def calibration(scores: Sequence[Scores]) -> FloatArray:
-    """P(slippery) in BINS of it: answers, mean of what they give, share of truths that were
-    slippery, (BINS, 3).
+    """Calibration of P(slippery) in BINS of it: answers, mean of the given probabilities, share of
+    truths that were slippery, (BINS, 3).
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU

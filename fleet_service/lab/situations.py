@@ -158,8 +158,8 @@ def _weather(temperature: float) -> Reports:
 
 
 def false_alert(rng: Generator) -> bool:
-    """Whether CARS on winter tyres whom nobody knows, who all take a wet curve gently, make an
-    alert of it.
+    """Return True if CARS unknown vehicles on winter tyres, all gentle in a wet curve, cause an
+    alert there.
     """
     n = CARS
     who = np.arange(CARS)

@@ -1,9 +1,9 @@
 """Value of the map to its users: road-hours known, alerts next to two simpler rules, minutes of
 unnoticed ice. Pure.
 
-Drivers use what a place demands, so that slippery road excites everybody and dry road hardly
-anybody. The service knows its fleet for an hour and a half before it counts. Half of the roads get
-another surface once.
+Drivers use the grip that a place demands, so that slippery road excites every vehicle and dry road
+hardly any. The service knows its fleet for an hour and a half before it counts. Half of the roads
+get another surface once.
 
     d      demand of a pass [g]: log-normal about DEMAND of the kind of place, DEMAND_SPREAD
     s      share of the grip used, min(d/μ, 1); a slip controller works where it is 1
@@ -68,7 +68,7 @@ class Readings(NamedTuple):
 
 
 def drive(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffic:
-    """Let `cars` an hour pass each road, by drivers who use `demand` times what the place
+    """Let `cars` an hour pass each road; drivers use `demand` times the grip that the place
     demands.
     """
     passes = rng.poisson(cars * ROADS * MINUTES / 60.0)

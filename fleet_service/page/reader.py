@@ -1,5 +1,5 @@
-"""Subscriber of the page, with the rights of a reader: receives tiles and alerts, queries what it
-missed, and tracks served regions.
+"""Subscriber of the page, with the rights of a reader: it receives tiles and alerts, queries those
+that it missed, and tracks served regions.
 
 It publishes nothing. If the access list hides tokens, it works without them.
 """

@@ -259,7 +259,7 @@ def replay(
 
 
 def _before(rows: segments.Rows) -> Before:
-    """Return what was used of rows when they were fused first."""
+    """Return lateness and weight of rows as they were used at the first fusion."""
     return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 

@@ -19,7 +19,7 @@ from schemas.numeric import IntArray
 from schemas.wire import Alert
 
 log = logging.getLogger(__name__)
-# Tables of a checkpoint beside those of the fusion.
+# Tables of a checkpoint in addition to those of the fusion.
 ALERTS: Final = "alerts"
 STREAMS: Final = "streams"
 ABOVE: Final = "streams_above"
@@ -35,7 +35,7 @@ class Restart(NamedTuple):
         cut: the last segment it includes; None for none.
         weather: names of the weather files it includes.
         refused: checkpoints that could not be read: damaged, or of another version.
-        beside: additional tables of the checkpoint, as columns.
+        extra_tables: additional tables of the checkpoint, as columns.
     """
 
     fusion: Fusion
@@ -44,12 +44,13 @@ class Restart(NamedTuple):
     cut: Cut | None
     weather: frozenset[str]
     refused: int
-    beside: dict[str, dict[str, IntArray]]
+    extra_tables: dict[str, dict[str, IntArray]]
 
 
-def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
-    """Begin from the archive in a folder; `beside` names additional tables that the service stored
-    with those of `image_of`."""
+def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
+    """Load the initial state from the archive in a folder; `extra_tables` names additional tables that
+    the service stored with those of `image_of`.
+    """
     refused = 0
     for path in checkpoints.newest(root):
         try:
@@ -61,7 +62,7 @@ def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> R
             streams = SequenceTrackers.of(
                 {name: columns[name].to_numpy() for name in columns.column_names}, above
             )
-            extra = {name: tables.pop(name) for name in beside if name in tables}
+            extra = {name: tables.pop(name) for name in extra_tables if name in tables}
             others = {
                 n: {column: t[column].to_numpy() for column in t.column_names}
                 for n, t in extra.items()

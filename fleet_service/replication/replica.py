@@ -174,8 +174,8 @@ class BucketReplica:
         return max(largest_epoch(self._slow.sizes()), largest_epoch(self._files(FOLDERS)))
 
     def prefetch(self) -> None:
-        """Download for a standby, in advance, what a later `join` would, while another service owns
-        the bucket.
+        """Download for a standby, in advance, the files that a later `join` needs, while another
+        service owns the bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete; compaction may remove files meanwhile.

@@ -1,11 +1,12 @@
 """Live hand-over of a region: the active service stops in good order, and its lease goes to a named
 standby.
 
-ask                                      the service
-get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
-watches the tokens                       checkpoint, copied; then as at any stop: flush,
-                                         acknowledge, undeclare lease given free for NAME, which
-                                         takes it, restores, declares
+    client                                   active service
+    get gripmap/v1/shard/SERVICE?to=NAME ──► checks that NAME stands by for its regions, replies
+    watches the tokens                       writes and uploads a checkpoint
+                                             stops as always: flush, acknowledge, undeclare
+                                             releases the lease for NAME
+                                             NAME acquires it, restores the map, declares its token
 """
 
 from __future__ import annotations

@@ -116,8 +116,9 @@ class Writer:
 
 
 def round_to_steps(rows: Rows) -> Rows:
-    """Return rows with floats at multiples of their column's step and times in microseconds: the
-    fusion uses what is stored."""
+    """Return rows with floats at multiples of their column's step and times in microseconds, so
+    that the fusion uses exactly the values that are stored.
+    """
     out = {
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c
         for name, c in rows.items()

@@ -56,7 +56,7 @@ FIRST: Final = frozenset(
 
 
 class DamagedError(Exception):
-    """The file is not what was written."""
+    """The content of the file differs from the content that was written."""
 
 
 def footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -1,11 +1,10 @@
-"""Requests of the archive's owner to the service that runs on it, as files: erasure, which only the
-service may do.
+"""Requests of the archive's owner to the running service, as files. Only the service may erase.
 
     requests/NAME.json           the request: a month, and a vehicle or none
     requests/NAME.answer.json    the result, or the reason of refusal; the request is removed then
 
-Everybody who may write into the archive may make a request. A request outlives the service: the
-next one finds it.
+Write access to the archive is the right to make a request. A request survives a restart of the
+service: the next service finds it.
 """
 
 from __future__ import annotations

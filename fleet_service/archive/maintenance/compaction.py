@@ -6,9 +6,9 @@ A round takes the oldest segments and only adds:
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
-It may die between any two of these steps and need not be finished afterwards. A row of a segment
-counts as compacted if a file of its partition names the segment, so that `reading` sees it once,
-and the next round takes what is left.
+A crash between any two of these steps needs no repair. A row of a segment counts as compacted if a
+file of its partition names the segment. So `reading` sees each row once, and the next round takes
+the remaining rows.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class _AmqpEvents(MessagingHandler):
         self._send()
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
-        """Send what was queued by another thread."""
+        """Send the messages that another thread queued."""
         self._send()
 
     def on_leave(self, _: Any) -> None:  # noqa: ANN401

@@ -35,7 +35,7 @@ class OpenEvent:
         name: of the stretch.
         sequence: number of the event.
         detected, sent: first detection, and time of the last message [ns UTC].
-        state: what the last message said, to see changes.
+        state: content of the last message, compared to detect changes.
         position: latitude and longitude [deg] of the event; stays, so that an update refers to the
             same place.
         ended: [ns UTC], 0 while it lasts.
@@ -187,7 +187,7 @@ class EventBook:
 
 
 def _state(alert: StretchAlert) -> tuple[float, ...]:
-    """Return what a receiver should learn of: extent, sub-cause, and witnesses."""
+    """Return the properties whose change is sent to receivers: extent, sub-cause, and witnesses."""
     return (
         float(alert.cells),
         round(alert.length_m),

@@ -67,7 +67,7 @@ class Witness:
         self._session.close()
 
     def take(self, body: bytes, _: Mapping[str, Any]) -> None:
-        """Publish what a message says about grip."""
+        """Publish the report of grip in a message."""
         try:
             batches = reports(decode(body), self._name, self._boot, self._seq, self._clock())
         except InputError as error:

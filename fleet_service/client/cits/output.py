@@ -81,7 +81,7 @@ class DenmOutput:
     def keep_up(
         self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Send what is due.
+        """Send the messages that are due.
 
         Args:
             standing: every stretch under alert.

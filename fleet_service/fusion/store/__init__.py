@@ -1,3 +1,3 @@
-"""Where a fusion keeps what it knows: records, hash tables and pools that grow. Its layout:
-README.md here. Pure.
+"""State of a fusion in memory: records, hash tables and pools that grow. Layout: README.md here.
+Pure.
 """

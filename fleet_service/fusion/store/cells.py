@@ -1,4 +1,4 @@
-"""The cells by columns, to read; and what is done with their rows."""
+"""The cells by columns for reading, and operations on their rows."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """What is known of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns
-    (n,) of `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4)."""
+    """Stored state of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns
+    (n,) of `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4).
+    """
 
     belief: PackedArray
     key: IntArray
@@ -76,8 +77,8 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """What is known of a slot, from one row to another; not where its window and its reporters
-    lie.
+    """Copy the state of a slot from one row to another, except for the places of its window and its
+    reporters.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]

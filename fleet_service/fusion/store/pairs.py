@@ -1,5 +1,5 @@
-"""What a vehicle reported in a cell before: its linked entries in the window, and the record of
-what is older.
+"""Earlier reports of a vehicle in a cell: its linked entries in the window, and a record of the
+older ones.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 @refcount_free_inlined
 def precedes(entries: RecordArray, a: int, b: int) -> bool:
-    """Whether entry `a` comes before `b`: by time, then by identity."""
+    """Return True if entry `a` comes before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
     if entries[a].number != entries[b].number:
@@ -65,8 +65,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """What an entry reported becomes what its vehicle reported before the checkpoint; later
-    entries stand alone.
+    """Move an entry's report into the record of its vehicle's reports before the checkpoint, and
+    unlink it from later entries.
     """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
@@ -84,14 +84,14 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _stays(pairs: RecordArray, place: int, least: int) -> bool:
-    """Whether a pair reported since `least` [s], or waits in the window."""
+    """Return True if a pair reported since `least` [s], or waits in the window."""
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
 
 
 @compiled
 def count_staying(pairs: RecordArray, least: int) -> int:
-    """How many pairs reported since `least` [s]."""
+    """Count the pairs that reported since `least` [s]."""
     count = 0
     for place in range(len(pairs)):
         count += pairs[place].slot != NONE and _stays(pairs, place, least)
@@ -134,7 +134,7 @@ def returning(number: int) -> np.uint64:
 
 @compiled
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
-    """Note in cells (k,) that vehicles (k,) were there, though what they reported is forgotten."""
+    """Mark in cells (k,) that vehicles (k,) were there, though their reports are forgotten."""
     for k in range(len(slots)):
         slot = slots[k]
         bit = returning(numbers[k])

@@ -44,26 +44,26 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot: one cell and sector that somebody visited. Its belief is a row of its own, see
-    `belief.unpack`.
+    """A slot: one visited cell and sector. Its belief is a row of its own, see `belief.unpack`.
 
     Attributes:
         key: cell · 4 + sector.
         time: last observation that is in the belief [ns]; 0 before the first.
         first: first one [ns].
-        returned: a bit for each remainder of the vehicles whose visits were forgotten, so that who
-            comes back is not counted as another.
+        returned: a bit for each remainder of the vehicles whose visits were forgotten, so that a
+            vehicle that comes back is not counted as another.
         visits: observations.
         vehicles: distinct vehicles.
         values: votes with a value, fractions of repeated ones summed.
         window: row of the slot's window, or NONE.
-        reporters: row of its recent reporters, or NONE where nobody gave a value or corroborated
+        reporters: row of its recent reporters, or NONE if no vehicle gave a value or corroborated
             anything lately.
         aged: time before `time` that the belief has not forgotten yet, in parts of 1/AGED s.
-        used: grip used by who gave values, mean by weight; in parts of 1/USED.
-        shared: relative standard deviation that their values share, likewise; in parts of 1/SHARED.
-        untrusted: bounds and values of vehicles that are not trusted, as far as not renewed; in
-            parts of 1/UNTRUSTED.
+        used: grip used by the vehicles that gave values, mean by weight; in parts of 1/USED.
+        shared: relative standard deviation that their values share, mean by weight; in parts of
+            1/SHARED.
+        untrusted: bounds and values of untrusted vehicles, without those that newer ones replaced;
+            in parts of 1/UNTRUSTED.
         manoeuvres: weight of the values by manoeuvre, see `shared`; in parts of 1/WEIGHT.
     """
 
@@ -84,8 +84,8 @@ class CellRecord:
 
 
 class EntryRecord:
-    """One observation in one cell, younger than the checkpoint. What a commit reads lies in the
-    first line of two.
+    """One observation in one cell, younger than the checkpoint. The fields that a commit reads lie
+    in the first of its two cache lines.
 
     Attributes:
         previous, following: entries of the slot's window, in order of time.
@@ -93,8 +93,8 @@ class EntryRecord:
         pair: place of the pair of slot and vehicle.
         vehicle: index of the vehicle.
         kind: BOUND or VALUE.
-        fresh: whether the vehicle reported nothing here lately.
-        last_mean, last_std, spent: what the vehicle has reported here, this entry included; in
+        fresh: True if the vehicle reported nothing here lately.
+        last_mean, last_std, spent: reports of the vehicle here so far, this entry included; in
             parts of 1/FINE.
         time: end of the visit [ns].
         weight: trust in the vehicle.
@@ -104,10 +104,10 @@ class EntryRecord:
         number, boot, sequence: order entries of equal times: the vehicle's number, its start, the
             row in its stream.
         evidence: likelihood in steps, see `likelihoods.evidence`.
-        used, shared: grip used, and what its value shares with others, in parts of 1/USED and
-            1/SHARED.
+        used, shared: grip used, and the error that its value shares with others, in parts of 1/USED
+            and 1/SHARED.
         manoeuvre: see `shared`.
-        late: whether it came after the checkpoint, and is compared with nobody.
+        late: True if it came after the checkpoint, and is compared with no other vehicle.
         limited: CLAIMED where a slip controller says slippery, HEEDED where the vehicle's flags
             have a good record.
     """
@@ -142,9 +142,10 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The window of a slot: its first and last entry, whether the live row waits to be computed
-    anew, the first entry's time [ns], how many entries are values. A window that is not in use has
-    slot NONE."""
+    """The window of a slot: its first and last entry, a flag that the live row must be computed
+    again, the first entry's time [ns], and the number of entries that are values. A window that is
+    not in use has slot NONE.
+    """
 
     slot: np.int32
     head: np.int32
@@ -155,8 +156,8 @@ class WindowRecord:
 
 
 class PairRecord:
-    """What a vehicle last reported in a cell before the checkpoint. Half a line, so that none lies
-    in two.
+    """Last reports of a vehicle in a cell before the checkpoint. A record is half a cache line
+    long, so that none crosses a line.
 
     Attributes:
         slot, vehicle: whose; a free place has slot NONE.

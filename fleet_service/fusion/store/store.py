@@ -200,9 +200,10 @@ class Store:
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles
-        reported FORGOTTEN_S before it (`votes.discount`), reporters and sources of an hour before
-        it (`trust.compare`, `Fusion.sources`)."""
+        """Drop old records once per hour of the checkpoint: reports of vehicles from FORGOTTEN_S
+        before it (`votes.discount`), and reporters and sources from an hour before it
+        (`trust.compare`, `Fusion.sources`).
+        """
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
             self.hour = hour

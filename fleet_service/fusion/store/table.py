@@ -54,7 +54,7 @@ def _row(held: int) -> int:
 
 @refcount_free_inlined
 def _held(mixed: np.uint64, row: int) -> int:
-    """What a place holds for a key and its row; never NONE."""
+    """Return the content of a place for a key and its row; never NONE."""
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
 
@@ -168,5 +168,5 @@ def places_for(entries: int, most: float) -> int:
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Whether so many entries are more than a share `most` of the places."""
+    """Return True if so many entries are more than a share `most` of the places."""
     return entries > most * places
