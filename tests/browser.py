@@ -29,7 +29,7 @@ def executable() -> str | None:
 
 
 class Opened:
-    """A page that was opened, what it complained of, and what it asked the network for."""
+    """An opened page, its errors, and its network requests."""
 
     def __init__(self, page: Page) -> None:
         self.page = page

@@ -1,5 +1,5 @@
-"""The edge agent as processes: how soon it answers, what a vehicle costs, how many a core
-carries, how jobs scale.
+"""Benchmark of the edge agent as processes: time to the first answer, cost of a vehicle, vehicles
+per core, scaling with jobs.
 """
 
 from __future__ import annotations
@@ -113,9 +113,10 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
 
 
 def watched(pid: int) -> tuple[float, resource.struct_rusage]:
-    """Peak resident memory [MB] of a process, looked at until it ends, and what it used.
+    """Return the peak resident memory [MB] of a process, sampled until it ends, and its resource
+    usage.
 
-    The peak that the system tells at the end counts from the fork on, when the memory was still
+    The peak that the system reports at the end counts from the fork on, when the memory was still
     that of its parent.
     """
     peak = 0.0

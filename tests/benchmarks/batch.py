@@ -1,5 +1,5 @@
-"""`make batch-bench`: what batch work makes of an archive and of drives, beside them; writes
-.batch/figures.json.
+"""`make batch-bench`: batch work on an archive and on drives, compared with the same work done
+directly; writes .batch/figures.json.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measured(folder: Path) -> list[Figure]:
-    """All figures; what is made for them goes into a folder."""
+    """Return all figures; the files made for them go into a folder."""
     logs = spread.drives(folder / "drives")
     return [
         Figure("iceberg.rows_different", iceberg.measured(folder / "iceberg"), "rows", 0.0),

@@ -1,10 +1,10 @@
 """Growth of a stream's cost with its rate: the engine's processor time from 10³ to 10⁵ observations
 a second.
 
-Ten observations to a message, one message a second of each vehicle: more rate is more vehicles, as
-in life. A second of the stream is taken in turns, then comes what a second brings: segment,
-acknowledgements, tiles. The stream's clock is made up, so that a rate which the machine could not
-keep is measured as well. Without the network.
+Ten observations to a message, and one message a second of each vehicle: a higher rate means more
+vehicles, as in life. The engine takes a second of the stream in turns, then does the work of a
+second: segment, acknowledgements, tiles. The stream's clock is simulated, so that rates beyond the
+machine's capacity are measured as well. Without the network.
 """
 
 from __future__ import annotations

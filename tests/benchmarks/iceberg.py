@@ -1,5 +1,5 @@
-"""Rows of an archive beside those of its Iceberg tables; `make batch-bench` counts how many
-differ.
+"""Comparison of the rows of an archive with those of its Iceberg tables; `make batch-bench` counts
+the differences.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Ingest: bytes → decoded, admitted, fused, in a synced Parquet segment, acknowledged; without the
 network.
 
-Every round sends fresh batches of many vehicles to a new archive. The limit beside it is a
-subscriber that does nothing but decode the same messages, with protobuf's own module, into one
-array a column. CPU time beside wall time, because other work on the machine slows the one and not
-the other.
+Every round sends fresh batches of many vehicles to a new archive. The limit for comparison is a
+subscriber that only decodes the same messages, with protobuf's own module, into one array a column.
+CPU time is given with wall time, because other work on the machine slows the one and not the other.
 """
 
 from __future__ import annotations
@@ -42,7 +41,9 @@ ROUNDS: Final = 3
 
 
 def ingest() -> list[Figure]:
-    """Observations per second, ten and one to a message, and CPU beside decoding alone."""
+    """Return observations per second, ten and one to a message, and CPU time compared with decoding
+    alone.
+    """
     ten, bare, own = rates(10)
     one, *_ = rates(1)
     return [

@@ -1,9 +1,9 @@
-"""`make page-bench`: the live page measured, beside MapLibre with the same cells as GeoJSON in the
-same browser.
+"""`make page-bench`: the live page measured, compared with MapLibre with the same cells as GeoJSON
+in the same browser.
 
 Writes `.page/figures.json` and prints the table. Times are of this machine and its software
-renderer: they are worth something beside each other only. Wants Chromium, and npm for MapLibre and
-axe-core; what is missing fails its row.
+renderer: only their ratios are meaningful. Needs Chromium, and npm for MapLibre and axe-core; a row
+whose tool is missing fails.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def opened(address: str) -> Iterator[Opened]:
 
 
 def drawn(on: Stage) -> dict[str, float]:
-    """First picture and frames, ours and MapLibre's in turn; what the page asked of others, and
-    said in errors.
+    """Return first picture and frames, ours and MapLibre's in turn; requests of the page to other
+    hosts, and its errors.
     """
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []

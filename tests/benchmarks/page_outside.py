@@ -141,8 +141,8 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
 
 
 def driven() -> dict[str, float]:
-    """A service, the page and six cars on ice that melts: what the page's publication and its
-    features say.
+    """Return figures of a service, the page and six cars on ice that melts: the page's publication
+    and its features.
 
     `leaked`: cells of situations that the map does not call measured; `unended`: situations that a
     pull finds open when their alert is over; `readers_failed`: of GDAL, geopandas and, where it is

@@ -108,7 +108,7 @@ class Town:
 
 
 class Stage(NamedTuple):
-    """The page's address, a session beside it, the town, the page's process."""
+    """The page's address, a session next to it, the town, the page's process."""
 
     address: str
     session: zenoh.Session

@@ -1,4 +1,4 @@
-"""The map as it was, over Zenoh, and the map after a restart beside the one before."""
+"""The map of a past moment over Zenoh, and the map after a restart compared with the one before."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ _X, _Y = (
 
 
 def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
-    """Visits to cells of the tile, just now: what was used, or ice."""
+    """Return visits to cells of the tile, dated now: grip used, or ice."""
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
     n = len(cell)
@@ -168,11 +168,10 @@ def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
 
 
 def alert_delays_ms(session: zenoh.Session) -> list[float]:
-    """From the second vehicle's publish to the alert of its cell at a subscriber, each far from all
-    others.
+    """Measure the time from the second vehicle's publish to the alert of its cell at a subscriber,
+    each far from all others.
 
-    Alerts of neighbours, and those that are repeated for who was away, are not the one that is
-    waited for.
+    Alerts of neighbours, and alerts repeated for subscribers that were away, do not count.
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
@@ -232,8 +231,8 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
 
 
 def service() -> list[Figure]:
-    """Queries, alerts and acknowledgements under 20 000 observations/s, beside a queryable that
-    does nothing.
+    """Return figures of queries, alerts and acknowledgements under 20 000 observations/s, compared
+    with a queryable that does nothing.
     """
     tile = keys.map_key(_TILE)
     west, south, east, north = (

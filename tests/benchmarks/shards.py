@@ -1,8 +1,8 @@
-"""Two services with a region each beside one with both: a burst until the last of it is
+"""Two services with a region each compared with one with both: a burst until the last of it is
 acknowledged.
 
-Twice: the engines alone, a process each, on messages that lie ready; and whole services over Zenoh,
-where the router and the sender need a share of the same cores, which a fleet's would not.
+Twice: the engines alone, a process each, on messages in memory; and whole services over Zenoh,
+where the router and the sender need a share of the same cores, unlike in a fleet.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Drives and zones that Spark spreads, beside the same ones done here; `make batch-bench` counts
-what differs.
+"""Drives and zones processed by Spark, compared with the same ones processed here; `make
+batch-bench` counts the differences.
 """
 
 from __future__ import annotations

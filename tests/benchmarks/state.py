@@ -1,8 +1,8 @@
-"""A million cells: a checkpoint while ingest goes on, and a restart from it with what came since.
+"""A million cells: a checkpoint while ingest goes on, and a restart from it with the rows since.
 
-The checkpoint is what a restart begins from; it is asked for as the service's upkeep does, beside a
-worker that takes messages all the time. The restart is a process of its own: imports, checkpoint,
-rows since, kernels, session, ready.
+A restart begins from the checkpoint. It is requested as the service's upkeep does, while a worker
+takes messages all the time. The restart is a process of its own: imports, checkpoint, rows since,
+kernels, session, ready.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SECOND: Final = 10**9
 
 
 def state() -> list[Figure]:
-    """A checkpoint of 10^6 cells beside ingest, and a restart from it."""
+    """Return figures of a checkpoint of 10^6 cells during ingest, and of a restart from it."""
     now = START + int(SPAN_S) * SECOND
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

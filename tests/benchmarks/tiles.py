@@ -1,5 +1,5 @@
-"""Thin traffic over many tiles: how long an acknowledgement takes beside them, and a tile behind
-who asks for all.
+"""Thin traffic over many tiles: the delay of an acknowledgement meanwhile, and the age of a tile
+for a client that asks for all of them.
 
 1 600 vehicles, each in a row of five tiles of its own, go back and forth and send a visit each 1.07
 s. Router, service, vehicles and readers are processes of their own.
@@ -96,14 +96,14 @@ class Acks:
                     self.waits[vehicle, seq] = now - self.put[vehicle, seq]
 
     def of(self, since: float) -> list[float]:
-        """Waits of what was put since then; infinite where nothing came."""
+        """Return the waits of batches that were put since then; infinite where nothing came."""
         return [
             self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since
         ]
 
 
 def drive(endpoint: str) -> None:
-    """Send until the time is over, wait for what is not acknowledged, and say how long each
+    """Send until the time is over, wait for the remaining acknowledgements, and print how long each
     took.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))

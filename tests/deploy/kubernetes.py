@@ -351,7 +351,7 @@ def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
 
 @contextmanager
 def cluster(overlay: str, root: Path) -> Iterator[Cluster]:
-    """An overlay that runs, with a bucket beside it where its pods want one."""
+    """Run an overlay, with a bucket next to it if its pods need one."""
     made = Cluster(overlay, root)
     wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""The demo's figures mean what they say."""
+"""The demo's figures are correct on small cases."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The manifests for Kubernetes are what its schemas allow, each reference leads somewhere, and the
-pods' commands run.
+"""The manifests for Kubernetes follow its schemas, every reference resolves, and the pods' commands
+run.
 
-What is started stands in `tests.deploy.kubernetes`. Nothing is applied to a cluster.
+`tests.deploy.kubernetes` starts the commands. Nothing is applied to a cluster.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_network_policies_reach_routers_but_never_services(overlay: str) -> None:
-    """As a cluster applies them: what a pod may do is what any policy that selects it lets it
-    do.
+    """Apply the policies as a cluster does: a pod may do everything that any policy selecting it
+    allows.
     """
     objects = built(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]

@@ -1,5 +1,5 @@
-"""The town that listens: what it hears it does not say again, and its figures mean what they
-say.
+"""The town of listening cars: a listening car does not publish what others sent, and its figures
+are correct.
 """
 
 from __future__ import annotations

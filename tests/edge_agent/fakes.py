@@ -1,6 +1,4 @@
-"""Drives over the ground, made-up estimates and logs for tests of the rim: what it reads,
-nothing of a filter.
-"""
+"""Drives over the ground, made-up estimates and logs for tests of input and output; no filter runs."""
 
 from __future__ import annotations
 

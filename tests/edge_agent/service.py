@@ -58,8 +58,8 @@ class Router:
 
 @dataclass
 class Service:
-    """Keeps what it is sent; acknowledges it when `answer` is set; `refuse(batch)` gives a
-    reason to reject.
+    """A service that keeps the messages it receives; it acknowledges them when `answer` is set;
+    `refuse(batch)` gives a reason to reject.
     """
 
     router: Router

@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it publishes, and one line for what is wrong."""
+"""The command line: files written, messages published, and one line per error."""
 
 from __future__ import annotations
 

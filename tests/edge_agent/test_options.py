@@ -282,8 +282,9 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """Record what a live command passes to the loop: vehicles, names, signals, settings, estimator,
-    duration; and its files."""
+    """Record the arguments that a live command passes to the loop: vehicles, names, signals,
+    settings, estimator, duration; and its files.
+    """
     seen: list[object] = []
 
     def note(
@@ -457,8 +458,8 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     estimator: str, name: str
 ) -> None:
-    """One fifth more of it; `name` is what a vehicle publishes under, and 002 drives every wheel
-    by its own motor.
+    """Increase the number by a fifth; `name` is the name under which a vehicle publishes, and 002
+    drives every wheel by its own motor.
     """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()

@@ -1,11 +1,11 @@
-"""An archive that has grown old: how long a service takes to be ready on it, and what a question
-about the past costs.
+"""Age of an archive: the time until a service is ready on a grown archive, and the cost of a
+question about the past.
 
-20 million observations and 40 million states of six days, made once and kept in `age-archive`
-beside the campaigns' folders. A service begins from Parquet alone, takes a checkpoint, and begins
-from that and the little that came since. Each is measured in a process of its own, by the most
-memory that it ever had. At last one day of it is begun from alone, and with the other days as if
-they were months old: what no longer matters costs nothing.
+20 million observations and 40 million states of six days are made once and kept in `age-archive`
+next to the campaigns' folders. A service begins from Parquet alone, takes a checkpoint, and begins
+from that and the few rows since. Each is measured in a process of its own, by its peak memory.
+Finally a service begins from one day alone, and from that day with the other days dated months
+back: expired days must cost nothing.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _asked_of(root: Path) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _made(site: Site, root: Path, observations: int) -> Path:
-    """An archive, made anew if it is not there in this size."""
+    """Return an archive; make it if it is not there in this size."""
     said = root / "size"
     if said.exists() and said.read_text() == str(observations):
         return root

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Do it, and say what it cost."""
+    """Do the work, and print its cost."""
     what = sys.argv[1]
     root = Path(sys.argv[2])
     began = time.perf_counter()

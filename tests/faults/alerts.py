@@ -1,9 +1,9 @@
 """Watcher behind a router that is restarted: it receives every standing alert soon after the
 session is back.
 
-Two routers, the service behind the one, a watcher behind the other. That one is killed, alerts are
-raised, and it comes back; what was raised meanwhile the watcher must hear, and it hears nothing
-while it is away.
+Two routers, the service behind the one, a watcher behind the other. The watcher's router is killed,
+alerts are raised, and the router comes back. The watcher must receive the alerts raised meanwhile,
+and receives nothing while the router is down.
 """
 
 from __future__ import annotations

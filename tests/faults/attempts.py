@@ -147,7 +147,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Return True if anybody receives what is published there."""
+    """Return True if any listener receives a message that is published there."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.passed(session)

@@ -1,11 +1,11 @@
-"""The service gone for an hour while routers stand and cars drive on; then back, with room for so
-much a second.
+"""The service away for an hour while routers stand and cars drive on; then it comes back, with a
+limited rate.
 
-The cars' outboxes and the service's engine are the real ones; network and time are made up, so that
-an hour takes a minute. A service takes what its queue holds and drops the rest, and acknowledges
-what is on disk twice a second. Each car has its share of what a service of a thousand cars takes:
-20 batches of a second, and 20 places of the queue. Every second it comes to a cell where nobody
-was: all of them must be on the map in the end, the old ones as old news.
+The cars' outboxes and the service's engine are the real ones; network and time are simulated, so
+that an hour takes a minute. A service takes the messages of its queue and drops the rest, and
+acknowledges rows on disk twice a second. Each car has its share of the capacity of a service for a
+thousand cars: 20 batches a second, and 20 places of the queue. Every second it enters a cell that
+no car visited before. In the end all these cells must be on the map, the old ones as late reports.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""One bit changed in a file, of every kind that service and agent keep: it is noticed, or it
-changes nothing.
+"""One bit changed in a file, of every kind that service and agent keep: the change is noticed, or
+it has no effect.
 
-Each time a copy of an archive is damaged and a service begins from it; its map and its rows are
-compared with those of the whole archive, and what differs must have been counted. Spools likewise:
-what an agent sends is what was stored.
+Each time a copy of an archive is damaged and a service begins from it. Its map and its rows are
+compared with those of the whole archive, and every difference must have been counted. The same for
+spools: an agent must send exactly the stored bytes.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _flip(path: Path, random_: random.Random) -> int:
 
 
 def _found(root: Path, whole: Path) -> dict[str, Any]:
-    """Map, rows and what was counted by a service that begins here, and hears every batch again."""
+    """Return map, rows and counters of a service that begins here and receives every batch again."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if root != whole:
@@ -127,7 +127,7 @@ def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
 
 
 def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
-    """Bits of a spool; what was found wrong and not noticed."""
+    """Change bits of a spool; return how often, and the errors that were not noticed."""
     path = site.folder / "whole.sqlite"
     wrong = []
     outbox = Outbox(path, boot=5)

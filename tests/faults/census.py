@@ -101,8 +101,8 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Rows that are there again for who knows nothing of us, and reads the compacted files as
-    they lie.
+    """Count the rows that appear twice for a reader that knows nothing of the format's rules and
+    reads the compacted files directly.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

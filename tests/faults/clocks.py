@@ -103,8 +103,8 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
     seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
-        """All report each second, and send what they sent before once more; then the service
-        does its jobs.
+        """Let all vehicles report each second and send their previous batches once more; then the
+        service does its jobs.
         """
         nonlocal seq
         for _ in range(steps):

@@ -1,9 +1,9 @@
 """`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: services that follow
-each other, again and again, under load: killed, frozen, cut off, amid a compaction, amid of
-copying, with two that wait, and one that wakes.
+each other, again and again, under load: killed, frozen, cut off, during a compaction, during an
+upload, with two standbys, and with one that wakes from a freeze.
 
-At the end each machine, and one that begins with an empty disk, is to hold all that was
-acknowledged, once.
+At the end each machine, and one that begins with an empty disk, must hold all acknowledged rows,
+once.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""`python -m tests.faults.cluster_service …`: `fleet-service`, which says when it compacts and when
-it copies, and does both often, so that a campaign can meet it amid of them. A line that begins and
-none that ends is one that was met."""
+"""`python -m tests.faults.cluster_service …`: `fleet-service` that prints when it compacts and when
+it uploads, and does both often, so that a campaign can interrupt them. A line that begins an
+operation without one that ends it shows an interruption.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ def _say(sign: str, what: str) -> None:
 def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
 ) -> str | None:
-    """As `beside.run`."""
+    """Run a module as `beside.run_module` does."""
     _say(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)
     _say(ENDS, COMPACTING)

@@ -1,8 +1,8 @@
-"""The machines of the cluster campaign: services of one region that follow each other, and how each
-of them goes.
+"""The machines of the cluster campaign: services of one region that follow each other, and the ways
+in which each of them ends.
 
-Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and
-somebody who asks for the map all the time.
+Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and a
+client that asks for the map all the time.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ def loads(folder: Path, endpoint: str, processes: int, vehicles: int, rate: floa
 
 
 class Asking:
-    """Somebody who asks for a box, all the time: what is known of it is told, or that nobody serves
-    it.
+    """A client that asks for a box all the time. A correct answer has everything that is known, or
+    says that no service serves the box.
 
     Attributes:
         whole: answers with all that was known at the beginning.

@@ -1,8 +1,9 @@
-"""A disk that forgets: while it is in use, power can go at any operation of the code under test.
+"""A simulated disk with power loss: while it is in use, power can fail at any operation of the code
+under test.
 
-The files are real and lie in a folder; what the code does with them goes through here (`os.fsync`,
+The files are real and lie in a folder; the code's operations on them go through here (`os.fsync`,
 `os.rename`, `os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`, `shutil.rmtree`). After
-power loss only what was synced is sure: the bytes of a file at its last fsync, and the names in a
+power loss only synced data is certain: the bytes of a file at its last fsync, and the names in a
 folder at its own. Of everything later any part may have reached the disk: of the bytes a prefix,
 with or without rubbish behind, and of the changes of names any that keep the order of each name.
 """
@@ -140,7 +141,7 @@ class CrashDisk:
         return rename
 
     def _moved(self, source: str, target: str) -> None:
-        """A folder gets another name: what is durable in it is so under whichever of the two
+        """Rename a folder: its durable content stays durable under whichever of the two names
         survives.
         """
         for path in [path for path in self._names if f"{path}/".startswith(f"{source}/")]:
@@ -235,7 +236,9 @@ class CrashDisk:
                 )
 
     def _survives(self, synced: bytes | None, written: bytes) -> bytes:
-        """Bytes of a file: the synced ones, or a prefix of what was written since, and rubbish."""
+        """Return the bytes of a file after power loss: the synced ones, or a prefix of those
+        written since, and rubbish.
+        """
         if written == synced:
             return synced
         kept = written[: self._random.randint(0, len(written))]

@@ -1,5 +1,6 @@
-"""A few lives of one archive on a disk that forgets: each but the last ends by a power loss at a
-random operation, and the next one finds what the disk kept."""
+"""A few lives of one archive on a disk with power loss: each but the last ends by a power loss at a
+random operation, and the next one starts from the surviving files.
+"""
 
 from __future__ import annotations
 

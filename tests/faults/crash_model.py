@@ -1,11 +1,12 @@
-"""Histories on a disk that forgets: power lost at any operation, torn writes, a full disk.
+"""Histories on a disk with power loss: power lost at any operation, torn writes, a full disk.
 
-Of the log and its compaction here, thousands; of the agent's outbox in `crash_spool`; of a whole
-service with its keys, checkpoints, weather, retention and forgetting in `crash_service`.
+Thousands of histories of the log and its compaction are here; `crash_spool` has those of the
+agent's outbox, `crash_service` those of a whole service with its keys, checkpoints, weather,
+retention and forgetting.
 
 A history of the log is a few lives of one archive. In each, batches are let in, segments written,
-compacted; then the power goes at a random operation, and the next life finds what the disk kept.
-What was acknowledged must be there, each row once, and a batch may only count as held if it is. In
+compacted; then the power fails at a random operation, and the next life starts from the surviving
+files. Acknowledged rows must be there, each once, and a batch may only count as held if it is. In
 the last life everything that was not acknowledged is sent again.
 """
 

@@ -1,12 +1,12 @@
-"""Histories of a whole service on a disk that forgets: keys, log, compaction, roll-ups,
+"""Histories of a whole service on a disk with power loss: keys, log, compaction, roll-ups,
 checkpoints, snapshots, weather, retention and forgetting.
 
 A history is a few lives of one archive, days apart. In each the engine takes batches and weather,
-and what its upkeep does is done in any order; between two lives somebody may have a vehicle's month
-forgotten, or the whole month. The power goes at a random operation. What the next life finds must
-hold what was acknowledged, each row once, and all weather that acted; it must know a batch again if
-and only if it holds it; the map from a checkpoint and the log is the map from the log alone; no
-compacted file is damaged; and what was forgotten does not come back.
+and the jobs of its upkeep run in any order. Between two lives an operator may have a vehicle's
+month forgotten, or the whole month. The power fails at a random operation. The next life must find
+all acknowledged rows, each once, and all weather that acted. It must know a batch again if and only
+if it holds it. The map from a checkpoint and the log equals the map from the log alone, no
+compacted file is damaged, and forgotten rows do not come back.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class ServiceHistory(Lives[Sent]):
     """A history of a service.
 
     Attributes:
-        done: what was done before a power loss, to its end.
+        done: operations that were completed before a power loss.
     """
 
     lives = 4

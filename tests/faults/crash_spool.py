@@ -1,9 +1,9 @@
 """Histories of the agent's outbox: power lost at any byte that SQLite had not yet synced.
 
-SQLite writes by itself, so its files are looked at from outside: before and after each commit. When
-a commit has returned its bytes are synced; what power loss leaves in the middle of the next one is
-the old files with a part of the new log, or, when the log was folded into the database, any mixture
-of old and new pages beside the old log.
+SQLite writes by itself, so its files are observed from outside: before and after each commit. When
+a commit has returned, its bytes are synced. Power loss in the middle of the next one leaves the old
+files with a part of the new log. If the log was being folded into the database, it leaves any
+mixture of old and new pages, with the old log.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """A real small file system that is full: a service and an agent's outbox on it, load going on, then
 room again.
 
-Where this process may mount, it is a tmpfs of some megabytes; elsewhere every call by which log,
-upkeep and outbox make or move a file fails with ENOSPC. While it is full nothing may be
-acknowledged that is not there, jobs go on in turn, and with room again everything is acknowledged
-and nothing hangs. At last it is full with days that retention removes, and whose roll-ups are to be
-made before: what was set aside is room enough for that.
+Where this process may mount, it is a tmpfs of some megabytes. Elsewhere every call by which log,
+upkeep and outbox make or move a file fails with ENOSPC. While it is full, only stored rows may be
+acknowledged and jobs go on in turn; with room again, everything is acknowledged and nothing hangs.
+Finally it is full with days that retention removes and whose roll-ups must be made before: the
+reserved space is enough for that.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def _until_settled(engine: Engine) -> int:
 
 
 def _until_done(engine: Engine) -> int:
-    """Wait until each job has gone well once, with room again; returns what was acknowledged
+    """Wait, with room again, until each job has succeeded once; return the rows acknowledged
     meanwhile.
     """
     got = 0
@@ -214,7 +214,7 @@ def _room_made(engine: Engine, folder: Path) -> int:
 
 
 def _outbox_recovers(folder: Path, mounted: bool) -> bool:
-    """An outbox refuses what it has no room for, keeps what it took, and goes on."""
+    """Return True if an outbox refuses messages without room, keeps the accepted ones, and goes on."""
     outbox = Outbox(folder / "spool.sqlite", boot=5)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))
     took = len(outbox.store([draft], 0.0))

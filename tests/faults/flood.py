@@ -1,9 +1,9 @@
-"""One vehicle sends as fast as it can, and the others go on: how long they wait, and what it does
-to the map.
+"""One vehicle sends as fast as it can while the others go on: their waiting time, and the effect on
+the map.
 
-What it sends is true, so that it should count as one vehicle that sent it once a second. The map
-with the flood is held against one that an engine without a network makes of the same honest batches
-and that.
+Its reports are true, so that it should count as one vehicle that sent once a second. The map with
+the flood is compared with one that an engine without a network makes of the same honest batches and
+one report a second of that vehicle.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def hash_of(name: str) -> int:
 
 @dataclass
 class Honest:
-    """An honest vehicle: sends, sends again what is not settled, and notes how long each took."""
+    """An honest vehicle: it sends, repeats unsettled batches, and records how long each took."""
 
     session: zenoh.Session
     name: str

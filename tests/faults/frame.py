@@ -2,13 +2,13 @@
 of its own.
 
 A campaign is a function from a `Site` to figures. One with a bar is made by `bars.figure(name,
-value)`; what only tells how hard it was (kills, rates) is a `Figure` without a bar. To add one:
-write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and name it in
-`campaigns.py` with the figures that it owes.
+value)`; a figure that only describes the load (kills, rates) is a `Figure` without a bar. To add
+one: write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and name it in
+`campaigns.py` with the figures that it must give.
 
-`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A figure that is owed and
-not given fails. A campaign that raises ends the run with its traceback: what it measured is not
-known.
+`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A required figure that is
+missing fails. A campaign that raises ends the run with its traceback, because its measurements are
+unknown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Malformed messages and queries among honest ones, through the whole engine: admission, fusion,
 archive, answers.
 
-The oracle knows nothing of the service's own rules: it looks at the archive, where every value must
-be finite or absent and within what the units allow, and where every honest row must lie once.
+The oracle knows nothing of the service's own rules. It reads the archive, where every value must be
+finite or absent and within the physical limits of its unit, and where every honest row must be
+exactly once.
 """
 
 from __future__ import annotations

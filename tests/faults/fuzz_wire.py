@@ -1,10 +1,10 @@
 """Malformed messages, weather, questions and acknowledgements through a real router, into a service
 and vehicles.
 
-What `fuzz` hands to the engine in its own process goes the whole way here: Zenoh's threads, the
-bounded queue, what a vehicle may send, the queryables, the worker's turns. Vehicles report amid it
-through the agent's publisher and outbox. No acknowledgement that is put here can be read: a forged
-one is what certificates are for (`security`).
+The inputs that `fuzz` hands to the engine in its own process go the whole way here: Zenoh's
+threads, the bounded queue, the limits of a vehicle, the queryables, the worker's turns. Meanwhile
+vehicles report through the agent's publisher and outbox. None of the acknowledgements sent here can
+be decoded: certificates protect from forged ones (`security`).
 """
 
 from __future__ import annotations

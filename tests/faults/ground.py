@@ -1,10 +1,10 @@
-"""The ground of the attacks: two routers with TLS and access list, a running service, honest
+"""The stage of the attacks: two routers with TLS and access list, a running service, honest
 parties, listeners.
 
-Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a
-marker which is put after an attack has gone through, and is heard, shows that nothing of the attack
-is still to come. What has reached the service waits there for its worker, which takes it in order:
-only a later batch that is acknowledged shows that it was judged and counted.
+No step waits by sleeping. Samples of one priority keep their order on each way. So a marker that is
+put after an attack, and received, shows that nothing of the attack is still under way. Messages
+that reached the service wait there for its worker, which takes them in order: only a later batch
+that is acknowledged shows that they were judged and counted.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class Ground:
         self.drive()
 
     def passed(self, session: zenoh.Session, *listeners: Listener) -> None:
-        """Return when everything that `session` did has gone through and the listeners heard
-        what it brought.
+        """Return when everything that `session` did has gone through and the listeners received its
+        effects.
         """
         list(session.get(f"{keys.ROOT}/map/**"))
         self._marks += 1

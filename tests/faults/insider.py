@@ -1,10 +1,11 @@
-"""One enrolled car that does all that a valid car may, for a made-up hour, beside ten honest ones
+"""One enrolled car that does all that a valid car may, for a simulated hour, with ten honest ones
 on their road.
 
 It sends as much as its limit lets through: visits all over a region and the world, a boot for each
 batch, JSON, batches with a foot in another month, its own reports again, as they were and under
-other numbers, and ice on a road that is its own. What questions cost is in `queries`. Engine,
-limits and archive are the service's; only time is made up. What it did is a figure too.
+other numbers, and ice on a road that is its own. The cost of questions is measured in `queries`.
+Engine, limits and archive are the service's; only time is simulated. The amount of its actions is a
+figure too.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
-    """The next of what it may do, in turn."""
+    """Return the next of its permitted messages, in turn."""
     seq = number + 1
     what = number % 6
     if what == 0:  # places all over the region

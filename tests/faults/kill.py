@@ -162,8 +162,8 @@ def map_difference(archive: Path) -> float:
 
 
 def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tuple[Census, Load]:
-    """One round: what became of it, and what was offered from when all had started until the
-    drain.
+    """Run one round; return its census, and the load offered from the start of all processes until
+    the drain.
     """
     for number in range(agents):
         there.load([f"sim-{number:03}"], RATE, seed=number).start()

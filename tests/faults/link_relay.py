@@ -40,7 +40,7 @@ class LinkTerms:
         loss: share of packets that are lost.
         delay_s: one way.
         bytes_per_s: rate; 0 for no limit.
-        queue_bytes: length of the queue in front of the rate; what does not fit is lost.
+        queue_bytes: length of the queue in front of the rate; packets that do not fit are lost.
         drop_udp: True where a network blocks UDP.
         seed: of the losses.
     """

@@ -1,5 +1,5 @@
 """Load: observations of made-up visits through the agent's real publisher and outbox, with a
-journal of what is safe.
+journal of stored and settled batches.
 
 `python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its
 standard output: one line per batch that was committed to the outbox, and one per batch that an
@@ -50,8 +50,8 @@ class Plan:
 
 
 def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
-    """Tell `+ vehicle boot kind region seq records time` of what is on disk, `- …` of what is
-    settled.
+    """Print `+ vehicle boot kind region seq records time` for each batch on disk, `- …` for each
+    settled one.
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:

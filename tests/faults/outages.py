@@ -76,8 +76,8 @@ def frozen(site: Site) -> list[Figure]:
 
 
 def leaving(site: Site) -> list[Figure]:
-    """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone
-    soon, and lose nothing.
+    """Send SIGTERM with a running router and with a frozen one: agent and service end soon, and
+    lose nothing.
     """
     longest = 0.0
     lost = 0

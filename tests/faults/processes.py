@@ -1,9 +1,9 @@
 """Router, service and load as processes of their own: started, killed, frozen and stopped by a
 campaign.
 
-What they print goes through a pipe to `folder/NAME.log`, one file over all starts: what a process
-printed before it was killed is there, and a limit on its files does not limit its log. A router
-keeps its port over restarts.
+Their output goes through a pipe to `folder/NAME.log`, one file over all starts. So lines that a
+process printed before it was killed are there, and a limit on its files does not limit its log. A
+router keeps its port over restarts.
 """
 
 from __future__ import annotations
@@ -166,9 +166,9 @@ class Stage:
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:
-        """No new observations; wait until every generator has all of its batches settled.
+        """Stop new observations; wait until every generator has all of its batches settled.
 
-        Ends before if none settles anything for `patience_s`: what is left in an outbox then is
+        Ends before if none settles anything for `patience_s`: batches left in an outbox then are
         missing in the archive, and counted there.
         """
         for part in self.loads:

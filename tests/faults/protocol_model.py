@@ -283,7 +283,7 @@ def _tick(world: World, slow: int, rules: Rules) -> World:
 
 
 def _gone(one: Service) -> Service:
-    """Return a service that serves no more; what the network still holds of it may land."""
+    """Return a service that serves no more; messages of it that the network still holds may land."""
     return Service("gone", one.number, age=0, sending=one.sending)
 
 

@@ -1,10 +1,10 @@
 """`python -m tests.faults.rogue`: a session of any mode in a process of its own, for attacks that
 may break its sender.
 
-Reads one line of JSON: settings, name, what to hear, what to put where. Prints a line when that has
-gone out; at the next line it asks for the map, so that what it was to hear has come, and prints the
-keys that it heard. It ends without closing: a Zenoh session that plays router may abort its own
-process when it closes.
+Reads one line of JSON: settings, name, keys to subscribe to, messages to put. Prints a line when
+the messages have gone out. At the next line it asks for the map, so that all expected messages have
+arrived, and prints the keys that it received. It ends without closing: a Zenoh session in router
+mode may abort its own process when it closes.
 """
 
 from __future__ import annotations

@@ -49,8 +49,8 @@ def handles(part: Part) -> int:
 
 
 def slope(times: FloatArray, megabytes: FloatArray) -> float:
-    """Growth of what a process never gives back [MB per 10 min]: a line through the least of each
-    minute.
+    """Return the growth of a process's permanent memory [MB per 10 min]: a line through the least
+    of each minute.
 
     Within a minute it takes and gives back: a segment, a compaction, a query.
     """

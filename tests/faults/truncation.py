@@ -1,9 +1,9 @@
-"""The newest segment cut, and any of its bytes changed, at every place: what is acknowledged and
-what is held agree.
+"""The newest segment cut, and any of its bytes changed, at every place: acknowledged and held
+batches agree.
 
-The newest segment is one that was written and not yet acknowledged when the power went: its rows
-may go, those of the older segments may not. A batch that is not held must be new to the service
-when its vehicle sends it again.
+The newest segment is one that was written and not yet acknowledged when the power failed: its rows
+may be lost, those of the older segments may not. A batch that is not held must be new to the
+service when its vehicle sends it again.
 """
 
 from __future__ import annotations

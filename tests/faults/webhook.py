@@ -1,8 +1,8 @@
 """Broken receivers of a webhook: every alert arrives, waits in the queue, or is counted as lost.
 
 Each kind of receiver is broken for its first connections and then sound. Two kinds never recover. A
-receiver keeps the ids of the alerts that it confirmed, which is the oracle; the sender's own
-counters only tell what it admits.
+receiver keeps the ids of the alerts that it confirmed; this is the oracle, because the sender's own
+counters only show the losses that it noticed.
 """
 
 from __future__ import annotations

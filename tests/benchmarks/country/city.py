@@ -1,5 +1,5 @@
-"""A city: vehicles with the default estimator on SUMO's routes, their observations fused beside
-the truth.
+"""A city: vehicles with the default estimator on SUMO's routes, their observations fused and
+compared with the truth.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Memory cost per vehicle, per cell, and per cell of a vehicle, with an engine in a process of its
 own.
 
-The same number of observations goes through it each time, as do the same messages but for what is
-varied, so that the window of late observations is alike.
+The same number of observations goes through it each time, in messages that are equal except for the
+varied quantity, so that the window of late observations has the same size.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Take the stream of that kind, and print what it added."""
+    """Ingest the stream of that kind, and print the memory that it added."""
     sent = _stream(kind)
     with (
         tempfile.TemporaryDirectory() as folder,

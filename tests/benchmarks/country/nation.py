@@ -207,7 +207,9 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
 
 
 def _least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Memory of each process but the last now, or what it was before, if that was less."""
+    """Return the memory of each process but the last: its memory now, or the earlier one if that
+    was less.
+    """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
 

@@ -20,7 +20,7 @@ NEW_PLACES: Final = 1.0
 
 
 def million(found: Mapping[str, float]) -> list[Figure]:
-    """A million vehicles at the country's rate each, from what was measured."""
+    """Return the estimate for a million vehicles at the country's rate each, from measured figures."""
     rate = FACTOR * found["country.rate"]
     cells = FACTOR * found["country.cells"]
     cores = rate * found["country.service_us"] * 1e-6

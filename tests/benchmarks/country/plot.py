@@ -15,7 +15,7 @@ COLOURS: Final = ("#0072b2", "#d55e00", "#009e73")
 
 
 def draw(course: Path, out: Path) -> None:
-    """Draw what the course left in its folder."""
+    """Draw the files of a finished course."""
     with np.load(course / "course.npz") as looks, np.load(course / "waits.npz") as waits:
         time_s = looks["time"]
         memory = looks["memory"]

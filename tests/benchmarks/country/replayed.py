@@ -1,4 +1,4 @@
-"""A country of copies of one town: where its vehicles are, and what each of them reports when.
+"""A country of copies of one town: positions of its vehicles, and the reports of each over time.
 
     regions    17, 17 and 16 in three zones side by side, a service for each zone
     towns      four in a region; regions are unlike in size, as 1/sqrt(rank)
@@ -6,8 +6,8 @@
                it again and again; those of one town with one drive are spread evenly over it
     reports    each sends ROWS visits every PERIOD_S, in turn; they take that long: traffic is slow
 
-The same for who sends it and for who looks at it; nothing but the seed and the city's observations
-is needed.
+The sender and the observer compute the same country from the seed and the city's observations
+alone.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Chunk(NamedTuple):
         message: its batch, all but who, where and when.
         x, y: of the positions, columns and rows of cells from the north-western tile of the town,
             with their fractions.
-        cell_x, cell_y: of the cells that were named, likewise.
+        cell_x, cell_y: of the cells that were named, counted in the same way.
         enter, leave: before the last, as a share of the time that all of them took.
     """
 
@@ -111,7 +111,7 @@ class Country:
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
     def batch(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
-        """Key and bytes of what a vehicle reports in its turn, just now."""
+        """Return key and bytes of a vehicle's report in its turn, dated now."""
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
         k = int(self.region[vehicle])

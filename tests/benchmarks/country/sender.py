@@ -1,5 +1,5 @@
-"""The country's vehicles: a process that sends what they report, and knows how long each batch
-waited for its ack.
+"""The country's vehicles: a process that sends their reports, and records how long each batch
+waited for its acknowledgement.
 """
 
 from __future__ import annotations

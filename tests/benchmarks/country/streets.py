@@ -1,9 +1,8 @@
 """SUMO's traffic as lanes for our own plant: each vehicle has a lane of its own, with the speeds
 that it had there.
 
-SUMO gives routes and speeds, no more: what the tyres do on the way is the plant's. A driver keeps
-SUMO's speed where he believes the road dry, and less where he does not; where SUMO has him wait, he
-creeps.
+SUMO gives only routes and speeds; the plant simulates the tyres. A driver keeps SUMO's speed where
+he believes the road dry, and drives slower elsewhere; where SUMO lets him wait, he creeps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Roads for the tests of what lies ahead: straight lines of known cells near Gothenburg."""
+"""Roads for the tests of the road ahead: straight lines of known cells near Gothenburg."""
 
 from __future__ import annotations
 

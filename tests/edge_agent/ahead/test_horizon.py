@@ -83,7 +83,9 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
 def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
-    """A navigation system leaves out what has been driven: the next corner may be the beginning."""
+    """A navigation system leaves out the part already driven, so the next corner may be the
+    beginning.
+    """
     path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
     assert path is not None
     assert len(path.distance) in (299, 300)
@@ -224,8 +226,8 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
-    """It has heard only of what it asked for, and what lies behind that it must ask for before
-    it comes there.
+    """The car receives only the boxes that it asked for, so it must ask for a box before it
+    arrives.
     """
     road = keys_on(1500.0)
     cache = LocalMap()

@@ -36,7 +36,7 @@ DAY = 86_400 * NS
 
 
 class Driving:
-    """A car at the beginning of a road, at 14 m/s by what it says, that looks ahead along it."""
+    """A car at the beginning of a road that reports 14 m/s and looks ahead along the road."""
 
     def __init__(self, router: Router) -> None:
         self.metre = 0.0
@@ -57,7 +57,7 @@ class Driving:
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Keep saying where it is until what lies ahead is as wanted."""
+        """Report its position until the outlook meets the condition."""
 
         def there() -> bool:
             self.be()

@@ -1,5 +1,5 @@
-"""The map as a prior: expected at entry, gone again when it is wrong, and never in what is
-published.
+"""The map as a prior: expected at entry, dropped when it is wrong, and never part of a published
+report.
 """
 
 from __future__ import annotations

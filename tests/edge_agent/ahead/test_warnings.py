@@ -108,7 +108,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
-    """Ice fades on the map, before its alert ends: what was a value is a bound then."""
+    """Ice fades on the map before its alert ends: the former value is only a bound then."""
     cache = told([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
         cache.alert(alert(key, time=NOW - NS), NOW)

@@ -1,4 +1,4 @@
-"""Many recorded drives: each to its own file, several at a time, a bad one beside good ones."""
+"""Many recorded drives: each to its own file, several at a time, a bad one among good ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DRIVES = 3
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of drives, each with its vehicle file beside it."""
+    """A folder of drives, each with its vehicle file next to it."""
     folder = tmp_path_factory.mktemp("drives")
     for seed in range(DRIVES):
         files = [

@@ -1,4 +1,4 @@
-"""Reports of a drive: what is drawn is what was estimated, and what nobody knows has no colour."""
+"""Reports of a drive: the picture shows the estimates, and unknown values have no colour."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ RATE = 50.0
 
 
 class Basket:
-    """Takes what the loop offers."""
+    """A receiver of everything that the loop offers."""
 
     broken = False
 

@@ -1,4 +1,4 @@
-"""An agent as its operator sees it: what was sent and settled, what waits, whether it keeps up."""
+"""Metrics of an agent for its operator: reports sent, settled and waiting, and its lag."""
 
 from __future__ import annotations
 

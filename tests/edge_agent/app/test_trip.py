@@ -1,5 +1,5 @@
-"""A live trip: nothing is published before the doctor has passed, and what a trip teaches holds
-in the next.
+"""A live trip: nothing is published before the doctor has passed, and the next trip uses the
+calibration that this one learned.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Calibration: what was put into a simulated car's devices comes out of its drives, and mends
-them.
-"""
+"""Calibration: errors put into a simulated car's devices are found from its drives and corrected."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Every constant of the default's table moves what it is for, in the direction and by the size
-that its reason says.
+"""Every constant of the default's table moves the quantity that it is for, in the direction and by
+the size that its reason states.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
 
 
 def reported(estimates: Estimates) -> dict[str, float]:
-    """Figures of what is reported of one drive."""
+    """Return figures of the reports of one drive."""
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,
         "lower": estimates.mu_lower,
@@ -316,7 +316,7 @@ def inside(filters: np.ndarray) -> dict[str, float]:
 
 
 def known(values: FloatArray, where: FloatArray) -> float:
-    """Mean of what is told, 0 of none."""
+    """Return the mean of the reported values, 0 without any."""
     there = np.isfinite(where)
     return float(values[there].mean()) if there.any() else 0.0
 

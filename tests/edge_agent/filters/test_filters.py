@@ -207,7 +207,7 @@ def swing(x: FloatArray) -> FloatArray:
 
 
 def look(x: FloatArray) -> FloatArray:
-    """What is seen of it: its shadow, and its rate times its height."""
+    """Return the measurement: its shadow, and its rate times its height."""
     return np.stack([np.sin(x[:, 0]), x[:, 1] * np.cos(x[:, 0])], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Context signals: each kind of source fills them, old logs stay as they were, and what is too
+"""Context signals: each kind of source fills them, old logs stay unchanged, and a value that is too
 old is unknown.
 """
 
@@ -102,7 +102,7 @@ def frames_of(name: str) -> list[can.Message]:
 
 
 def imported(path: Path, profile: Profile, out: Path) -> SignalLog:
-    """A source as a log, without the checks of what an estimator needs."""
+    """Import a source as a log, without checking the signals that an estimator needs."""
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
     merged = merge(
         [read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0
@@ -118,7 +118,7 @@ def imported(path: Path, profile: Profile, out: Path) -> SignalLog:
 
 
 def assert_filled(log: SignalLog) -> None:
-    """All context is there, and is what was true."""
+    """Assert that all context is there and has its true values."""
     assert log.context is not None
     assert len(log.t) > 500
     assert (np.isfinite(log.context).mean(axis=0) >= ENOUGH).all(), np.isfinite(log.context).mean(

@@ -1,5 +1,5 @@
-"""Live sources: what they send comes in, on one clock; what they lose is told, and nothing falls
-over.
+"""Live sources: their readings arrive on one clock, losses are reported, and no error ends the
+program.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Live rows: one clock for all sources, linear between readings, late fixes moved, lost sources
-opened anew.
+opened again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Steered(HostClock):
 
 
 class Scripted(Feed):
-    """A source that says what it is told to say."""
+    """A source that delivers a given script of readings."""
 
     def listen(self) -> None:
         self.stopping.wait()

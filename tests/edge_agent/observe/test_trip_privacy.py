@@ -1,4 +1,4 @@
-"""Trip ends: nothing is told of where a trip began and ended, and everything of what lies
+"""Trip ends: nothing is published about the places where a trip began and ended, and everything in
 between.
 """
 

@@ -1,4 +1,4 @@
-"""A damaged spool: set aside, what is readable saved, the car goes on, and it is counted."""
+"""A damaged spool is set aside and counted, its readable rows are saved, and the car goes on."""
 
 from __future__ import annotations
 

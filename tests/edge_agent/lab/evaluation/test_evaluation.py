@@ -1,5 +1,5 @@
-"""The campaign: names and bars as asked, measures that mean what they say, a report made from
-figures alone.
+"""The campaign: all names and bars exist, measures are correct on small cases, and the report is
+made from figures alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plots state what they show, and an estimator has one colour in all of them."""
+"""Plots state their content, and an estimator has one colour in all of them."""
 
 from __future__ import annotations
 

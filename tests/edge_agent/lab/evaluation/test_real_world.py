@@ -1,4 +1,4 @@
-"""The rough world's figures mean what they say, on seeds that nobody tunes on."""
+"""The rough world's figures are correct, on seeds that are not used for tuning."""
 
 from __future__ import annotations
 

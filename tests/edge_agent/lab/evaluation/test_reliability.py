@@ -1,5 +1,5 @@
-"""Reliability and consistency mean what they say: on answers whose error is known, and on the
-banks themselves.
+"""Reliability and consistency are correct on answers whose error is known, and on the banks
+themselves.
 """
 
 from __future__ import annotations

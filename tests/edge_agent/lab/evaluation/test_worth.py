@@ -1,4 +1,6 @@
-"""What fuzzy inference and the ants bring is measured on drives that nobody tuned on."""
+"""Benefit of fuzzy inference and of the ant colony, measured on drives that are not used for
+tuning.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Manoeuvres: each drives, tells what it should of the road, and is the same twice."""
+"""Manoeuvres: each drives, excites the tyres as intended, and is reproducible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roads and friction: geometry, that one can drive for ever, and what lies where and when."""
+"""Roads and friction: geometry, endless driving, and the surface at every place and time."""
 
 from __future__ import annotations
 

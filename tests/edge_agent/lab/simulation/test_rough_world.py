@@ -1,5 +1,5 @@
-"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then what the
-sensors make of it.
+"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then the readings of
+the sensors.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def column(log: pa.Table, name: str) -> FloatArray:
 
 
 def sine(slope: float) -> float:
-    """Of the angle whose tangent is the slope."""
+    """Return the sine of the angle whose tangent is the slope."""
     return slope / float(np.hypot(1.0, slope))
 
 

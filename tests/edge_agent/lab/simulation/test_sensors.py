@@ -1,4 +1,4 @@
-"""Sensors: what they add to the truth is what their table says."""
+"""Sensors: the errors that they add to the truth are those of their table."""
 
 from __future__ import annotations
 

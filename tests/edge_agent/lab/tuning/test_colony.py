@@ -1,6 +1,4 @@
-"""The colony as a search: its equations, its bounds, and whether it is worth its name beside
-chance.
-"""
+"""The colony as a search: its equations, its bounds, and its result compared with random search."""
 
 from collections.abc import Callable
 

@@ -246,7 +246,7 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
-    """Without a truth: what is measured next judges, on the last third of the recordings."""
+    """Without a truth, the next measurement judges, on the last third of the recordings."""
     logs = []
     found = []
     for name, seed in (("one", "1"), ("two", "2")):
