@@ -4,8 +4,7 @@
     log, vehicle = edge_agent.read_log("drive.parquet"), edge_agent.load_vehicle("drive.json")
     print(edge_agent.estimate(log, vehicle).to_pandas()[["t", "mu", "mu_lower", "mu_upper"]])
 
-The names of `__all__` are what other programs may rely on; they are loaded when they are first
-asked for.
+The names of `__all__` are the public interface; each is loaded on first access.
 """
 
 from __future__ import annotations

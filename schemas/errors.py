@@ -15,8 +15,8 @@ class InputError(ValueError):
 
     Args:
         field: the name of the field, column, option or file that is wrong.
-        problem: what is wrong with it.
-        fix: what to do about it.
+        problem: the fault.
+        fix: how to correct it.
     """
 
     def __init__(self, field: str, problem: str, fix: str) -> None:

@@ -1,14 +1,14 @@
-"""The fixed friction grid, and what a log-likelihood on it means.
+"""The fixed friction grid, and the meaning of a log-likelihood on it.
 
 Legend
     μ        peak tyre–road adhesion coefficient                      [-]
     EDGES    borders of the 32 equal bins on [0.05, 1.20]             (33,)
     CENTRES  middles of the bins                                      (32,)
-    PRIOR    what is believed of a road nobody has measured: uniform  (32,)
+    PRIOR    belief for a road that was never measured: uniform       (32,)
     ℓ        log p(a visit's measurements | μ), up to a constant      (…, 32), nats
 
-A log-likelihood travels as 32 bytes: steps of 1/16 nat below the maximum, floored at 255 steps.
-A flat one (all zeros) means that nothing was learned.
+A log-likelihood travels as 32 bytes: steps of 1/16 nat below the maximum, floored at 255 steps. A
+flat one (all zeros) means that nothing was learned.
 """
 
 from __future__ import annotations

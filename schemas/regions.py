@@ -1,4 +1,5 @@
-"""Regions as key expressions, what lies along a route, and what of it nobody serves. Pure.
+"""Regions as key expressions, the regions along a route, and the parts that no service serves.
+Pure.
 
 A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` is all of a chunk.
 """
@@ -25,14 +26,14 @@ Box = tuple[float, float, float, float]
 
 
 def overlap(one: str, other: str) -> bool:
-    """Whether two expressions have a region in common."""
+    """Return True if two expressions have a region in common."""
     return all(
         a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
     )
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Whether an expression has all regions of another."""
+    """Return True if an expression has all regions of another."""
     return all(a in (b, "*") for a, b in zip(wide.split("/"), narrow.split("/"), strict=True))
 
 
@@ -42,8 +43,8 @@ def region_of(tile: int) -> str:
 
 
 def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
-    """Expressions of what a question is about and nobody serves; as few as there are. Of a question
-    without a place that is what lies within no service's region at all.
+    """Return the fewest expressions that cover the unserved part of a question. For a question
+    without a place, that is the area outside every service's region.
 
     Raises:
         InputError: the route is too long.
@@ -74,7 +75,7 @@ def _without(
 
 
 class Rank:
-    """Places by when a route passes them; what it does not pass comes last."""
+    """Places in the order in which a route passes them; places off the route come last."""
 
     def __init__(self, route: Sequence[tuple[float, float]]) -> None:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}

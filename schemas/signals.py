@@ -1,4 +1,4 @@
-"""The signals of a vehicle: names, order in an array, units, and what may be wrong with them.
+"""The signals of a vehicle: names, order in an array, units, and health flags.
 
 A block of signals is a float array (T, N, len(CHANNELS)) for T samples of N vehicles; NaN is a
 missing reading. Axes are ISO 8855: x forward, y left, z up; yaw, steering and lateral quantities
@@ -78,7 +78,7 @@ class S(IntEnum):
 
 
 class Health(IntFlag):
-    """What limits an estimate; flags add up, 0 is sound."""
+    """Flags that limit an estimate; flags add up, 0 is sound."""
 
     OK = 0
     NO_TORQUE = 1  # wheel torque missing: longitudinal force from the accelerometer alone

@@ -1,4 +1,4 @@
-"""How fast one may go and still stop within what one sees. Pure."""
+"""The highest speed at which a vehicle can stop within its sight distance. Pure."""
 
 from __future__ import annotations
 

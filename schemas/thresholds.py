@@ -1,4 +1,4 @@
-"""Numbers that more than one room must agree on; each stands here and nowhere else.
+"""Numbers that more than one room must agree on; each is defined only here.
 
 EXCITED_SHARE       share of μ that must be used for a reading of μ to be more than a lower bound
                     (contract)
@@ -12,8 +12,8 @@ Z_95                95 % quantile of the standard normal: half a 90 % interval i
 GRAVITY             [m/s²], rounded; standard gravity is 9.80665 (ISO 80000-3)
 EARTH_RADIUS_M      [m] of the sphere that Web Mercator tiles are cut from: WGS 84, semi-major axis
 METRES_PER_DEGREE   [m/°] of latitude on that sphere, π/180 · EARTH_RADIUS_M, rounded
-REACTION_S          [s] of a driver who is told (Green, Transportation Human Factors 2, 2000: 1.2 to
-                    1.5 s)
+REACTION_S          [s] of a warned driver (Green, Transportation Human Factors 2, 2000: 1.2
+                    to 1.5 s)
 NS                  nanoseconds of a second
 """
 

@@ -1,4 +1,4 @@
-"""Estimator of your own: it only reports that friction is at least what was used.
+"""Example of your own estimator: it reports only that friction is at least the grip in use.
 
 As a plug-in, your package states in its pyproject.toml
 

@@ -1,9 +1,9 @@
-"""The map as prior knowledge about the vehicle's current cell; it never enters what the vehicle
-publishes. Pure.
+"""The map as prior knowledge about the vehicle's current cell; it never affects published records.
+Pure.
 
-The estimator runs as if there were no map: its recursion, and the evidence of a visit that is
-published, are the same bit for bit. Beside it stands what it would believe had it begun the visit
-with the map's belief:
+The estimator runs without the map: its recursion, and the published evidence of a visit, are
+bit-equal with and without it. In addition, this module computes the belief of an estimator that had
+begun the visit with the map's belief:
 
     q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at a cell's border
     p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            in the cell
@@ -16,12 +16,12 @@ Legend
             differ (total variation), BLIND where it knows only this one
     L       likelihood of the visit's measurements so far               (32,)
     β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 -
-            β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take
-            away, and what a visit found holds for the next ones, KEPT of it from border to border
+            β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which
+            no map can reduce; a share KEPT of the result passes to the next visit
 
 The filter's own belief is carried over a border, never the mixture, so that no cell of the map is
-counted twice. Hypotheses that are averaged by what they predicted: Hoeting et al., Bayesian model
-averaging, Stat. Sci. 14 (1999).
+counted twice. Averaging hypotheses by their predictions: Hoeting et al., Bayesian model averaging,
+Stat. Sci. 14 (1999).
 """
 
 from __future__ import annotations

@@ -33,7 +33,9 @@ SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
 
 @dataclass(frozen=True)
 class Active:
-    """Standing warning: what was reported, its places, and where and when it was last confirmed."""
+    """A current warning: the reported hazard, its places, and where and when it was last
+    confirmed.
+    """
 
     warning: GripWarning
     places: frozenset[int]

@@ -16,16 +16,16 @@ At one speed gain and understeer are the same; only a prior that the whole fleet
 apart there. So the regression of a drive begins from USUAL around SOUND, and its standard
 deviations say how much of that is left.
 
-Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is
-taken off a radius by the file's stiffness, its driven axle, and what usual cars lose to air and to
-the tyres' rolling.
+Wheels under force slip. The driven axle therefore turns faster, and the dragged one slower; a
+radius is corrected for that by the file's stiffness, its driven axle, and the usual losses to air
+and rolling resistance.
 
-A drive that was not excited enough for a quantity leaves it out. The median deviation among drives
-(not less than FLOOR, as few drives may agree by chance) over the root of their number, and BIAS,
-what all drives have in common (crossfall of 2.5 %, a steering map that is bent, load), make the
-standard deviation. Both were set on 40 simulated rough cars with other seeds than those of the
-figures. A quantity that was hardly seen is drawn to what cars usually have (USUAL): value and
-standard deviation are those of the posterior.
+A drive without enough excitation for a quantity leaves it out. The standard deviation has two
+parts. One is the median deviation among drives over the root of their number; it is not less than
+FLOOR, as few drives may agree by chance. The other is BIAS, the error that all drives share
+(crossfall of 2.5 %, a bent steering map, load). Both were set on 40 simulated rough cars with other
+seeds than those of the figures. A quantity with little excitation is drawn to its usual value
+(USUAL): value and standard deviation are those of the posterior.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tu
 
 
 def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
-    """Estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; what it was not
-    excited for is left out.
+    """Return estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; quantities
+    without enough excitation are left out.
     """
     return _quantities(prepare(t, signals, vehicle), vehicle) | lags(t, signals, vehicle)
 
@@ -253,10 +253,10 @@ def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
 
 
 def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    """Torque against what moves the file's mass, by the wheels: an accelerometer pitches with the
-    body.
+    """Compare torque with the force that moves the file's mass, measured by the wheels because an
+    accelerometer pitches with the body.
 
-    Slope, air and rolling are beside it: they do not go with acceleration.
+    Slope, air and rolling are fitted as separate terms, because they do not vary with acceleration.
     """
     rows = (drive.moving > 0) & np.isfinite(drive.torque) & np.isfinite(drive.v_dot)
     if np.sum(rows & (np.abs(drive.v_dot) > PULLED)) < LEAST_S * RATE_HZ:
@@ -267,11 +267,11 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def _slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
-    """Slip of the wheels against the mean of the four, (n, 4): what drives, less what it takes to
-    turn the others.
+    """Return the slip of the wheels against the mean of the four, (n, 4): the slip from the driving
+    force minus the slip that turns the other wheels.
 
-    The accelerometer feels the tyres' force less the air's, on slopes too; its offset is what it
-    reads beside dv/dt.
+    The accelerometer feels the force of the tyres minus that of the air, on slopes too; its offset
+    is the difference of its reading from dv/dt.
     """
     if vehicle.drive_split_front is None:
         return np.zeros((int(rows.sum()), 4))

@@ -27,7 +27,8 @@ PROVENANCE = b"gripmap.import"
 
 
 def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
-    """A recording of any kind: what the profile asks for, or everything where there is none yet.
+    """Read a recording of any kind: the signals of the profile, or all signals if there is no
+    profile.
 
     Raises:
         InputError: the file is unknown, broken, needs a database, or needs a library that is not
@@ -133,8 +134,8 @@ def profile_of(log: Path) -> Profile:
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:
-    """The log as Parquet; where the date is known as `timestamp`, else as `t`; what was done
-    stands in its metadata.
+    """Write the log as Parquet, with column `timestamp` where the date is known, else `t`; the
+    metadata record the processing steps.
     """
     columns: dict[str, Any] = {}
     if merged.start_ns is not None:

@@ -80,9 +80,10 @@ def context_signals(profile: Profile) -> set[str]:
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
 ) -> FloatArray:
-    """A block's context (T, N, len(CONTEXT)) from what a source knows; the rest is unknown.
+    """Return a block's context (T, N, len(CONTEXT)) from the values of a source; the rest is
+    unknown.
 
-    The way in for a source that has no profile, a simulation for one:
+    For sources without a profile, for example a simulation:
 
         Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature":
         -3.0}))

@@ -1,9 +1,9 @@
-"""Signals as a calibrated vehicle means them: offsets off, wheels alike, steering by its true map,
-devices together.
+"""Signals corrected by the calibration of a vehicle: without offsets, with equal wheels, the true
+steering map and a common clock.
 
-What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering
-stays. So does a_y: what it reads straight on is crossfall too, which tyres truly hold, and no drive
-tells them apart.
+A quantity that was not learned is assumed to be sound; a learned one is a posterior mean, drawn
+towards sound. Rear steering is not corrected. Neither is a_y: its reading on a straight contains
+crossfall, which the tyres really hold, and no drive separates the two.
 """
 
 from __future__ import annotations

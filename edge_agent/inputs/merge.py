@@ -46,8 +46,8 @@ SMOOTH: Final = 50  # readings to either side over which bursts of arrival are s
 
 @dataclass
 class Merged:
-    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source knew it,
-    and what was done.
+    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source had a date,
+    and the processing steps.
     """
 
     t: FloatArray
@@ -67,13 +67,13 @@ def merge(
     steering_ratio: float | None = None,
     shifts: Mapping[str, float] | None = None,
 ) -> Merged:
-    """One log of all recordings.
+    """Merge all recordings into one log.
 
     Args:
-        recordings: what the sources gave.
-        profile: which signal is which channel.
-        wheel_radius: of the vehicle file [m]; goes before the profile's.
-        steering_ratio: of the vehicle file; likewise.
+        recordings: recordings of the sources.
+        profile: the channel of each signal.
+        wheel_radius: of the vehicle file [m]; takes precedence over the profile's.
+        steering_ratio: of the vehicle file; takes precedence over the profile's.
         shifts: source name -> seconds to add to its clock.
 
     Raises:
@@ -129,8 +129,8 @@ def merge(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Channel -> the recording that has its signals, and how; a receiver fills what the
-    profile's signals do not.
+    """Return channel -> the recording that has its signals, and how; a receiver fills channels that
+    the profile's signals do not.
     """
     found: dict[str, tuple[int, Channel]] = {}
     for name in (*CHANNELS, GROUND, *CONTEXT):

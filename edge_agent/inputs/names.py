@@ -1,9 +1,9 @@
-"""A profile drafted from the names of signals: what is likely which channel, for a person to look
-over.
+"""A draft profile from the names of signals: the likely channel of each signal, for a person to
+check.
 
-Names are cut into words at case, digits and signs. A wheel is recognised by its two letters or
+Names are split into words at case, digits and signs. A wheel is recognised by its two letters or
 words, in English or German (VL VR HL HR: vorn and hinten, links and rechts). Units come from the
-recording where it tells them.
+recording where it has them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def place_of(plain: str) -> str | None:
 
 
 def draft(signals: Mapping[str, str], name: str) -> Profile:
-    """A profile of what the names say.
+    """Return a profile drafted from the names.
 
     Args:
         signals: name -> unit as recorded, "" where it is not given.

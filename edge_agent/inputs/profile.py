@@ -133,7 +133,7 @@ class Profile(Part):
         return {name for channel in self.channels.values() for name in channel.needs()}
 
     def text(self) -> str:
-        """As JSON, without what is not said."""
+        """Return the profile as JSON, without unset fields."""
         return (
             json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1)
             + "\n"

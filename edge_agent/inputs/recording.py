@@ -1,4 +1,6 @@
-"""What a reader gives: named series on one clock, and the same cut to what a profile asks for."""
+"""Result of a reader: named series on one clock, and the selection of the signals that a profile
+needs.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,10 @@ class Recording:
     """Signals of one source by name, all on one clock.
 
     Attributes:
-        name: of the file, to speak of it.
+        name: of the file, for messages.
         start_ns: ns UTC of t = 0, None where the source has no date.
         rows: whether all signals share their times, as the columns of a table do.
-        notes: what a reader has to say about it.
+        notes: remarks of the reader.
     """
 
     name: str

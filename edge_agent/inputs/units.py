@@ -1,4 +1,4 @@
-"""Units that recordings come in, and what they are in those of the signal log."""
+"""Units of recordings, and their factors to the units of the signal log."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ assert set(QUANTITY) == {*CHANNELS, *CONTEXT}
 
 
 def spelled(text: str) -> str:
-    """A unit as we write it; what is unknown comes back in lower case."""
+    """Return the standard spelling of a unit; an unknown unit is returned in lower case."""
     plain = re.sub(r"\s", "", text.lower())
     return SPELLINGS.get(plain, plain)
 

@@ -1,1 +1,1 @@
-"""What judges and tunes: simulation, evaluation, tuning. Nothing that is judged imports it."""
+"""The laboratory: simulation, evaluation and tuning. The evaluated code never imports it."""

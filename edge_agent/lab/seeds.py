@@ -1,4 +1,4 @@
-"""Whose seeds are whose: nobody judges with what was tuned on.
+"""Ranges of random seeds: tuning and evaluation use separate seeds.
 
 Everything that is chosen (constants, memberships, rules) is chosen on seeds below FIGURES, and
 every figure that is published comes from seeds from FIGURES on: other noise, vehicle files,

@@ -1,5 +1,5 @@
-"""What a simulated fleet really drove over: one row per true visit of a cell, to hold the map
-against.
+"""Ground truth of a simulated fleet's roads: one row per true visit of a cell, for comparison with
+the map.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def own_drafts(folder: Path) -> Iterator[Path]:
     """Create a folder within `folder` for drafts that are renamed when they are complete.
 
     Two attempts at one file, on one or two machines, write different drafts. `sweep_drafts` removes
-    what a killed attempt leaves.
+    the drafts of a killed attempt.
     """
     with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
         yield Path(drafts)

@@ -4,9 +4,9 @@ greyscale.
 The live page, HTML reports, images and QGIS share them. `FOUR` are the classes of a well known
 grip, `TWO` those of a roughly known one, `LITTLE` is no class. In the order ice, snow, rather
 slippery, wet, rather not, good grip the lightness rises on light ground and falls on dark ground,
-for every kind of sight and on grey paper: what is dangerous stands out most. `GRIP` runs through
-`FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green, because a safe
-colour would be a promise. `tests/test_palette.py` computes order and distances.
+for every kind of sight and on grey paper: the most dangerous class stands out most. `GRIP` runs
+through `FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green, because a
+safe colour would be a promise. `tests/test_palette.py` computes order and distances.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What lies ahead of a vehicle as bytes: its warnings, and its horizon as runs of metres."""
+"""Wire format of the road ahead of a vehicle: its warnings, and its horizon as runs of metres."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ class Runs(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way
-    on.
+    """The road ahead of one vehicle: the current warnings, and the horizon along its most probable
+    route.
 
-    `here` is the friction where it is, by its own measurements and the map: median, 5 and 95 %; NaN
-    where none is told.
+    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 and 95
+    %; NaN where none is known.
     """
 
     vehicle: str
@@ -84,7 +84,7 @@ class Outlook(NamedTuple):
 
 
 def encode_ahead(outlook: Outlook) -> bytes:
-    """Protobuf bytes of what lies ahead."""
+    """Return the Protobuf bytes of an outlook."""
     columns: dict[str, Any] = {
         name: column.tolist() for name, column in outlook.runs._asdict().items()
     }
@@ -97,7 +97,7 @@ def encode_ahead(outlook: Outlook) -> bytes:
 
 
 def decode_ahead(payload: bytes) -> Outlook:
-    """Read what lies ahead.
+    """Read an outlook.
 
     Raises:
         WireError: not an Ahead, or columns of different lengths.

@@ -34,7 +34,7 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """The fields of a batch beside its records."""
+    """The fields of a batch other than its records."""
 
     kind: Kind
     vehicle: str
@@ -189,7 +189,7 @@ def _column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[An
 
 
 def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
-    """Whether a message's columns have the lengths that they should.
+    """Check that a message's columns have equal lengths.
 
     Raises:
         WireError: they have not.
@@ -258,8 +258,8 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
 
 
 def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
-    """Fill what a sender of observations may leave out. `unplaced`: rows without a cell, at a
-    finite position.
+    """Fill the columns that a sender of observations may leave out. `unplaced`: rows without a
+    cell, at a finite position.
     """
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])

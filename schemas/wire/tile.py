@@ -1,8 +1,8 @@
-"""Reading a tile of the map, an Arrow stream, as if a stranger had sent it.
+"""Reader for a tile of the map, an Arrow stream from an untrusted sender.
 
-Arrow trusts its sender: it unpacks what is compressed, however large it becomes, and takes lengths
-and offsets as they come. So the head of each message is looked at before Arrow sees its body, and
-the result is checked in full.
+Arrow trusts its sender: it decompresses data however large the result is, and uses lengths and
+offsets unchecked. Therefore the head of each message is checked before Arrow sees its body, and the
+result is checked in full.
 """
 
 from __future__ import annotations

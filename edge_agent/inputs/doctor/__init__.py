@@ -1,3 +1,3 @@
-"""The signal doctor: by physics and not by names, what is wrong with a drive's signals, and how
-to mend it.
+"""The signal doctor: finds faults in a drive's signals by physics, not by names, and corrects
+them.
 """

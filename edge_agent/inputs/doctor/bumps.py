@@ -1,10 +1,10 @@
-"""Front and rear wheels told apart by the road: a bump reaches the rear wheel one wheelbase after
-the front wheel.
+"""Test that separates front and rear wheels: a bump reaches the rear wheel one wheelbase after the
+front wheel.
 
-What the left and right wheel of an axle differ by, less its mean over some metres, is unevenness of
-the road and noise. Over the distance driven, the rear axle repeats the front one's after the
-wheelbase. The peak of their correlation there, or one wheelbase before, tells which axle is which;
-on a smooth road there is none.
+The difference of the left and right wheel of an axle, minus its mean over some metres, is
+unevenness of the road plus noise. Over the distance driven, the rear axle repeats the signal of the
+front axle after one wheelbase. A correlation peak there, or one wheelbase before, identifies the
+axles; a smooth road has no peak.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
-    """Measure by how much wheels and steering speak later than the inertial unit, and report
-    what is too much.
+    """Measure the delays of wheels and steering relative to the inertial unit, and report those
+    that are too large.
     """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)

@@ -11,11 +11,11 @@ from edge_agent.inputs.doctor.scales import SETTLED
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault: the channel, what it is called, the words for it, and what mends it.
+    """One fault: its channel, its name, its description, and its correction.
 
     Attributes:
-        scale: to multiply the channel by; offset: to add after that; delay_s: that its stamps are
-            late.
+        scale: factor for the channel; offset: to add after that; delay_s: delay of its time
+        stamps [s].
         confidence: log odds over the next best explanation, where there is one.
     """
 

@@ -1,11 +1,12 @@
-"""A drive made ready for its examination: even time, smoothed, with what the wheels alone say of
-the motion.
+"""A drive prepared for its examination: evenly sampled, smoothed, with the motion computed from the
+wheels alone.
 
 Legend
     v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle
          file
     r    yaw rate [rad/s];  r_w the same from the wheels: (right − left) / track, mean of both axles
-    v_g  speed over ground from fixes [m/s]; course likewise, counter-clockwise from east [rad]
+    v_g  speed over ground from fixes [m/s]; course, also from fixes, counter-clockwise from east
+         [rad]
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ class EvenDrive:
 
 
 def smooth(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
-    """A running mean over `seconds`, taken twice, of what is not NaN; NaN where half of it is."""
+    """Return a running mean over `seconds`, applied twice, that skips NaN; NaN where half of the
+    window is NaN.
+    """
     width = min(max(1, round(seconds * RATE_HZ)), len(x))
     for _ in range(2):
         good = np.isfinite(x)
@@ -174,11 +177,10 @@ def prepare(
 
 
 def slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return where a wheel spins or locks, (n,), from what the wheels (n, 4) say of each other in
-    any unit.
+    """Return where a wheel spins or locks, (n,), by comparison of the wheels (n, 4), in any unit.
 
     Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is
-    another tyre. A wheel that is off all along is left out: it is a fault of its own and would hide
+    another tyre. A wheel that is off all along is left out: it is a separate fault and would hide
     the rest of the drive.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)

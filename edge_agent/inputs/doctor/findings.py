@@ -197,7 +197,7 @@ def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
 
 
 def _axes_exchanged(drive: EvenDrive) -> bool:
-    """Whether the axes of the accelerometer are exchanged."""
+    """Return True if the axes of the accelerometer are exchanged."""
 
     def alike(x: FloatArray, y: FloatArray) -> float:
         good = np.isfinite(x) & np.isfinite(y) & (drive.moving > 0)
@@ -314,9 +314,8 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
     """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged
     axles.
 
-    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly
-    anything is asked. A wheel that is off, but not seen to be so while the car coasts, adds the
-    wheels to `doubts`.
+    In a bend, wheels slip with the force of the tyres, so only moments with hardly any force count.
+    A wheel whose error is not confirmed while the car coasts adds the wheels to `doubts`.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)

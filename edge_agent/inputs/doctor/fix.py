@@ -40,8 +40,8 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 def corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return the findings, and the small lags as if they were findings: what a corrected profile
-    takes out.
+    """Return the findings, and the small lags in the same form: everything that a corrected profile
+    removes.
     """
     lags = small_lags(diagnosis)
     return [
@@ -53,8 +53,8 @@ def corrections(diagnosis: Diagnosis) -> list[Finding]:
 def fixed(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Profile and vehicle with what the findings say, and the findings that nobody can mend from
-    here.
+    """Return profile and vehicle corrected by the findings, and the findings that cannot be
+    corrected this way.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -1,12 +1,9 @@
-"""What must be equal by physics, held against each other: gain, offset, lag and how sure.
+"""Comparison of quantities that are equal by physics: gain, offset, lag and confidence.
 
-identity        left        right       tells
-lateral         a_y         v · r       unit and sign of a_y, v, r
-longitudinal    a_x         dv/dt       unit and sign of a_x, v
-steering        δ · v       L · r       unit and sign of δ, v, r (with understeer · v² r beside it)
-axle            r_w         r           which wheel is left, v, r
-ground          v_g         v           unit of v: the wheels' radius
-turning         d course    r           sign and unit of r
+identity left right checks lateral a_y v · r unit and sign of a_y, v, r longitudinal a_x dv/dt unit
+and sign of a_x, v steering δ · v L · r unit and sign of δ, v, r (plus a term understeer · v² r)
+axle r_w r which wheel is left, v, r ground v_g v unit of v: the wheels' radius turning d course r
+sign and unit of r
 """
 
 from __future__ import annotations
@@ -40,8 +37,8 @@ CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 @dataclass(frozen=True)
 class Fit:
-    """left = gain · right + offset (+ what is beside): `error` of ln |gain| (std), correlation,
-    lag of left [s].
+    """Result of the fit left = gain · right + offset (+ further terms): `error` of ln |gain| (std),
+    correlation, lag of left [s].
     """
 
     gain: float
@@ -59,7 +56,7 @@ class Fit:
 
     @property
     def known(self) -> bool:
-        """Whether it tells anything."""
+        """True if the fit carries information."""
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
 
@@ -67,12 +64,12 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not
-    constant.
+    """The two sides (n,) of an identity, further terms of the left side, and the terms that the
+    offset depends on, where it is not constant.
 
-    `bend` (n,) is given where the left may grow by a share of right · bend that a drive may not
-    tell from the gain: at one speed, understeer and a gain of the steering are the same. `loose`
-    are standard deviations of the gains of what else the left holds, for the same reason.
+    `bend` (n,) is given where the left side may also grow by a share of right · bend that a drive
+    may not separate from the gain: at one speed, understeer and a gain of the steering are the
+    same. `loose` are standard deviations of the gains of the further terms, for the same reason.
     """
 
     left: FloatArray
@@ -144,16 +141,16 @@ def fits(drive: EvenDrive) -> dict[str, Fit]:
 
 
 def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
-    """left = gain · right + offset + Σ k · beside, over the moving part, after the lag is taken
-    out.
+    """Fit left = gain · right + offset + Σ k · term, over the moving part, after removal of the
+    lag.
 
-    The gain is the geometric mean of both regressions, so that noise on either side does not bend
+    The gain is the geometric mean of both regressions, so that noise on either side does not bias
     it.
 
     Args:
-        sides: what is held against each other.
+        sides: the two sides of the identity.
         moving: (n,) 1 where the car moves.
-        grips: (n,) 0 where the wheels' speed is not the car's; the lag is taken there as well.
+        grips: (n,) 0 where the wheels' speed is not the car's; the lag is measured there as well.
         level: no offset, and every moving moment is excited: a quantity that is itself large.
     """
     left = sides.left
@@ -239,11 +236,11 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty
-    makes.
+    """Return the share of `bend` in the right side, and the standard deviation of ln gain from its
+    uncertainty.
 
-    Each share is tried: what it leaves of the left side, of `count` independent moments, against
-    what cars have.
+    Each share is tried: the residual of the left side, over `count` independent moments, plus its
+    deviation from usual cars.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))
@@ -300,7 +297,9 @@ def _ratio(x: FloatArray, y: FloatArray) -> float:
 
 
 def robust(table: FloatArray, y: FloatArray) -> FloatArray:
-    """Least squares, twice, the second time without what lies three robust spreads off."""
+    """Fit least squares twice, the second time without points that are three robust standard
+    deviations off.
+    """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]
     off = np.abs(y - table @ solution)
     near = off <= 3.0 * 1.4826 * np.median(off) + 1e-12
@@ -323,10 +322,11 @@ def shifted(x: FloatArray, seconds: float) -> FloatArray:
 
 
 def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
-    """Seconds that `left` is behind `right`, by the peak of |correlation|, and its error; infinite
-    where unknown.
+    """Return by how many seconds `left` is behind `right`, by the peak of |correlation|, and its
+    error; infinite where unknown.
 
-    The two halves of the drive are asked as well: what they differ by is an error too.
+    The lags of the two halves of the drive are compared as well: their difference adds to the
+    error.
     """
     lag, sharp = _peak(left, right, moving)
     if not sharp:

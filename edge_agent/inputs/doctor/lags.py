@@ -1,4 +1,4 @@
-"""How late devices speak against the inertial unit, each from two ways to the yaw rate.
+"""Delays of devices relative to the inertial unit, each from two measurements of the yaw rate.
 
     wheel_lag   wheels' yaw rate behind the gyro's: mean of both axles, or the axle that follows the
                 gyro best

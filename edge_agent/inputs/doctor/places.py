@@ -65,7 +65,9 @@ def _agreement(yaw: FloatArray, course: FloatArray) -> float:
 
 
 def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
-    """Whether the fixes go as the wheels do only when latitude and longitude are exchanged."""
+    """Return True if the fixes agree with the wheels only after latitude and longitude are
+    exchanged.
+    """
     latitude = signals[:, S.LATITUDE]
     longitude = signals[:, S.LONGITUDE]
     if np.isfinite(latitude).sum() < 10:

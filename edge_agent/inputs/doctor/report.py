@@ -1,6 +1,4 @@
-"""The doctor's findings as lines for a terminal, and as one page with plots that needs nothing
-beside it.
-"""
+"""The doctor's findings as lines for a terminal, and as one self-contained page with plots."""
 
 from __future__ import annotations
 
@@ -42,7 +40,7 @@ STYLE: Final = (
 
 
 def lines(diagnosis: Diagnosis) -> list[str]:
-    """What was found, a line each."""
+    """Return the findings, one line each."""
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
         f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown
@@ -59,7 +57,9 @@ def lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def document(diagnosis: Diagnosis) -> dict[str, object]:
-    """What was found, for a program: scale, offset and delay mend a channel, in this order."""
+    """Return the findings for a program; scale, offset and delay correct a channel, in this
+    order.
+    """
     return {
         "passed": diagnosis.passed,
         "advice": advice(diagnosis),
@@ -125,7 +125,9 @@ def _table(fits: dict[str, Fit]) -> str:
 
 
 def _figure(name: str, fit: Fit) -> str:
-    """A scatter of both sides, with the identity itself (grey) and what was found (red)."""
+    """Return a scatter plot of both sides, with the identity itself (grey) and the measured
+    relation (red).
+    """
     step = max(1, len(fit.right) // POINTS)
     x = fit.right[::step]
     y = fit.left[::step]

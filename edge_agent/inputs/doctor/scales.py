@@ -1,15 +1,16 @@
-"""Which quantities have a wrong unit, sign or clock: the fewest faults that explain all identities.
+"""Search for quantities with a wrong unit, sign or clock: the fewest faults that explain all
+identities.
 
-Every quantity may be sound or have one of a few faults, each a factor on what is recorded (Occam: a
-fault costs as much as FAULT_COST / 2 in log probability, since few columns are wrong). An identity
-says, in logarithms,
+Every quantity may be sound or have one of a few faults, each a factor on the recorded value. A
+fault costs FAULT_COST / 2 in log probability, since few columns are wrong (Occam). An identity
+states, in logarithms,
 
     ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π
                                                                                   sign(factor)
 
 Every set of at most two faulty quantities is tried. A quantity is settled when all explanations
-that say otherwise of it cost SETTLED more. Clocks likewise: the lag of an identity is the
-difference of two devices' lags.
+that disagree on it cost SETTLED more. Clocks are treated in the same way: the lag of an identity is
+the difference of two devices' lags.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ WRONG_SIGN: Final = 60.0  # cost of a sign that nothing explains, at full correl
 
 
 class Mistake(NamedTuple):
-    """A fault of a quantity: what it is called, and what the recorded value is of the true one."""
+    """A fault of a quantity: its name, and the ratio of the recorded to the true value."""
 
     name: str
     factor: float
@@ -97,7 +98,7 @@ CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by ch
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
-    """What each quantity may have."""
+    """Return the possible faults of each quantity."""
     g = 1.0 / GRAVITY
     deg = 1.0 / DEG
     ratio = vehicle.steering_ratio or 16.0
@@ -136,15 +137,15 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of each quantity: the fault or None, and by how much the best explanation that differs
-    costs more.
+    """For each quantity, its fault or None, and the margin by which the best explanation that
+    differs costs more.
     """
 
     faults: dict[str, Mistake | None]
     margins: dict[str, float]
 
     def settled(self, quantity: str) -> bool:
-        """Whether nothing else is plausible of it."""
+        """Return True if no other explanation of the quantity is plausible."""
         return self.margins[quantity] >= SETTLED
 
 
@@ -166,8 +167,8 @@ def explain(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
 
 
 def _alike(one: Mistake | None, other: Mistake | None) -> bool:
-    """Whether two faults come to the same: km/h is a radius of .28 m, which no drive tells from
-    a wrong one.
+    """Return True if two faults are equivalent: km/h equals a radius of .28 m, which no drive
+    separates from a wrong radius.
     """
     if one is None or other is None:
         return one is other

@@ -1,1 +1,1 @@
-"""Live sources: threads that listen, and rows at a fixed rate of what they heard."""
+"""Live sources: threads that listen, and rows built from their messages at a fixed rate."""

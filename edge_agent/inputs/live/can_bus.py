@@ -51,8 +51,8 @@ class CanFeed(Feed):
     Args:
         name: of the source.
         clock: the host's.
-        decoder: which frames, and what is in them.
-        options: of `can.Bus`: interface, channel and whatever the interface takes.
+        decoder: decodes the frames that the profile needs.
+        options: of `can.Bus`: interface, channel and further options of the interface.
 
     Raises:
         InputError: python-can is not installed.

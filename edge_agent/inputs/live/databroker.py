@@ -52,10 +52,10 @@ class DatabrokerFeed(Feed):
         self._call: Any = None
 
     def listen(self) -> None:
-        """Hear updates until the broker goes.
+        """Receive updates until the connection to the broker ends.
 
-        Its first answer holds what it knew before, however old: not readings, but of what is sent
-        when it changes the value of now.
+        The first answer holds the broker's last values, however old. They are not readings, except
+        for a signal that is sent only on change: there the last value still holds.
         """
         connection = self._connection
         with connection.open_channel() as channel:

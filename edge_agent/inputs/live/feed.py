@@ -1,4 +1,5 @@
-"""A live source: a thread that listens, opens anew what was lost, and hands over what it heard.
+"""A live source: a thread that listens, reopens a lost connection, and hands over the received
+messages.
 
 Times are the host's: seconds since its start, by a clock that never steps. A source whose stamps
 are up to BELIEVED_S old when they arrive has the host's date and is believed. Any other has a clock
@@ -36,7 +37,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HostClock:
-    """The host's clock from its start on: ns UTC of then, and what a steady clock showed."""
+    """The host's clock from its start on: the UTC time [ns] of the start, and the reading of a
+    monotonic clock at that moment.
+    """
 
     start_ns: int = field(default_factory=time.time_ns)
     steady_s: float = field(default_factory=time.monotonic)
@@ -103,7 +106,7 @@ class Feed(ABC):
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """The signals in what was heard."""
+        """Return the signals in the received messages."""
 
     def start(self) -> None:
         """Begin to listen."""
@@ -117,8 +120,8 @@ class Feed(ABC):
 
     @property
     def listening(self) -> bool:
-        """Whether its thread runs: after `close`, one that hangs, which its library may wait for
-        at the exit.
+        """Return True if the thread runs: after `close`, a hanging thread that its library may wait
+        for at exit.
         """
         return self._thread.is_alive()
 
@@ -162,7 +165,7 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log what it met, once."""
+        """Log a reason once."""
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)
             log.warning("%s: %s", self.name, reason)

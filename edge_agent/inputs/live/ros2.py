@@ -3,8 +3,8 @@ decoded by rosbags.
 
 A topic's key is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, its payload CDR. The attachment begins
 with a sequence number and the time of publication (int64 each, little endian; rmw_zenoh_cpp,
-design.md): so what was lost is known. Signals are called as in a bag, /topic.field.field; topics of
-can_msgs/Frame are buses.
+design.md), so lost messages are counted. Signals are named as in a bag, /topic.field.field; topics
+of can_msgs/Frame are buses.
 """
 
 from __future__ import annotations
@@ -148,7 +148,9 @@ class Ros2Feed(Feed):
         self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
     def _published(self, attachment: bytes) -> int:
-        """Time of publication [ns], 0 where it is not told; counts what is missing before it."""
+        """Return the time of publication [ns], 0 where it is missing; count the messages lost
+        before it.
+        """
         if len(attachment) < ATTACHMENT.size:
             return 0
         number, at = ATTACHMENT.unpack_from(attachment)

@@ -1,11 +1,11 @@
-"""Rows at a fixed rate of what live sources heard: the importer's profile and merging, a tenth of a
-second at a time.
+"""Rows at a fixed rate from the messages of live sources, with the importer's profile and merging,
+a tenth of a second at a time.
 
-A row is made DELAY_S after its time, so that readings to either side of it are there; a source that
-speaks but is behind (its host is busy) is waited for up to PATIENCE_S. What comes later still is
-missing, and counted. The clock makes the rows: where all sources are silent they are empty, and the
-estimator widens. A fix that comes after its row is moved along its own course to the first row that
-is left.
+A row is made DELAY_S after its time, so that readings on both sides of it have arrived. A source
+that is active but behind (its host is busy) is waited for up to PATIENCE_S. Later messages are
+treated as missing, and counted. The clock makes the rows: where all sources are silent they are
+empty, and the estimator widens. A fix that arrives after its row is moved along its own course to
+the first row that is left.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ class LiveRows:
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _behind(self, time: float) -> bool:
-        """Whether a source has yet to tell of a time: none that is silent, and no receiver,
-        whose fixes are rare.
+        """Return True if a source may still deliver readings of a time: not a silent source, and
+        not a receiver, whose fixes are rare.
         """
         return any(
             feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
@@ -161,7 +161,7 @@ class LiveRows:
         )
 
     def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """What a source told lately."""
+        """Return the recent readings of a source."""
         kept = self._readings[place]
         fresh_ones = feed.take()
         if "course" not in fresh_ones:

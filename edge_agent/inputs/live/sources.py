@@ -1,4 +1,4 @@
-"""Live sources as they are asked for on a command line: `kind:address?option=value`.
+"""Live sources as written on a command line: `kind:address?option=value`.
 
 source                                   is
 can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its
@@ -6,9 +6,9 @@ can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel
                                          other options are those of the interface
 ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0);
                                          `frames=/can0` is one of can_msgs/Frame; `messages=FOLDER`
-                                         holds PACKAGE/NAME.msg of types of one's own
+                                         holds PACKAGE/NAME.msg of your own types
 vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with
-                                         `token=FILE` as somebody
+                                         `token=FILE` authenticated
 gpsd:127.0.0.1:2947                      a gpsd
 """
 
@@ -39,7 +39,7 @@ VSS_PROFILE: Final = "vss"
 
 
 def is_live(source: str) -> bool:
-    """Whether a source of `run` is a live one."""
+    """Return True if a source of `run` is a live one."""
     return source.partition(":")[0] in KINDS
 
 

@@ -1,8 +1,8 @@
 """CAN logs (BLF, ASC, candump, TRC, bus-logging MF4) to series, by way of a CAN database.
 
 Times are those of arrival, counted from the log's first frame in whole microseconds, so that one
-drive is one drive in every format. Buses are numbered as python-can does; of a message that several
-buses carry, that bus is taken which has most of what is asked for, unless it is named.
+drive is one drive in every format. Buses are numbered as python-can does. If several buses carry a
+message, the named bus is used, otherwise the bus with most of the wanted signals.
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ def decoded(
     wanted: Iterable[str],
     buses: dict[str, int] | None = None,
 ) -> Recording:
-    """The signals `MESSAGE.SIGNAL` of a log.
+    """Return the signals `MESSAGE.SIGNAL` of a log.
 
     Args:
         take: gives the log's frames.
         name: of the log.
         database: how to decode it.
-        wanted: whole names; what the database or the log does not have is left out.
+        wanted: full names; names that the database or the log does not have are left out.
         buses: the bus of a message, where it is known.
     """
     messages: dict[str, list[str]] = defaultdict(list)
@@ -128,7 +128,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a name or None
-    """Number of a bus: can1 and 1 are 1, what has no number is 0."""
+    """Return the number of a bus: 1 for can1 and 1, 0 for a name without a number."""
     if isinstance(channel, int):
         return channel
     digits = "".join(c for c in str(channel or "") if c.isdigit())

@@ -1,9 +1,10 @@
-"""CAN databases, read tolerantly, and frames decoded a column at a time.
+"""CAN databases, parsed tolerantly, and frames decoded a column at a time.
 
-Only `BO_` and `SG_` lines are read: names with blanks, doubled messages and unknown attributes,
-over which strict parsers stumble, do no harm. Multiplexed signals are decoded where their switch
-says so. Bit numbers are those of a DBC: little endian counts up from the start bit; big endian
-starts at the most significant bit and counts down within a byte, then on to the next byte.
+Only `BO_` and `SG_` lines are read. Therefore names with blanks, doubled messages and unknown
+attributes, on which strict parsers fail, do no harm. Multiplexed signals are decoded where their
+switch selects them. Bit numbers are those of a DBC. Little endian counts up from the start bit. Big
+endian starts at its most significant bit and counts down within a byte, then continues in the next
+byte.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
 
 
 class MdfContent(NamedTuple):
-    """What a file holds: frames and the time of the first [s since 1970 UTC], or the channels of
-    a measurement.
+    """Content of a file: frames and the time of the first [s since 1970 UTC], or the channels of a
+    measurement.
     """
 
     frames: tuple[Log, float] | None
@@ -135,7 +135,7 @@ def _content(path: Path, identifiers: set[int] | None, names: set[str] | None) -
 
 
 def has_frames(mdf: Any) -> bool:  # noqa: ANN401
-    """Whether a bus was logged in it."""
+    """Return True if a bus was logged in the file."""
     return any("CAN_DataFrame" in name for name in mdf.channels_db)
 
 

@@ -28,7 +28,7 @@ Leaf = tuple[str, Callable[[Any], Any]]
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a bag: by its ending, or a folder with a bag's metadata."""
+    """Return True if the path is a bag: by its suffix, or a folder with a bag's metadata."""
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
@@ -56,7 +56,7 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 
 def has_frames(reader: Any) -> bool:  # noqa: ANN401
-    """Whether a topic of it is a CAN log."""
+    """Return True if a topic of the bag is a CAN log."""
     return any(connection.msgtype == FRAME for connection in reader.connections)
 
 

@@ -1,1 +1,3 @@
-"""How well cars that listen are warned, what it costs, and what the map as a prior is worth."""
+"""Evaluation of warnings in the car: their quality, their cost, and the benefit of the map as a
+prior.
+"""

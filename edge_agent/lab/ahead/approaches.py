@@ -1,12 +1,13 @@
-"""Are cars that come to an alerted stretch warned in time, and no others? Simulated drivers, the
-real warnings.
+"""Test whether cars that approach an alerted stretch are warned in time, and other cars are not:
+simulated drivers, the real warning code.
 
-The link is up and the map known, within SPREAD of `known_town`: what is judged is what a car makes
-of it, with the fixes of its receiver. A car comes to a stretch from road that is not slippery; who
-drives from snow onto ice is on it already. It is warned in time when it could stop before the
-stretch from where it was told: 1.5 s of reaction, then braking with the true friction of the road
-before it, with 3 m/s² at the most; and when the warning stands as it comes. A warning is false when
-nothing slippery lies within a lane's width of where the car then drove: no cell is finer.
+The link is up and the map known, within SPREAD of `known_town`. The test judges the warnings that a
+car derives from it, with the fixes of its receiver. An approach comes from road that is not
+slippery; a car that drives from snow onto ice is already on slippery road. A warning is in time
+when the car could stop before the stretch from where the warning was given, and when the warning is
+still active on arrival. Stopping takes 1.5 s of reaction, then braking with the true friction of
+the road before the stretch, with at most 3 m/s². A warning is false when nothing slippery lies
+within a lane's width of where the car then drove, because no cell is finer.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ START_NS: Final = 1_800_000_000 * NS
 
 @dataclass
 class Approaches:
-    """What was counted."""
+    """Counts of approaches and warnings."""
 
     came: int = 0
     warned: int = 0
@@ -57,9 +58,7 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the look at which it was raised, what it said, and the look at which it
-    ended.
-    """
+    """One warning: the look at which it was raised, its content, and the look at which it ended."""
 
     at: int
     distance: float
@@ -69,8 +68,8 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """One car's way: metre, speed, friction and the least beside it at each look, and what it
-    was told, by name.
+    """Track of one car: metre, speed, friction and the least friction next to it at each look, and
+    the warnings by name.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -82,7 +81,7 @@ class _Track:
 
 
 def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Shares and rates over drawn towns, on given routes and, beside them, without."""
+    """Return shares and rates over drawn towns, with given routes and, for comparison, without."""
     found = {routed: Approaches() for routed in (True, False)}
     for seed in seeds:
         for routed, counts in found.items():

@@ -1,4 +1,4 @@
-"""What listening costs a car in a day: megabytes down in a busy city, and processor.
+"""Cost of listening for one car and day: megabytes received in a busy city, and processor time.
 
 The city is a grid of streets 100 m apart, every place of both directions measured, STANDING alerts
 in each tile; the car drives DAY_KM through it at city speed. The bytes are those of the answers
@@ -73,7 +73,9 @@ def way(rng: np.random.Generator, metres: float) -> FloatArray:
 
 
 def figures(seed: int, metres: float) -> list[Figure]:
-    """Megabytes a day and share of a core, on a given route and, beside it, without."""
+    """Return megabytes a day and the share of a core, with a given route and, for comparison,
+    without.
+    """
     known = streets()
     out = []
     for routed, ending in ((True, ""), (False, ".unrouted")):

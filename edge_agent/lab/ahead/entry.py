@@ -1,11 +1,11 @@
-"""What the map as a prior is worth: the error at entry, how long a wrong map delays, and what of it
-is published.
+"""Benefit of the map as a prior: the error at entry, the delay by a wrong map, and its effect on
+published records.
 
-One drive of the default estimator through drawn towns gives what each filter believed and measured,
-ten times a second; the maps are laid beside it afterwards, since the filter never sees one. A map
-is `known_town`'s: off by chance as far as it says. It is wrong where the scenario's black ice
-appears, dry as it was before; and, the other way round, where it says ice of as long a stretch that
-is dry.
+One drive of the default estimator through drawn towns gives beliefs and measurements of each
+filter, ten times a second. The maps are applied afterwards, since the filter never sees one. A map
+is `known_town`'s: its errors are drawn with the stated spread. It is wrong where the scenario's
+black ice appears, because it still says dry; and, the other way round, where it says ice on an
+equally long stretch that is dry.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """What N filters said at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T,
+    """Records of N filters at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T,
     N).
     """
 
@@ -55,7 +55,7 @@ class FilterTrace:
 
 
 def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Ratios over all towns, and the largest change of what is published."""
+    """Return ratios over all towns, and the largest change of a published value."""
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
     nats = 0.0
@@ -95,7 +95,7 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
 
 
 def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None) -> FilterTrace:
-    """Drive, and note what the filters say; with a `prior`, as a car does that hears that map."""
+    """Drive and record the beliefs of the filters; with a `prior`, the car also hears that map."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
@@ -178,7 +178,7 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Median of what would be believed with a map, (T, N)."""
+    """Return the median of the belief with a map, (T, N)."""
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):

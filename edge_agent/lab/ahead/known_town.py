@@ -42,7 +42,9 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 
 
 def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None) -> LocalMap:
-    """What a car has heard that was told of all places, by the truth, or off it by chance."""
+    """Return the local map of a car that has heard of all places, with their true friction or with
+    random errors.
+    """
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)
     lower = np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER)

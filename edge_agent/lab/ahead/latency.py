@@ -1,9 +1,9 @@
-"""From an alert's put to the warning: VEHICLES cars of one process, a session each, all of them
-looking, a real router.
+"""Latency from publishing an alert to the warning: VEHICLES cars in one process, each with its own
+session, on a real router.
 
-Every car stands on a road of its own and looks ahead each second; the service's side answers their
-questions. Alerts are put, one after the other, on the roads of cars drawn by chance, and what comes
-back is timed.
+Every car stands on its own road and looks ahead each second; the service's side answers their
+questions. Alerts are published one after the other on the roads of randomly drawn cars, and the
+time until the warning is measured.
 """
 
 from __future__ import annotations

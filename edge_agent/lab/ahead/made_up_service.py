@@ -62,11 +62,11 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 @dataclass
 class MadeUpService:
-    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes
-    what it was asked.
+    """Fake service with places of known friction (`mu` by cell * 4 + sector) and current alerts;
+    records the questions.
 
-    They were observed at `now`. With `kept` it answers with the tile as it was made then, as a
-    store of messages would.
+    The places were observed at `now`. With `kept` it answers with the tile as it was made then, as
+    a store of messages would.
     """
 
     settings: ZenohSettings
@@ -100,7 +100,7 @@ class MadeUpService:
         )
 
     def tile(self, key: IntArray, mu: FloatArray) -> bytes:
-        """What it answers for places of a tile."""
+        """Return the answer for places of a tile."""
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
         return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
 

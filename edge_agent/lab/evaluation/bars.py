@@ -1,4 +1,4 @@
-"""The figures of a campaign: those with a bar as one table, and every measure beside them for
+"""The figures of a campaign: those with a bar in one table, followed by every other measure for
 context.
 """
 
@@ -53,8 +53,8 @@ def in_the_world(name: str) -> Callable[[Results], float]:
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Interval score with over without fuzzy sets, or with what the colony found over untuned
-    vertices or over what chance found.
+    """Return the ratio of interval scores: with over without fuzzy sets, or the colony's vertices
+    over untuned or randomly found ones.
     """
     return lambda results: worth.ratio(results.worth, name)
 

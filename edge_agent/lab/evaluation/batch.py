@@ -1,4 +1,4 @@
-"""Drives of one scenario side by side, and what an estimator makes of them."""
+"""Drives of one scenario, simulated together, and the estimates of an estimator for them."""
 
 from __future__ import annotations
 
@@ -131,5 +131,5 @@ def repeated(batch: DriveSet, count: int) -> DriveSet:
 
 
 def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
-    """What the bank says of the drives."""
+    """Return the bank's estimates of the drives."""
     return bank.advance(batch.t, batch.signals)

@@ -1,7 +1,7 @@
-"""Calibration against the truth of simulated rough cars: its errors, and what it brings.
+"""Calibration against the truth of simulated rough cars: its errors, and its benefit.
 
-Errors are in units of the standard deviations that it claims; what it brings is the width of the
-friction's interval.
+Errors are in units of the standard deviations that the calibration states. The benefit is the
+narrower interval of friction.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ESTIMATOR: Final = "aco-fckf"
 
 
 def truth(seed: int, car: int) -> dict[str, float]:
-    """What the devices of a rough car are off by."""
+    """Return the true device errors of a rough car."""
     error = error_row(ROUGH_FLEET, GOTHENBURG, seed, car)
     mounted = error[ErrorColumn.MOUNTED :]
     offset = error[ErrorColumn.OFFSET :]
@@ -66,8 +66,8 @@ def _heavier(seed: int, car: int) -> float:
 
 
 class Narrowed(NamedTuple):
-    """Of some cars: mean width of the 90 % interval, and share of truths inside, without and
-    with calibration.
+    """Mean width of the 90 % interval over some cars, and share of truths inside, without and with
+    calibration.
     """
 
     plain_width: float

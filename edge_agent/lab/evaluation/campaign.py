@@ -36,7 +36,7 @@ FAULTY_SEEDS = 4
 
 @dataclass(frozen=True)
 class PlottedDrive:
-    """The first drive of a scenario and what was estimated, kept for plots."""
+    """The first drive of a scenario and its estimates, kept for plots."""
 
     batch: DriveSet
     reported: Estimates

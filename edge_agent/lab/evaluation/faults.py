@@ -1,6 +1,6 @@
-"""Sensor faults: what goes wrong, what is expected then, and what every estimator makes of it.
+"""Sensor faults: each fault, its expected effect, and the response of every estimator.
 
-The drives are ordinary ones; a fault begins at BEGINS. `told` is whether health reports the flag in
+The drives are ordinary ones; a fault begins at BEGINS. `told` is 1 if health reports the flag in
 every drive.
 """
 
@@ -41,7 +41,9 @@ def in_order(t: FloatArray) -> FloatArray:
 
 
 def gap(t: FloatArray) -> FloatArray:
-    """Three seconds without a sample; what is left is a drive with a hole in it."""
+    """Return the samples that remain after three seconds without samples: a drive with a hole in
+    it.
+    """
     return np.where(t < BEGINS, t, t + 3.0)
 
 
@@ -138,7 +140,7 @@ def harmed(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def outcome(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from
+    """Return the measures of a case, per drive: `finite`, `told` (1 or 0), coverage and width from
     BEGINS on, RMSE.
     """
     after = batch.t[:, 0] >= BEGINS

@@ -1,5 +1,5 @@
-"""What comes in by files: frames decoded as by cantools, a minute of a bus at once, one drive
-alike in all formats.
+"""Evaluation of file import: frames decoded as by cantools, a minute of a bus at once, one drive
+equal in all formats.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def _largest(one: FloatArray, other: FloatArray) -> float:
 
 
 def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
-    """The three rows, and what they were taken over."""
+    """Return the three rows, and the data they were measured on."""
     wrong, compared = decode_errors(recorded, seed)
     largest, formats = same_estimates(folder, seed, seconds)
     return [

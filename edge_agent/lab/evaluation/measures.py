@@ -1,4 +1,4 @@
-"""What is measured of estimates against truth; every measure gives one number per drive, (N,).
+"""Measures of estimates against truth; every measure gives one number per drive, (N,).
 
 Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the
 stated spread is right; NIS squared innovation over its stated variance, per row [1]. Their mean
@@ -37,7 +37,7 @@ def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def covered(batch: DriveSet, reported: Estimates) -> BoolArray:
-    """Whether the 90 % interval holds the mean friction, (T, N)."""
+    """Return whether the 90 % interval holds the mean friction, (T, N)."""
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
 
@@ -90,7 +90,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Of split friction, in the last second: error of the lower side, coverage of the higher."""
+    """Return for split friction, in the last second, the error of the lower side and the coverage
+    of the higher.
+    """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel
     wheels = reported.mu_wheel
@@ -121,8 +123,8 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or
-    longer, per drive.
+    """Count per drive how often the interval lies more than NEAR away from an unchanged friction
+    for HOLD_S or longer.
     """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

@@ -1,22 +1,22 @@
-"""How well anybody could do with these sensors: two bars of the papers, and an oracle that knows
+"""Best possible accuracy with these sensors: two bars of the papers, and an oracle that knows
 nearly everything.
 
-An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is
-given the truth of all that is not listed as unknown. What is unknown to him is what vehicle file
-and data sheet leave open to anybody. Everything is linear about the truth, so that his estimate is
-that of least squares with a Gaussian prior.
+An oracle is a Bayesian estimator that gets the same noisy readings, and the truth of everything
+that is not listed as unknown. Its unknowns are those that vehicle file and data sheet leave open.
+Everything is linear about the truth, so its estimate is that of least squares with a Gaussian
+prior.
 
-`speed`: v_x of an accelerating sine. He hears the wheels without noise: W = (1 + ρ) v.
+`speed`: v_x of an accelerating sine. It gets the wheels without noise: W = (1 + ρ) v.
 
-    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: what the rolling
+    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: part that the rolling
                                                                              body has followed
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of
                                                                              STRETCH_S
     unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and
     pitches, b offsets
 
-`friction`: μ under .6 g, at the end of the drive. He hears the mean of four wheels, knows the force
-of every tyre, and the speed but for offset and leak of a_x.
+`friction`: μ under .6 g, at the end of the drive. It gets the mean of four wheels, knows the force
+of every tyre, and the speed except offset and leak of a_x.
 
     R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))    s true slip
     g    slip that the forces take at μ and with that shape of the tyre's curve, over the true one
@@ -55,7 +55,7 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """A drive of 002.sine: what the oracle knows, and what rolls and pitches in the
+    """A drive of 002.sine: the values given to the oracle, and the roll and pitch terms of the
     accelerometers, (T,) each.
     """
 
@@ -78,7 +78,9 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 
 
 def _speed(heard: OracleSignals, n: int, rho: float) -> float:
-    """Each second he estimates ρ anew from all that came before, and corrects the wheels by it."""
+    """Return the speed: each second ρ is estimated again from all earlier readings, and the wheels
+    are corrected by it.
+    """
     batch = heard.batch
     car = PAPERS["002.sine"].vehicle
     v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))
@@ -126,7 +128,9 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """|μ − truth| at the end of 003.accel, one per seed, and the error that the oracle expects of himself, likewise."""
+    """Return |μ − truth| at the end of 003.accel, and the oracle's expected error, one per seed
+    each.
+    """
     scenario = PAPERS["003.accel"]
     exact = realistic(scenario, seeds[:1], "ideal")
     batch = realistic(scenario, seeds)

@@ -1,8 +1,8 @@
-"""Mistakes of recordings, planted into simulated drives: what the signal doctor has to find and
+"""Mistakes of recordings, planted into simulated drives, that the signal doctor has to find and
 name.
 
-Sizes are those met when foreign logs were brought in: units, signs, offsets, a clock .4 s off,
-status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre.
+Sizes are those seen in imported third-party logs: units, signs, offsets, a clock .4 s off, status
+bits in a wheel speed, exchanged columns, and a vehicle file with another tyre.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def icy(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
 
 
 def named(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Whether the doctor names the mistake, and whether it lets the drive pass."""
+    """Return whether the doctor names the mistake, and whether it accepts the drive."""
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
     same = next((kinds for kinds in RADII_ALIKE if planted.kind in kinds), {planted.kind})

@@ -101,7 +101,7 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
 
 
 def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
-    """What is driven: scenario, manoeuvre, speed, friction, vehicle and seed."""
+    """Return the title of a drive: scenario, manoeuvre, speed, friction, vehicle and seed."""
     spec = SCENARIOS.get(scenario)
     batch = drive.batch
     mu = batch.mu[:, 0]
@@ -125,7 +125,7 @@ def _true() -> dict[str, Any]:
 
 
 def _rough(world: RealWorldResults, path: Path) -> Path:
-    """One rough car in a hilly town: speed beside the wheels', slope, friction with the
+    """Plot one rough car in a hilly town: speed and that of the wheels, slope, friction with the
     default's interval, health.
     """
     from matplotlib import pyplot as plt

@@ -1,4 +1,4 @@
-"""What the papers print, and where our figure for it stands; and why some of it cannot be
+"""Figures printed in the papers, compared with ours, and the reasons why some cannot be
 reproduced.
 """
 
@@ -8,9 +8,7 @@ from typing import Final, NamedTuple
 
 
 class Printed(NamedTuple):
-    """A number that a paper prints: where, what, its value, and the figures that stand beside
-    it.
-    """
+    """A number that a paper prints: place, quantity, value, and our figures for comparison."""
 
     paper: str
     what: str
@@ -131,7 +129,7 @@ DEFAULT: Final = "aco-fckf"
 
 
 def names() -> list[str]:
-    """Names of the figures that stand beside what the papers print, with their spreads."""
+    """Return the names of our figures that are compared with the papers, with their spreads."""
     found = [
         name.replace("ESTIMATOR", estimator)
         for row in PRINTED

@@ -5,8 +5,8 @@ vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: friction th
 surely had). Of the time in which a car moves, from the third second on:
 
     informative    share with an interval narrower than INFORMATIVE of the prior's
-    right          of that, share whose interval meets what is known: true friction, else at least
-                   the grip in use
+    right          of that, share whose interval agrees with the known friction: the true one,
+                   else at least the grip in use
     ice            share with P(slippery) > ICE although the road was not slippery
     contradicted   share with the health flag CONTRADICTION
     urgent         observations per hour that would be sent at once, of logs with a position
@@ -149,8 +149,8 @@ def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray
 
 
 def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
-    """Return what was measured of the truth, by column, at the times of the log; NaN where
-    nothing was.
+    """Return the measured truth by column at the times of the log; NaN where it was not
+    measured.
     """
     file = path.with_suffix(".truth.parquet")
     if not file.exists():
@@ -178,8 +178,8 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and
-    what is known of it.
+    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and the
+    known truth.
     """
     t = adopted.log.t
     signals = adopted.log.signals
@@ -230,8 +230,8 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return the friction that the surface of a log had at least: what is known of it, or what
-    the car used.
+    """Return the least friction of a log's surface: the known value, or the grip that the car
+    used.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (smooth(even(t, signals[:, channel], at), SMOOTH_S) for channel in (S.AX, S.AY))

@@ -136,8 +136,8 @@ def lately(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> 
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Width and MISS times how far the truth lies outside; the only way to lower it is to be
-    sharp and right.
+    """Return the width plus MISS times the distance of the truth from the interval. It rewards
+    narrow intervals that hold the truth.
     """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
@@ -186,7 +186,7 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
 
 
 def baseline(tally: Tally, batch: DriveSet) -> None:
-    """What the prior scores, and what the mean of four wheels makes of v_x."""
+    """Record the score of the prior, and the v_x error of the mean of four wheels."""
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = (
         radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1)

@@ -114,7 +114,7 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Printed figures beside ours."""
+    """Return printed figures next to ours."""
     rows = []
     for row in PRINTED:
         cells = (
@@ -248,7 +248,7 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Whether something held in all drives of all estimators."""
+    """Return whether something held in all drives of all estimators."""
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 

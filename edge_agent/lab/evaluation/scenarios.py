@@ -1,8 +1,8 @@
 """The scenarios: the papers' manoeuvres with the papers' vehicles, those of the default's bars, and
 other vehicles.
 
-What a paper does not give (tyres, wheel inertia, the vehicle of 003) is that of the simulator's
-sedan or of an ordinary car; all four wheels drive, as in the papers.
+Data that a paper does not give (tyres, wheel inertia, the vehicle of 003) are those of the
+simulator's sedan or of an ordinary car; all four wheels drive, as in the papers.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The interface kuksa.val.v2 served by gRPC: what the specification says of GetValue, Subscribe and
-PublishValue.
+"""Fake databroker: the interface kuksa.val.v2 over gRPC, with GetValue, Subscribe and PublishValue
+as specified.
 
-Unknown paths are NOT_FOUND; a subscription answers at once with all that is known, and then with
-each update; what a slow subscriber does not fetch is buffered up to its `buffer_size`, and then the
-oldest is dropped.
+Unknown paths are NOT_FOUND. A subscription answers at once with all known values, and then with
+each update. Updates for a slow subscriber are buffered up to its `buffer_size`; then the oldest are
+dropped.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Databroker:
 
     @property
     def subscribers(self) -> int:
-        """How many listen."""
+        """Return the number of subscribers."""
         return len(self._subscribers)
 
     def value(self, path: str) -> Any:  # noqa: ANN401

@@ -1,5 +1,5 @@
-"""What live sources lose: samples at 100 Hz for a minute, and the agent itself when a source is
-killed.
+"""Benchmark of live sources: lost samples at 100 Hz over a minute, and the agent itself when a
+source is killed.
 """
 
 from __future__ import annotations
@@ -238,8 +238,8 @@ def _shows(
     silent: bool,
     patience_s: float = PATIENCE_S,
 ) -> bool:
-    """Whether the health of a running agent comes to say that a source is silent, or no longer
-    says so.
+    """Return whether the health of a running agent begins to report a source as silent, or ceases
+    to.
     """
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
@@ -255,7 +255,7 @@ def _shows(
 
 
 def _troubles(port: int) -> list[str]:
-    """What an agent's `/healthz` says is wrong, nothing while it does not answer."""
+    """Return the problems in an agent's `/healthz`; none while it does not answer."""
     try:
         with urllib.request.urlopen(
             f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S

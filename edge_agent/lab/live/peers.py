@@ -1,9 +1,10 @@
-"""What live sources listen to, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS
-SAMPLES RATE`.
+"""Senders for live sources, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS SAMPLES
+RATE`.
 
-A peer says `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and says
-how many messages that were. It ends with its input; so it can be killed and started anew at the
-same address. Of a databroker it is the interface kuksa.val.v2 as published, not the broker itself.
+A peer prints `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and
+prints the number of messages. It ends when its input ends, so it can be killed and restarted at the
+same address. The databroker peer implements the published interface kuksa.val.v2; it is not the
+broker itself.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ HASH: Final = "RIHS01_" + "0" * 64
 
 
 def drive_at(t: float) -> dict[str, float]:
-    """What the channels read at time t [s] of a gentle slalom."""
+    """Return the readings of the channels at time t [s] of a gentle slalom."""
     rate = 0.2 * np.sin(1.5 * t)
     return {
         "ax": 0.0,

@@ -35,7 +35,7 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """How the ants behave; InputError where a habit leaves its range."""
+    """Parameters of the ants' behaviour; InputError where one leaves its range."""
 
     alpha: float = 1.0  # weight of pheromone, α
     theta: float = 1.0  # weight of visibility, θ₀

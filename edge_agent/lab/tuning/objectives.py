@@ -1,4 +1,4 @@
-"""What a set of memberships is worth on simulated drives.
+"""Scores of a set of memberships on simulated drives.
 
 Legend
     l, u, mu    stated 5 % and 95 % quantiles of friction, and the true mean of the four wheels [1]
@@ -222,7 +222,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
-    """Run the estimator over the drives and score what it says after the first second."""
+    """Run the estimator over the drives and score its output after the first second."""
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
         drives.t, drives.signals, threads=2
     )

@@ -1,5 +1,5 @@
-"""Recorded drives as a search takes them: without a truth, so that only what was measured next
-can judge.
+"""Recorded drives as input of a search: there is no ground truth, so only the next measurements can
+judge.
 """
 
 from __future__ import annotations

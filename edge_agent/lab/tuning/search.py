@@ -1,8 +1,8 @@
-"""What the two searches share: a graph of positions, a result, a history.
+"""Parts that the two searches share: a graph of positions, a result, a history.
 
 A search looks for the best vector of one value per vertex, each from its own short list of
-positions. It knows nothing of filters: the objective is any function of that vector, larger is
-better.
+positions. It does not depend on filters: the objective is any function of that vector, and larger
+is better.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ Progress = Callable[[Iteration], None]
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be maximised, over which vectors.
+    """The objective to maximise, and the vectors to search.
 
     objective: value of a vector (V,). choices: per vertex its positions, ascending. start (V,): the
     first vector evaluated, so that the result is never worse than it. admissible: vectors that may
@@ -153,7 +153,7 @@ class Ledger:
             progress(self.history[-1])
 
     def result(self) -> Result:
-        """What was found; InputError before the first evaluation."""
+        """Return the result of the search; raise InputError before the first evaluation."""
         if self.best_path is None:
             raise InputError(
                 "ants, iterations", "nothing was evaluated", "use at least one of each"

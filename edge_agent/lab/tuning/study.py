@@ -43,7 +43,7 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """How R stands to the noise: the filter's R over VARIANCE, and whether the noise follows the
+    """Ratio of R to the noise: the filter's R over VARIANCE, and whether the noise follows the
     paper's schedule.
     """
 
@@ -97,7 +97,7 @@ class StudySet:
 
 
 class StudyScores(NamedTuple):
-    """How memberships do under one condition, mean over the drives."""
+    """Scores of memberships under one condition, mean over the drives."""
 
     log_likelihood: float  # of the innovations, more is better [nat/s]
     nis: float  # per row; near 1 where the stated covariance is right [1]
@@ -183,7 +183,7 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
-    """Mean log-likelihood over the conditions [nat/s]: what is searched for."""
+    """Return the mean log-likelihood over the conditions [nat/s], the objective of the search."""
     return float(
         np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])
     )

@@ -50,7 +50,7 @@ SHOWN: Final = (*GIVEN, *WAYS)
 
 @dataclass
 class Study:
-    """Results of every repeat of every way, and what the found memberships are worth on held-out
+    """Results of every repeat of every way, and the scores of the found memberships on held-out
     drives.
     """
 
@@ -59,7 +59,7 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """What each repeat found, or what is given."""
+        """Return the memberships that each repeat found, or the given ones."""
         if way in GIVEN:
             return [GIVEN[way]]
         return [memberships_of(result.best) for result in self.found[way]]
@@ -174,8 +174,8 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """What the file of tuned memberships says of a way: over all conditions, on both sets of
-    drives.
+    """Return the scores of a way in the file of tuned memberships: over all conditions, on both
+    sets of drives.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
