@@ -1,12 +1,11 @@
-"""Coverage-guided fuzzing of parsers: what an input makes run decides whether it is kept and
-changed further.
+"""Coverage-guided fuzzing of parsers: an input that runs new lines is kept and changed further.
 
     python -m tests.fuzz [--seconds 45] [--only NAME …] [--seed N] [--out .fuzz]
 
 Each parser has seeds in `tests/data/fuzz/NAME/`, which are kept, and a corpus in the folder
 `--out`. A crash is any exception that the parser does not document; a hang is more than SLOW_S for
-one input. Inputs that crash or hang are written next to the corpus. Found inputs that matter belong
-into `tests/data/fuzz`.
+one input. Inputs that crash or hang are written next to the corpus. Add useful inputs that it finds
+to `tests/data/fuzz`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own: no
+"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own; no
 container engine is needed.
 
-The Python is this machine's of the version that FROM names, in a fresh environment; folders of the
-image lie below another root. What the image then holds is started: a router, and a service that is
-ready without compiling anything. Users cannot be changed here: what USER names is only looked at.
+Python is this machine's interpreter of the version that FROM names, in a fresh environment; folders
+of the image lie below another root. Then the content of the image is started: a router, and a
+service that is ready without compiling anything. Users cannot be changed here: the user of USER is
+only checked.
 """
 
 from __future__ import annotations
@@ -152,7 +153,7 @@ def starts(image: Image) -> float:
 
 
 def main() -> int:
-    """Build it, and start what it holds."""
+    """Build the image, and start its processes."""
     with tempfile.TemporaryDirectory() as folder:
         image = Image(Path(folder))
         (image.root / "home").mkdir()

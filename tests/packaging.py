@@ -1,8 +1,9 @@
-"""`make package`: builds sdist and wheel, tries the wheel in a fresh environment, far from here.
+"""`make package`: builds sdist and wheel, tries the wheel in a fresh environment, outside the
+source tree.
 
-The wheel is built from the sdist, so that what is missing in the one is missed in the other. It is
-tried with each Python of VERSIONS that this machine has, on the PATH or among pyenv's; for those
-that it has not, a line says so. `--python` names others.
+The wheel is built from the sdist, so that a file missing in the one is missed in the other. It is
+tried with each Python of VERSIONS that this machine has, on the PATH or among pyenv's; for the
+others it prints a line. `--python` names more.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def main() -> int:
 
 
 def use(python: str, wheel: Path, folder: Path) -> None:
-    """Install the wheel for an interpreter and do in an empty folder what a new user does first."""
+    """Install the wheel for an interpreter and do the first steps of a new user in an empty folder."""
     folder.mkdir()
     run([python, "-m", "venv", folder / "venv"], folder)
     scripts = folder / "venv" / "bin"

@@ -246,7 +246,7 @@ def keep(name: str, source: Path) -> str:
         source: the `figures.json` that the campaign wrote.
 
     Returns:
-        one line that says what was done, or why nothing was.
+        one line with the result, or the reason why nothing was kept.
     """
     campaign = CAMPAIGNS[name]
     if not source.exists():

@@ -138,7 +138,7 @@ class Network:
             process.terminate()
 
     def linked(self) -> None:
-        """Wait until what is put at one router comes out at the other, both ways."""
+        """Wait until a message put at one router comes out at the other, both ways."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with self.session(SERVICE, first) as here, self.session(SERVICE, second) as there:
                 arrived = threading.Event()

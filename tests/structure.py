@@ -362,8 +362,8 @@ class Figure(NamedTuple):
 
     Attributes:
         name: of the figure.
-        bar: value that is the aim.
-        ceiling: value that must not be exceeded; at most what was measured last.
+        bar: value to reach.
+        ceiling: value that must not be exceeded; at most the last measured value.
         places: returns one entry per counted thing.
         per_1000: True if the value is per 1,000 lines of the packages.
     """

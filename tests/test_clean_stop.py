@@ -1,5 +1,5 @@
-"""SIGTERM and Ctrl-C: agent and service flush, settle what they can, and are gone, whatever the
-router does.
+"""SIGTERM and Ctrl-C: agent and service flush, settle as many reports as they can, and end,
+whatever the router does.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ ICE = 0.25
 
 
 class System:
-    """A router and a service in this process, and the folder with what they and the agents
-    leave.
+    """A router and a service in this process, and the folder with the files of the service and the
+    agents.
     """
 
     def __init__(self, folder: Path, endpoint: str) -> None:

@@ -1,5 +1,5 @@
-"""The frame of the fault campaigns: it reports what is missing, and its census sees what is lost
-or doubled.
+"""The frame of the fault campaigns: it reports missing figures, and its census finds lost and
+doubled rows.
 """
 
 from __future__ import annotations

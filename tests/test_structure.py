@@ -229,7 +229,7 @@ def impurities(tree: ast.AST) -> list[tuple[int, str]]:
 
 
 def undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Public modules, classes and functions without a docstring; what is inside a function is
+    """Yield public modules, classes and functions without a docstring; names inside a function are
     private.
     """
     if ast.get_docstring(tree) is None:

@@ -1,4 +1,4 @@
-"""The town of listening cars: a listening car does not publish what others sent, and its figures
+"""The town of listening cars: a listening car does not publish reports of others, and its figures
 are correct.
 """
 

@@ -33,7 +33,7 @@ def _say(sign: str, what: str) -> None:
 def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
 ) -> str | None:
-    """Run a module as `beside.run_module` does."""
+    """Run a module as the service does, and print when it begins and ends."""
     _say(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)
     _say(ENDS, COMPACTING)

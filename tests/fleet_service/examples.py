@@ -1,4 +1,4 @@
-"""Observations and batches made by hand, and what a cell believes after them."""
+"""Observations and batches made by hand, and the resulting belief of a cell."""
 
 from __future__ import annotations
 

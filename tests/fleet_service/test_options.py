@@ -1,8 +1,9 @@
-"""Every option of the commands is seen to matter: it is changed, the command runs, and what it does
-is another thing than before.
+"""Every option of the commands has an effect: the test changes it, runs the command, and requires
+another result than before.
 
-A command runs on copies of the archive that is kept; what it prints, its exit code and every file
-below its folder is what it does. It does the same twice, so that a difference is the option's.
+A command runs on copies of the reference archive. Its result is its output, its exit code and every
+file below its folder. Each command gives the same result twice, so that a difference comes from the
+option.
 """
 
 from __future__ import annotations

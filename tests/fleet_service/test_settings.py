@@ -1,6 +1,4 @@
-"""Every setting of the service is seen to matter: it is changed, and what the service does is
-another thing.
-"""
+"""Every setting of the service has an effect: the test changes it, and requires another behaviour."""
 
 from __future__ import annotations
 

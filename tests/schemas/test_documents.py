@@ -137,7 +137,9 @@ def test_limits_that_are_written_in_words_are_those_of_the_code() -> None:
 
 
 def table_of_ranges() -> str:
-    """The README's table of what a report may carry, from the tables of the contract."""
+    """Return the README's table of the ranges of a report's columns, from the tables of the
+    contract.
+    """
     lines = ["| column | unit | range |", "|---|---|---|"]
     fields = {
         field.name: field

@@ -3,8 +3,8 @@ else of GripMap.
 
 python -m tests.schemas.third_party ENDPOINT: reports ice by two vehicles, one in protobuf and one
 in JSON, reads its acknowledgements, the reports, the tile, the alerts and the map's answers, and
-prints what it found as one line of JSON. Only ever run as a program: to import it would hinder the
-importer too.
+prints the results as one line of JSON. Run it only as a program: importing it would block GripMap's
+modules in the importing process too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`make usability`: every figure of the first hour, measured; writes `.usability/figures.json`.
 
---only NAME ... measures these; what is left out is not in the file, and a missing figure is a
+--only NAME ... measures these; other figures are not in the file, and a missing figure is a
 failure.
 """
 
@@ -54,7 +54,7 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """A folder with an archive, and what is said on the way."""
+    """A folder with an archive, and the figures with their notes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -64,7 +64,7 @@ class House:
         mistakes.prepare(folder)
 
     def note(self, what: str, found: object) -> None:
-        """Say what a figure is made of."""
+        """Print the measurements behind a figure."""
         print(f"{what}: {found}", flush=True)
 
 

@@ -29,13 +29,13 @@ def test_inference_rises_with_the_mismatch_and_covers_its_whole_range() -> None:
     assert (np.diff(reported) >= 0).all()
 
 
-def test_noise_grows_where_the_actual_innovation_exceeds_the_theoretical_one() -> None:
+def test_noise_grows_where_innovations_exceed_their_theory() -> None:
     assert adapted(1.0, 3.0, 1.0, INPUTS, OUTPUTS) > 1.0
     assert adapted(1.0, 1.0, 1.0, INPUTS, OUTPUTS) == 1.0
     assert adapted(2.0, 0.2, 1.0, INPUTS, OUTPUTS) < 2.0
 
 
-def test_the_factor_stays_within_its_bounds_however_long_the_mismatch_lasts() -> None:
+def test_noise_factor_stays_in_bounds_during_a_long_mismatch() -> None:
     high = low = 1.0
     for _ in range(1000):
         high = adapted(high, 100.0, 1.0, INPUTS, OUTPUTS)
@@ -59,7 +59,7 @@ def test_a_file_from_before_the_rules_has_the_untuned_ones() -> None:
     assert Memberships.from_json(old) == Memberships.from_vector(SETS.to_vector()[:12]) == SETS
 
 
-def test_a_file_from_before_the_test_of_contradiction_keeps_what_it_still_steers() -> None:
+def test_file_older_than_the_consistency_test_keeps_its_valid_entries() -> None:
     old = SETS.to_json() | {"stretched": [14.0, 22.0], "lately": [0.08, 0.15]}
     assert Memberships.from_json(old) == SETS
 

@@ -35,7 +35,7 @@ def test_membership_is_none_at_the_foot_full_at_the_peak_and_even_between() -> N
     ]
 
 
-def test_offsets_hurry_where_the_wheels_are_far_and_not_where_nothing_is_asked_for() -> None:
+def test_offsets_adapt_fast_for_far_wheels_only_where_grip_is_used() -> None:
     assert hurry(TUNED, TUNED.far[1]) == 0.3
     assert hurry(TUNED, TUNED.far[0]) == 0.0
     assert hurry(IDLE, 100.0) == 0.0

@@ -29,7 +29,7 @@ def test_at_the_peaks_the_table_itself_speaks_and_beyond_them_its_edge() -> None
     assert infer_two(1e9, 1e9, ALPHA, RATE, TABLE) == pytest.approx(math.log(8.0))
 
 
-def test_r_grows_where_innovations_are_larger_than_expected_and_shrinks_where_smaller() -> None:
+def test_r_follows_the_ratio_of_actual_to_expected_innovations() -> None:
     assert infer_two(2.0, 0.0, ALPHA, RATE, TABLE) > 0.0 > infer_two(-0.7, 0.0, ALPHA, RATE, TABLE)
 
 

@@ -40,13 +40,13 @@ def test_a_drive_that_excites_finds_its_friction_and_its_velocity(name: str) -> 
     assert reported.mu_utilised[-1, 0] > 0.35
 
 
-def test_straight_on_at_constant_speed_the_interval_stays_as_wide_as_the_prior() -> None:
+def test_interval_keeps_the_width_of_the_prior_without_excitation() -> None:
     t, signals, vehicle = drive("straight", 0.85)
     reported = run("fckf", t, signals, vehicle)
     assert (reported.mu_upper - reported.mu_lower)[-1, 0] >= 0.8 * PRIOR_WIDTH
 
 
-def test_what_was_learned_is_forgotten_over_the_metres_driven_without_excitation() -> None:
+def test_estimate_is_forgotten_over_metres_without_excitation() -> None:
     turn = drive("j-turn", 0.5)
     straight = drive("straight", 0.5, seconds=40.0)
     t, signals = joined(turn, straight)
@@ -93,7 +93,7 @@ def test_closing_visits_does_not_change_the_estimates() -> None:
     assert (closed.evidence[closes].max(axis=-1) == 0.0).all()
 
 
-def test_two_beliefs_that_enter_a_cell_send_the_same_evidence_within_half_a_nat() -> None:
+def test_evidence_of_a_cell_is_independent_of_the_belief_at_entry() -> None:
     visit = drive("slalom", 0.3, seconds=8.0)
     reported = []
     for before in (0.3, 0.85):
@@ -117,9 +117,7 @@ def test_a_visit_straight_on_is_flat() -> None:
     assert np.ptp(reported.evidence[500, 0]) < 0.2
 
 
-def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anything_above() -> (
-    None
-):
+def test_gentle_braking_excludes_only_friction_below_the_grip_used() -> None:
     t, signals, vehicle = drive("gentle-braking", 0.85)
     closes = np.zeros(len(t), bool)
     end = int(np.searchsorted(t, 4.0))
@@ -289,7 +287,7 @@ def test_a_single_false_acceleration_is_told_refused_and_bridged(size: float) ->
     assert (reported.vy_std < 1.5 * plain.vy_std).all()
 
 
-def test_an_acceleration_that_jumps_and_stays_is_believed_at_the_second_reading() -> None:
+def test_lasting_jump_of_acceleration_is_accepted_at_the_second_reading() -> None:
     t, signals, vehicle = drive("straight", None)
     signals = signals.copy()
     signals[300:, S.AX] += 5.0

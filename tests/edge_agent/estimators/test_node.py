@@ -69,13 +69,13 @@ def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
     assert np.isinf(theta_at(curve, 1.0))
 
 
-def test_far_beyond_the_table_a_spinning_wheel_still_has_the_force_of_sliding() -> None:
+def test_slip_beyond_the_table_gives_the_sliding_force() -> None:
     curve = curve_tables(partial(magic_formulas, c=1.45, e=-0.1))
     assert ratio_at(curve, 1e4) * 1e4 == pytest.approx(magic_formula(1e4, 1.45, -0.1), abs=2e-3)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, 1.0])
-def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have(
+def test_residual_noise_equals_that_of_slip_and_force_about_a_line(
     slope: float,
 ) -> None:
     rng = np.random.default_rng(0)
@@ -86,9 +86,7 @@ def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have
     assert distance.var() == pytest.approx(felt, rel=0.02)
 
 
-def test_the_densities_of_split_nodes_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> (
-    None
-):
+def test_two_split_nodes_share_a_friction_that_lies_between_them() -> None:
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     for side in range(2):
@@ -102,7 +100,7 @@ def test_the_densities_of_split_nodes_overlap_so_a_friction_between_two_of_them_
             assert min(held) > 0.0
 
 
-def test_split_sides_come_either_way_round_and_their_cells_share_out_all_they_have() -> None:
+def test_split_nodes_exist_for_both_sides_and_their_cells_sum_to_one() -> None:
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     assert sides.prior.sum() == pytest.approx(1.0)

@@ -34,7 +34,7 @@ def test_road_change_leaves_the_prior_as_it_is() -> None:
     assert out == pytest.approx(PRIOR, abs=1e-12)
 
 
-def test_road_change_keeps_the_whole_mass_and_brings_any_belief_back_to_the_prior() -> None:
+def test_road_change_keeps_the_mass_and_converges_to_the_prior() -> None:
     w = np.zeros(NODES)
     w[3] = 1.0
     out = np.empty(NODES)

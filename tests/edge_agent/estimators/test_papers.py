@@ -148,7 +148,7 @@ def test_straight_on_at_constant_speed_every_wheel_is_as_unknown_as_before(name:
     ).all()
 
 
-def test_with_wheel_torque_the_unscented_filter_finds_the_friction_of_a_slalom_on_snow() -> None:
+def test_unscented_filter_with_torque_finds_friction_of_snow_in_a_slalom() -> None:
     t, signals, vehicle = drive("slalom", 0.3)
     reported = run("sr-ukf", t, signals, vehicle)
     assert reported.mu_lower[-1, 0] < 0.3 < reported.mu_upper[-1, 0]
@@ -182,7 +182,7 @@ def test_every_setting_of_the_papers_filter_matters(change: dict[str, object]) -
     assert not np.array_equal(usual.mu, other.mu)
 
 
-def test_the_fuzzy_sets_matter_to_the_papers_filter_and_are_refused_where_there_are_none() -> None:
+def test_fuzzy_sets_change_the_papers_filter_and_are_refused_elsewhere() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
     still = Memberships(outputs=(0.0, 0.0, 0.0, 0.0, 0.0))
     reported = create("paper-aco-fckf", [vehicle], memberships=still).advance(

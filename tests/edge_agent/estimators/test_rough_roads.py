@@ -40,7 +40,7 @@ def at_rest(seconds: float, ax: float, torque: float) -> tuple[FloatArray, Float
 
 
 @pytest.mark.parametrize("torque", [0.0, np.nan])
-def test_a_car_that_stands_on_a_slope_stands_and_learns_nothing_of_friction(torque: float) -> None:
+def test_car_standing_on_a_slope_learns_nothing_about_friction(torque: float) -> None:
     vehicle = drive("straight", 0.85)[2]
     said = run(*at_rest(40.0, 0.05 * GRAVITY, torque), vehicle)
     assert np.abs(said.vx).max() < 0.2
@@ -60,7 +60,7 @@ def test_a_car_that_starts_after_it_stood_is_not_held_back() -> None:
     assert abs(said.vx[-50:].mean() - gained) < 0.1 * gained
 
 
-def test_a_slope_without_torque_is_no_ice_and_wheels_that_agree_are_the_speed() -> None:
+def test_slope_without_torque_is_no_ice_and_agreeing_wheels_give_speed() -> None:
     t, signals, vehicle = drive("straight", 0.85, seconds=20.0)
     climbing = without_torque(signals)
     climbing[:, S.AX] += 0.07 * GRAVITY
@@ -88,14 +88,14 @@ def test_no_upper_end_lies_below_the_grip_in_use_even_beyond_the_grid() -> None:
     assert (said.mu_upper >= said.mu).all()
 
 
-def test_without_torque_the_axle_that_drives_is_found_and_friction_is_right() -> None:
+def test_driven_axle_is_found_without_torque_and_friction_is_right() -> None:
     t, signals, vehicle = drive("firm-acceleration", 0.85)
     said = run(t, without_torque(signals), vehicle)
     assert said.mu_lower[-1, 0] < 0.85 < said.mu_upper[-1, 0]
     assert said.mu_lower[-1, 0] > 0.3  # and not only the prior
 
 
-def test_steering_that_is_late_contradicts_and_then_the_interval_is_the_priors() -> None:
+def test_late_steering_contradicts_the_model_and_restores_the_prior() -> None:
     t, signals, vehicle = drive("sine", 0.85, seconds=30.0)
     late = signals.copy()
     late[:, DELTA] = np.roll(signals[:, DELTA], 80, axis=0) + 0.1 * np.sin(5.0 * t)[:, None]

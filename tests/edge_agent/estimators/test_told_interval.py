@@ -73,7 +73,7 @@ def test_who_knows_nothing_tells_the_prior() -> None:
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.3, 0.5, 0.8])
-def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_as_much(
+def test_correct_vehicle_file_lowers_only_the_upper_end(
     mu: float,
 ) -> None:
     weight = about(mu, 0.1)
@@ -85,7 +85,7 @@ def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_a
     assert told(DESIGN.prior, likeness=1.0) == told(DESIGN.prior)
 
 
-def test_a_learned_upper_end_is_nearer_than_a_quantile_of_tempered_evidence() -> None:
+def test_learned_upper_end_is_below_the_quantile_of_tempered_evidence() -> None:
     weight = about(0.8, 0.1)
     _, median, upper = told(weight)
     assert median < upper < quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)

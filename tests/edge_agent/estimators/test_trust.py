@@ -47,13 +47,13 @@ def after(
     return bank._filters["trust"][0], (health.astype(np.int64) & Health.CONTRADICTION) > 0
 
 
-def test_strain_is_one_where_nothing_was_learned_and_chi_square_over_freedom_of_much() -> None:
+def test_strain_goes_from_one_to_chi_square_over_degrees_of_freedom() -> None:
     assert strain(0.0, 0.0, 2.0) == 1.0
     assert strain(5000.0, 5000.0, 2.0) == pytest.approx(2.0, rel=1e-3)
     assert strain(0.0, 10.0, 2.0) < 0.2
 
 
-def test_axles_are_surer_in_a_car_that_is_as_its_file_says_and_within_limits() -> None:
+def test_axles_are_more_certain_with_a_correct_vehicle_file() -> None:
     usual = CONSTANTS.strain_usual
     assert strained_noise(believing(strained=usual), CONSTANTS) == pytest.approx(1.0)
     noise = [
@@ -64,11 +64,11 @@ def test_axles_are_surer_in_a_car_that_is_as_its_file_says_and_within_limits() -
     assert (noise[0], noise[-1]) == (CONSTANTS.strain_least, CONSTANTS.strain_most)
 
 
-def test_innovations_as_stated_speak_for_the_model_and_thrice_as_large_ones_against_it() -> None:
+def test_innovations_as_stated_support_the_model_threefold_ones_do_not() -> None:
     assert axles_ratio(1.0) < 0.0 < axles_ratio(FACTOR)
 
 
-def test_evidence_is_believed_less_and_less_until_the_brink_and_then_not_at_all() -> None:
+def test_weight_of_evidence_falls_to_zero_at_the_limit() -> None:
     shares = [
         credence(believing(odd=share * CONSTANTS.odd_least), CONSTANTS)
         for share in (0.0, 0.3, 0.8, 1.0, 2.0)
@@ -95,9 +95,7 @@ def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
     assert trust["odd"] < CONSTANTS.odd_least
 
 
-def test_side_force_that_nothing_turns_contradicts_for_as_long_as_patience_and_a_straight_undoes_nothing() -> (
-    None
-):
+def test_unexplained_side_force_contradicts_until_patience_ends() -> None:
     vehicle = drive("straight", 0.85)[2]
     t = np.arange(0.0, 5.0 + CONSTANTS.patience, 0.01)
     signals = np.zeros((len(t), 18))

@@ -68,7 +68,7 @@ def test_fusing_adds_information() -> None:
     assert mean == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filter() -> None:
+def test_federated_filter_with_halved_shared_rows_is_the_kalman_filter() -> None:
     """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the
     textbook filter.
     """
@@ -165,7 +165,7 @@ def test_a_downdate_takes_a_column_away() -> None:
     assert np.array_equal(root, np.tril(root))
 
 
-def test_a_downdate_that_would_leave_no_covariance_refuses_and_changes_nothing() -> None:
+def test_downdate_without_a_valid_covariance_changes_nothing() -> None:
     root = root_of(covariance(3, 10))
     before = root.copy()
     assert not downdate(root, 1.0001 * root[:, 0], np.empty(3))
@@ -203,7 +203,7 @@ def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
     assert cov == pytest.approx(other_cov, abs=1e-9)
 
 
-def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_system() -> None:
+def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
     rng = np.random.default_rng(21)
     n = 4
     f = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n))

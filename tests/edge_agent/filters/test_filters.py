@@ -155,7 +155,7 @@ def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> No
         assert np.allclose(ours_cov, cov, rtol=0, atol=1e-12)
 
 
-def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filter() -> None:
+def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
     rule = cubature(3)
     rng = np.random.default_rng(4)
     a = rng.normal(size=(3, 3))
@@ -211,7 +211,7 @@ def look(x: FloatArray) -> FloatArray:
     return np.stack([np.sin(x[:, 0]), x[:, 1] * np.cos(x[:, 0])], axis=1)
 
 
-def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance_filter() -> None:
+def test_square_root_filter_is_textbook_for_a_nonlinear_system() -> None:
     rule = cubature(2)
     rng = np.random.default_rng(8)
     q = 1e-3 * np.array([[1.0, 0.3], [0.3, 2.0]])

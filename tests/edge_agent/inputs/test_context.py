@@ -256,7 +256,7 @@ def test_a_live_source_that_tells_no_context_leaves_it_unknown() -> None:
     assert np.isnan(live_blocks({}, 1, 20, profile)).all()
 
 
-def test_a_flag_that_is_told_when_it_changes_holds_only_where_the_profile_says_so() -> None:
+def test_flag_sent_on_change_is_held_only_if_the_profile_says_so() -> None:
     names = ("ax", *CONTEXT)
     lasting = Profile(
         name="p", channels={n: Channel(signal=n, lasting=n in CONTEXT) for n in names}
@@ -267,7 +267,7 @@ def test_a_flag_that_is_told_when_it_changes_holds_only_where_the_profile_says_s
         assert np.isfinite(found[:, C.AIR_TEMPERATURE]).all()
 
 
-def test_a_databroker_tells_how_lasting_signals_stand_and_then_their_changes() -> None:
+def test_databroker_sends_lasting_signals_first_and_then_changes() -> None:
     port = free_port()
     profile = load_profile("vss")[0]
     air, abs_ = (profile.channels[name].signals[0] for name in ("air_temperature", "abs_active"))

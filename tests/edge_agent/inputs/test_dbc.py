@@ -33,7 +33,7 @@ def columns(data: list[bytes]) -> Bytes:
 
 
 @pytest.mark.parametrize("name", [name for name in shipped() if load_profile(name)[0].dbc])
-def test_made_frames_of_a_shipped_profile_decode_as_by_cantools_to_the_last_bit(name: str) -> None:
+def test_frames_of_shipped_profiles_decode_exactly_like_cantools(name: str) -> None:
     profile, folder = load_profile(name)
     assert profile.dbc is not None
     ours = read_dbc(folder / profile.dbc)

@@ -100,7 +100,7 @@ def test_a_log_as_csv_is_the_same_log(tmp_path: Path, some: list[can.Message], m
         assert whole[name].equals(other[name]), name
 
 
-def test_a_measurement_file_and_a_bag_of_sensors_are_drafted_from_their_names(
+def test_profile_draft_from_names_of_a_measurement_file_and_a_bag(
     tmp_path: Path, capsys: Output
 ) -> None:
     import asammdf
@@ -210,7 +210,7 @@ def test_gpsd_reports_are_the_same_fixes_as_sentences(
         assert np.allclose(series.t, again.signals[name].t)
 
 
-def test_a_log_in_local_time_is_put_beside_its_fixes_and_the_receivers_date_holds(
+def test_log_in_local_time_is_aligned_to_the_date_of_its_receiver(
     tmp_path: Path, some: list[can.Message], capsys: Output
 ) -> None:
     for message in some:
@@ -417,7 +417,7 @@ def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("part", ["*.db3", "metadata.yaml"])
-def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(
+def test_hostile_bag_folder_gives_a_clear_error_or_its_valid_readings(
     tmp_path: Path, part: str
 ) -> None:
     folder = formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3")
@@ -437,7 +437,7 @@ def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(
     assert refused > 0
 
 
-def test_a_hostile_database_or_profile_is_one_clear_error_or_what_is_left_of_it(
+def test_hostile_database_or_profile_gives_a_clear_error_or_valid_parts(
     tmp_path: Path,
 ) -> None:
     rng = np.random.default_rng(7)

@@ -150,7 +150,7 @@ def test_hostile_lines_of_a_receiver_are_counted() -> None:
         feed.close()
 
 
-def test_a_databroker_is_asked_for_what_it_knows_and_old_values_are_no_readings(
+def test_databroker_is_queried_and_old_values_are_no_readings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     port = free_port()

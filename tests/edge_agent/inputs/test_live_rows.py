@@ -67,9 +67,7 @@ def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None =
     return LiveRows(feeds, profile, CAR, clock, wait=wait or clock.move)
 
 
-def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> (
-    None
-):
+def test_foreign_time_stamps_are_moved_by_the_least_delay() -> None:
     own = Stamps()
     other = Stamps()
     delays = [0.3, 0.05, 0.2, 0.11]
@@ -96,7 +94,7 @@ def test_a_clock_that_is_set_under_way_is_followed() -> None:
     assert placed == pytest.approx(k + 0.02)
 
 
-def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(
+def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     clock: Steered,
 ) -> None:
     feed = Scripted("bus", clock)
@@ -210,7 +208,7 @@ def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
     ]
 
 
-def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counted(
+def test_rows_wait_for_a_slow_source_and_count_late_readings(
     clock: Steered,
 ) -> None:
     feed = Scripted("bus", clock)

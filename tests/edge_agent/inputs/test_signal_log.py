@@ -36,7 +36,7 @@ def test_the_channels_come_in_their_order(tmp_path: Path) -> None:
     assert log.start_ns is None
 
 
-def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(
+def test_absent_columns_nulls_and_infinities_are_missing_readings(
     tmp_path: Path,
 ) -> None:
     columns = {
@@ -63,7 +63,7 @@ def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(
         (("delta_fl",), [0.2, 0.2, 0.3, 0.4]),
     ],
 )
-def test_steering_without_a_column_is_the_other_front_wheels_or_none_at_the_rear(
+def test_steering_without_column_copies_the_front_and_is_zero_at_the_rear(
     tmp_path: Path, without: tuple[str, ...], expected: list[float]
 ) -> None:
     columns = a_log(3) | {

@@ -155,7 +155,7 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     assert observations.columns["mu_utilised"][:2].tolist() == pytest.approx([0.7, 0.1])
 
 
-def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_before() -> None:
+def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of
     the ice.
     """
@@ -194,7 +194,7 @@ def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
     return [float(used) for used in records.columns["mu_utilised"]]
 
 
-def test_grip_that_was_felt_at_the_border_of_a_cell_may_be_of_the_cell_beside() -> None:
+def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
     """Braking at the border, as far as a fix may be wrong, is told of neither cell; further
     inside of its own.
     """
@@ -222,7 +222,7 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 
 
 @pytest.mark.parametrize("cut", [None, 31, 33])
-def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_of_the_lesser(
+def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     cut: int | None,
 ) -> None:
     """From ice to dry road within the second visit: it was one or the other, and no more than the
@@ -274,7 +274,7 @@ def test_without_position_there_is_no_state() -> None:
     assert states.kind is Kind.STATE
 
 
-def test_an_observation_tells_what_controllers_and_surroundings_said_in_its_visit() -> None:
+def test_observation_contains_controller_flags_and_context_of_its_visit() -> None:
     """East through cells at 10 m/s; the first visit has an intervention, the second hardly any
     reading.
     """

@@ -54,8 +54,8 @@ def rebuilt_map(out: Path) -> pa.Table:
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
-    """The largest difference of a number of two maps; infinite where their cells, or what is
-    null, are not the same.
+    """Return the largest difference of a number of two maps; infinite where their cells, or their
+    nulls, are not the same.
     """
     if not all(
         ours[name].equals(theirs[name])

@@ -1,5 +1,5 @@
-"""Pictures of answers say what a reader acts on: roads, days, moments, names, and the line that
-was promised.
+"""Plots of answers show the parts that a reader needs: roads, days, moments, names, and the line of
+the contract.
 """
 
 from __future__ import annotations

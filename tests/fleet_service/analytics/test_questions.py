@@ -1,4 +1,4 @@
-"""Each question against an oracle in pandas or plain Python, and against what was planted in the
+"""Each question against an oracle in pandas or plain Python, and against the events planted in the
 synthetic archive.
 """
 

@@ -1,5 +1,5 @@
-"""An archive rebuilt zone by zone is what a replay of everything gives, and its roll-ups are
-those that it has.
+"""An archive rebuilt zone by zone equals a replay of everything, and its roll-ups equal the stored
+ones.
 """
 
 from __future__ import annotations

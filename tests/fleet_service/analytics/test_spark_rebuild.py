@@ -1,5 +1,5 @@
-"""`make spark-test`: what is rebuilt on Spark is, byte for byte, what is rebuilt here, whatever
-dies on the way.
+"""`make spark-test`: a rebuild on Spark equals a local one byte for byte, also when tasks die
+meanwhile.
 """
 
 from __future__ import annotations

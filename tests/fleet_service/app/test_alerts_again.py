@@ -1,5 +1,5 @@
-"""An alert that stands is told again: who was away, or behind a router that was restarted, hears
-it.
+"""Standing alerts are repeated, so that a client that was away, or behind a router that was
+restarted, receives them.
 """
 
 from __future__ import annotations

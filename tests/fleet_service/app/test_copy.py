@@ -203,7 +203,7 @@ def health(address: str) -> str:
 
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
-    """Send what is not acknowledged again, as spools do; whether all is."""
+    """Send unacknowledged batches again, as spools do; return True if all are acknowledged."""
     for one in fleet.unsettled(sent)[:20]:
         fleet.publish(one)
     return not fleet.unsettled(sent)

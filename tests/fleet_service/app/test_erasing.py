@@ -1,5 +1,5 @@
-"""A vehicle is erased beside a service that runs, and drives on: nothing of it is left, nothing
-of others is lost.
+"""A vehicle is erased while a service runs, and drives on: nothing of it is left, nothing of others
+is lost.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 
 def sent_by(vehicle: str, seq: int) -> Batch:
-    """Two visits: where all drive, and where only the one drives that is to be erased."""
+    """Return two visits: one where all vehicles drive, and one where only the vehicle to erase
+    drives.
+    """
     now = time.time_ns() - SECOND
     latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])
     cell = grid.cell_of(latitude, np.full(2, LONGITUDE))
@@ -145,7 +147,7 @@ def filled(root: Path, *names: str) -> Engine:
 
 
 def answered(engine: Engine, root: Path) -> None:
-    """Do what is asked for, with a worker."""
+    """Carry out the requests, with a worker."""
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())
     )

@@ -54,7 +54,7 @@ class Fleet:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alerted)
 
     def meet(self, *regions: int) -> Fleet:
-        """Wait until services for the regions hear what is published and asked."""
+        """Wait until services for the regions receive published messages and queries."""
         for region in regions or (REGION,):
             for name in (
                 keys.observation_key(region, "sim-000"),

@@ -1,11 +1,11 @@
-"""An archive to keep: every kind of file that a service writes, small, and the map that it stood
-for when it was made.
+"""A reference archive: every kind of file that a service writes, small, and the map that belonged
+to it when it was made.
 
     python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of
                                                            today
 
-`data/v1.0` was made so by commit 1f90692, before any file had a version. What is kept is never made
-again: it is what later code must go on reading.
+`data/v1.0` was made so by commit 1f90692, before any file had a version. A stored archive is never
+made again, because later code must go on reading it.
 
 Eight vehicles in two zones, around a midnight: compacted rows with their roll-ups and a snapshot, a
 checkpoint, and segments that came after it; dry road and ice, rows with a value, with a bound only,

@@ -1,4 +1,4 @@
-"""Compaction: nothing lost and nothing doubled, whenever it dies and whoever reads."""
+"""Compaction loses and doubles nothing, at whatever point it dies and with any reader."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
 
 
 def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """A spool that was brought back from a copy may hold what was acknowledged long ago."""
+    """A spool restored from a backup may hold rows that were acknowledged long ago."""
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -1,4 +1,4 @@
-"""Roll-ups: what a direct sum over the rows gives, whatever parts it was made of."""
+"""Roll-ups equal a direct sum over the rows, for every division into parts."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Versions of files: what is kept stays readable, other versions are no damage, and who only
-reads changes nothing.
+"""Versions of files: stored files stay readable, other versions are not damage, and a reader
+changes nothing.
 """
 
 from __future__ import annotations
@@ -53,11 +53,12 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """The map is the one that is kept beside, to what single precision and another machine's
-    logarithm leave.
+    """Assert that the map equals the stored one, up to single precision and another machine's
+    logarithm.
 
-    Its beliefs are what this fusion makes of the archive: one that thinks otherwise writes them
-    anew, and says why."""
+    Its beliefs are those that this fusion computes from the archive. A changed fusion must write
+    them again and give the reason.
+    """
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
     for now, line in zip(found["cells"], made["cells"], strict=True):

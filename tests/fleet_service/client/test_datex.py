@@ -1,4 +1,4 @@
-"""Slippery stretches as DATEX II: valid, versioned, ended; what is not heard of has not ended."""
+"""Slippery stretches as DATEX II: valid, versioned, ended; a stretch without news has not ended."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: 
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.1, 0.9), st.integers(1, 400))
-def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(
+def test_any_number_of_bounds_leaves_belief_flat_above_the_grip_used(
     used: float, vehicles: int
 ) -> None:
     fusion = Fusion(120.0)
@@ -45,7 +45,7 @@ def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.1, 0.9), st.integers(1, 200))
-def test_what_was_used_counts_where_an_estimator_was_contradicted_and_says_nothing(
+def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
     used: float, vehicles: int
 ) -> None:
     flat = np.zeros((vehicles, mugrid.BINS))

@@ -30,7 +30,7 @@ def test_a_backlog_of_an_hour_is_fused_and_its_order_of_arrival_is_nothing() -> 
     assert difference(straight, mixed) <= 1e-6
 
 
-def test_a_late_visit_to_a_cell_where_nobody_was_counts_as_it_would_have_in_time() -> None:
+def test_late_visit_to_an_unvisited_cell_counts_as_if_in_time() -> None:
     o = observations([600.0], [1], value([0.2]))
     found = []
     for parts in ((o, LIVE), (LIVE, o)):

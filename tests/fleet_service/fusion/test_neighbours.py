@@ -1,4 +1,4 @@
-"""What slippery neighbours tell of a cell, and what no neighbour does."""
+"""Influence of slippery neighbours on a cell, and its limits."""
 
 from __future__ import annotations
 

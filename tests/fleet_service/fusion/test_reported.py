@@ -34,7 +34,7 @@ def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
     assert np.isnan(reported[2]).all()
 
 
-def test_who_lies_is_compared_with_what_others_reported_and_not_with_what_is_used_of_it() -> None:
+def test_liar_is_compared_with_reported_values_not_with_used_parts() -> None:
     rng = np.random.default_rng(2)
     fusion = Fusion(120.0)
     n = 1200

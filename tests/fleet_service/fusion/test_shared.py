@@ -1,5 +1,5 @@
-"""What vehicles of one place have in common: no number of them averages it out, other manoeuvres
-do.
+"""Errors that vehicles of one place have in common: more vehicles do not average them out, other
+manoeuvres do.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ _rising = (
 
 @pytest.mark.parametrize("used", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("stated", [0.0, 0.2])
-def test_a_kernel_is_a_probability_for_every_road_and_leaves_the_prior_where_it_is(
-    used: float, stated: float
-) -> None:
+def test_kernel_rows_are_probabilities_and_keep_the_prior(used: float, stated: float) -> None:
     kernel = shared.shared_kernel(used, 1.0, stated)
     np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
     np.testing.assert_allclose(kernel @ mugrid.PRIOR, mugrid.PRIOR, atol=1e-15)
@@ -41,7 +39,7 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
-    """Of the interval, after thirty vehicles that agree."""
+    """Return the width of the interval after thirty vehicles that agree."""
     fusion = Fusion(120.0)
     n = len(manoeuvres)
     o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))
@@ -53,7 +51,7 @@ def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
     return upper - lower
 
 
-def test_many_who_do_the_same_are_no_certainty_and_other_manoeuvres_make_it_surer() -> None:
+def test_certainty_grows_with_manoeuvres_not_with_equal_vehicles() -> None:
     same = np.full(30, shared.BRAKING)
     mixed = np.arange(30) % 4
     spread = np.hypot(c.COMMON_ALWAYS, c.COMMON_MANOEUVRE) * 0.6

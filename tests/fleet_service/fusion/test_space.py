@@ -45,7 +45,7 @@ def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(
     np.testing.assert_allclose(share, share[::-1], atol=1e-9)
 
 
-def test_shares_are_those_of_visits_drawn_anywhere_in_a_cell_with_a_normal_error() -> None:
+def test_shares_match_simulated_visits_with_normal_position_error() -> None:
     rng = np.random.default_rng(1)
     for std in (3.0, 8.0):
         at = np.floor(
@@ -57,7 +57,7 @@ def test_shares_are_those_of_visits_drawn_anywhere_in_a_cell_with_a_normal_error
         )
 
 
-def test_a_good_fix_stays_in_its_cell_and_a_poor_one_reaches_along_the_heading() -> None:
+def test_good_fix_stays_in_its_cell_and_poor_one_spreads_along_heading() -> None:
     assert not spread(1.5)[1].any()
     x, y = grid.deinterleave(CELL)
     for yaw, ahead in ((0.0, (1, 0)), (np.pi / 2, (0, -1)), (np.pi, (-1, 0))):
@@ -94,7 +94,7 @@ def test_all_cells_together_learn_no_more_than_one_would(
     assert total <= information(told(sure)[0]) + 2e-3  # rounding of the 16 bits
 
 
-def test_a_cell_where_the_vehicle_was_perhaps_learns_a_little_and_is_not_visited() -> None:
+def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
     fusion = Fusion(120.0)
     cells, share = spread(5.0)
     o = observations([0.0], [1], value([0.2]))

@@ -118,7 +118,7 @@ def test_vehicle_with_a_record_sharpens_a_cell_and_a_newcomer_does_not() -> None
     ("used", "tail", "witnesses"),
     [(0.05, -12.0, 1), (0.19, -12.0, 1), (0.19, -4.0, 1), (0.19, -1.0, 0)],
 )
-def test_ice_far_below_any_grip_is_evidence_and_a_likely_tail_to_dry_road_is_none(
+def test_ice_below_any_grip_is_evidence_and_a_tail_of_dry_road_is_not(
     used: float, tail: float, witnesses: int
 ) -> None:
     assert count_witnesses(0.15, used, tail) == witnesses

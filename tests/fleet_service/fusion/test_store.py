@@ -1,6 +1,4 @@
-"""Room for the fusion: tables of any length find what was put in, and what nobody asks for any
-more is given back.
-"""
+"""Memory of the fusion: tables of any length find every stored key, and unused rows are freed."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ def test_a_table_of_any_length_finds_every_row_and_no_other(places: int) -> None
     assert (rows_of(table, rows, absent) == NONE).all()
 
 
-def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() -> None:
+def test_pairs_keep_their_share_and_are_found_after_every_growth() -> None:
     fusion = Fusion(LATENESS_S)
     vehicles = 3000
     for step in range(3):
@@ -46,7 +44,7 @@ def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() 
     assert fusion.live.visits[0] == 3 * vehicles
 
 
-def test_reporters_and_sources_of_hours_ago_are_dropped_and_new_ones_take_their_place() -> None:
+def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
     fusion = Fusion(LATENESS_S)
     cells = CELL + np.arange(40)
     fusion.update(observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells))
@@ -64,10 +62,10 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_new_ones_take_their_
     assert not np.allclose(belief(fusion, CELL + 7), before)
 
 
-def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_on_as_they_were() -> (
-    None
-):
-    """A fusion that dropped them takes what comes next as one that has them all."""
+def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
+    """A fusion that dropped them gives the same results for later observations as one that has them
+    all.
+    """
     fusion = Fusion(LATENESS_S)
     whole = Fusion(LATENESS_S)
     cells = CELL + np.arange(40)

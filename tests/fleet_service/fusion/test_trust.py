@@ -1,4 +1,4 @@
-"""Reputation: who is believed, and that talking to each other does not help."""
+"""Trust: which vehicles are trusted, and that a group that only agrees with itself gains nothing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def driven(private: int = 0) -> Fusion:
 
 
 @pytest.mark.parametrize("private", [0, 5])
-def test_a_group_that_agrees_only_with_itself_loses_its_vote_wherever_it_meets(
+def test_group_that_agrees_only_with_itself_loses_its_vote(
     private: int,
 ) -> None:
     fusion = driven(private)

@@ -1,4 +1,4 @@
-"""Who can move a cell, and how far: one vote per vehicle, many vehicles, change, trust."""
+"""Influence of votes on a cell: one vote per vehicle, many vehicles, change, trust."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_five_vehicles_narrow_a_cell_more_than_fifty_visits_of_one() -> None:
 
 
 @pytest.mark.parametrize("used", [0.1, 0.3, 0.5])
-def test_any_number_of_unexcited_vehicles_leaves_the_upper_end_at_the_priors(used: float) -> None:
+def test_any_number_of_unexcited_vehicles_keeps_the_priors_upper_end(used: float) -> None:
     fusion = Fusion(120.0)
     n = 200
     fusion.update(observations(np.arange(n) * 5.0, np.arange(n), at_least(np.full(n, used))))
@@ -136,7 +136,7 @@ def test_a_sender_that_says_nothing_changes_nothing() -> None:
 
 
 @given(st.lists(st.integers(0, 255), min_size=32, max_size=32), st.floats(0.0, 1.3))
-def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(
+def test_bound_says_nothing_above_the_grip_used_and_value_is_unchanged(
     steps: list[int], used: float
 ) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
@@ -148,7 +148,7 @@ def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(
         assert (found <= sent).all()
 
 
-def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() -> None:
+def test_upward_slopes_of_many_unexcited_visits_make_no_value() -> None:
     n = 60
     sloping = mugrid.encode_log_likelihood(np.tile(np.linspace(-2.0, 0.0, 32), (n, 1)))
     columns: dict[str, NDArray[Any]] = {
@@ -163,7 +163,7 @@ def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() 
     assert upper == pytest.approx(PRIOR_UPPER, abs=0.03)
 
 
-def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused() -> None:
+def test_flood_of_one_vehicle_is_bounded_and_reported_as_not_fused() -> None:
     fusion = Fusion(120.0)
     n = 500
     rng = np.random.default_rng(2)

@@ -56,7 +56,7 @@ def test_without_a_word_about_a_region_its_roads_age_by_the_clock() -> None:
         assert passed(weather, -5.0, 7.0) == pytest.approx((12.0, 12.0))
 
 
-def test_road_time_is_the_sum_over_what_the_weather_was_and_ends_with_a_reports_validity() -> None:
+def test_road_time_integrates_the_weather_until_a_report_expires() -> None:
     weather = w.weather_of(reports((0.0, RAIN), (1.0, FREEZING), (2.0, STEADY)))
     assert passed(weather, -1.0, 0.0) == pytest.approx((1.0, 1.0))
     assert passed(weather, 0.0, 1.0) == pytest.approx((w.WET_DRIFT, w.WET_CHANGE))
@@ -89,7 +89,7 @@ def after_an_hour(weather: w.Reports | None) -> np.ndarray:
     return belief(fusion, now=START + HOUR)
 
 
-def test_a_dry_value_fades_faster_when_water_freezes_and_slower_when_it_is_warm() -> None:
+def test_dry_value_fades_faster_in_frost_and_slower_in_warmth() -> None:
     width = {
         name: np.subtract(*interval(after_an_hour(reports((0.0, rows)) if rows else None))[::-1])
         for name, rows in (
@@ -103,9 +103,7 @@ def test_a_dry_value_fades_faster_when_water_freezes_and_slower_when_it_is_warm(
     assert slippery(after_an_hour(reports((0.0, FREEZING)))) > 2 * slippery(after_an_hour(None))
 
 
-def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_half_of_it_uniform() -> (
-    None
-):
+def test_unknown_road_fades_to_its_regions_prior_which_is_half_uniform() -> None:
     icy = np.where(mugrid.CENTRES < 0.4, 1.0, 0.0)
     told = dataclasses.replace(reports((0.0, STEADY)), prior=(icy / icy.sum())[None])
     fusion = Fusion(120.0)
@@ -115,9 +113,7 @@ def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_
     assert belief(fusion).min() > 0.4 / mugrid.BINS
 
 
-def test_weather_that_acts_on_what_was_not_folded_yet_gives_the_map_of_weather_known_before() -> (
-    None
-):
+def test_weather_for_the_open_window_gives_the_map_of_known_weather() -> None:
     rng = np.random.default_rng(8)
     n = 300
     o = observations(

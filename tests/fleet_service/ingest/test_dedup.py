@@ -1,4 +1,4 @@
-"""Admitted batches against a plain set as oracle, and the bound on what is remembered."""
+"""Admitted batches against a plain set as oracle, and the bound on remembered batches."""
 
 from __future__ import annotations
 

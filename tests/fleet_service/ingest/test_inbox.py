@@ -1,4 +1,4 @@
-"""The queue behind the subscribers: bounded by what it holds, and taken in steps."""
+"""The queue behind the subscribers: bounded by its content, and taken in steps."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""End-to-end drives: what the vehicles write is what the campaign reads and sets beside the
-truth.
-"""
+"""End-to-end drives: the campaign reads the files of the vehicles and compares them with the truth."""
 
 from __future__ import annotations
 
@@ -52,7 +50,7 @@ def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
-    """Cells beside CELL, seconds, and friction."""
+    """Return visits to cells next to CELL, from seconds and friction."""
     cell, seconds, mu = np.array(rows).T
     return pa.table(
         {
@@ -71,9 +69,7 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
     )
 
 
-def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> (
-    None
-):
+def test_truth_of_a_cell_is_that_of_its_last_half_minute_or_all_visits() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     slots, mu = end_to_end.joined(

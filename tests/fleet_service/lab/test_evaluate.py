@@ -1,4 +1,4 @@
-"""The campaign, tiny: every figure of the issue is there, and the parts do what they say."""
+"""The campaign on a small scale: every figure is there, and the parts work as documented."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.usefixtures("small")
-def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plots(
+def test_quick_campaign_writes_figures_with_bars_table_and_plots(
     tmp_path: Path,
 ) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--skip-whole-way"]) == 0
@@ -127,7 +127,7 @@ def test_a_single_visit_without_bias_is_calibrated() -> None:
     assert safe(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.95, abs=0.015)
 
 
-def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it_out() -> None:
+def test_error_shared_in_one_place_is_not_averaged_out() -> None:
     rng = np.random.default_rng(4)
     common = np.concatenate([town.build(rng, 1, 0.0).common for _ in range(40)])
     assert np.std(common) == pytest.approx(agent.COMMON, rel=0.15)
@@ -164,9 +164,7 @@ def test_what_is_delivered_twice_is_admitted_once() -> None:
     np.testing.assert_array_equal(np.sort(kept), np.arange(len(visits)))
 
 
-def test_the_federated_reset_is_the_inverse_variance_of_readings_and_the_newest_report_the_last() -> (
-    None
-):
+def test_federated_reset_is_inverse_variance_and_newest_is_the_last() -> None:
     seconds = np.arange(3.0)
     place = np.zeros(3, np.int64)
     reading = np.array([0.5, 0.7, np.nan])

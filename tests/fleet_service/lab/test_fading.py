@@ -9,7 +9,7 @@ import numpy as np
 from fleet_service.lab import fading
 
 
-def test_what_is_vouched_for_falls_with_time_and_falls_faster_in_rain_and_frost() -> None:
+def test_lower_end_falls_with_time_and_faster_in_rain_and_frost() -> None:
     lower = {
         name: fading.lower_ends(np.random.default_rng(1), known)
         for name, known in fading.WEATHER.items()

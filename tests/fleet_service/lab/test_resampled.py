@@ -1,4 +1,4 @@
-"""Errors drawn from what was driven: of the same vehicle, on a like road, scaled to the town's."""
+"""Errors resampled from drives: of the same vehicle, on a similar road, scaled to the town's."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def a_town(seed: int) -> tuple[town.Visits, np.random.Generator]:
     return town.drive(rng, town.build(rng, MINUTES, 0.0), Errors.draw(rng, VEHICLES), MINUTES), rng
 
 
-def test_a_town_s_vehicle_is_one_of_the_ways_and_its_reports_are_of_the_town_s_road() -> None:
+def test_vehicle_of_a_town_is_one_of_the_ways_on_the_towns_road() -> None:
     visits, rng = a_town(1)
     low = np.array([0.7, 0.8, 0.9, 1.0, 1.1])
     mu = np.tile(np.geomspace(0.05, 1.2, 80), len(low))

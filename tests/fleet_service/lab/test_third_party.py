@@ -1,5 +1,5 @@
-"""A fleet that is not ours: its error model is as stated, and its figures are true of what a map
-says.
+"""A fleet of another maker: its error model is as stated, and its figures match the answers of a
+map.
 """
 
 from __future__ import annotations

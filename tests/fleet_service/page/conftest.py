@@ -1,4 +1,4 @@
-"""A page of this process beside a router and a service, and a browser in front of it."""
+"""A page in this process with a router and a service, and a browser in front of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.waiting import until
 
 @dataclass
 class RunningPage:
-    """A page that listens, and what it is about."""
+    """A page that listens, with its folder and address."""
 
     address: str
     service: Running | None
@@ -55,7 +55,7 @@ def bare(router: ZenohSettings) -> Iterator[str]:
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """A page beside a service that keeps a snapshot each second."""
+    """A page next to a service that keeps a snapshot each second."""
     archive = tmp_path / "archive"
     with (
         running(router, archive, snapshot_s=1.0) as service,

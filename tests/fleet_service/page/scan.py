@@ -1,4 +1,4 @@
-"""Accessibility of the page by axe-core: what it calls serious or critical, in every panel."""
+"""Accessibility scan of the page by axe-core: serious and critical findings in every panel."""
 
 from __future__ import annotations
 

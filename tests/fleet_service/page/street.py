@@ -27,7 +27,7 @@ MIDDLE: Final = tuple(int(v) for v in grid.deinterleave(CELL))
 
 
 class Part(NamedTuple):
-    """Cells of a street, the headings they are driven in, and what is found there; None: they
+    """Cells of a street, the headings they are driven in, and the friction found there; None: they
     are only passed.
     """
 

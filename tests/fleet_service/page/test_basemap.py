@@ -1,5 +1,5 @@
-"""Tiles below the cells from a file of the operator's own: what is read, what is refused, what a
-person sees.
+"""Tiles below the cells from a file of the operator's own: accepted files, refused files, and the
+picture.
 """
 
 from __future__ import annotations

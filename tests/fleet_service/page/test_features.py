@@ -1,4 +1,4 @@
-"""The map as OGC API Features: opened by GDAL's own client, asked by hand, and what is refused."""
+"""The map as OGC API Features: opened by GDAL's own client, queried by hand, and refused requests."""
 
 from __future__ import annotations
 

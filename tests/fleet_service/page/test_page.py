@@ -1,4 +1,6 @@
-"""The page in a real browser, before a real service: what a person sees, does and may not miss."""
+"""The page in a real browser, in front of a real service: views, actions, and warnings that must
+not be missed.
+"""
 
 from __future__ import annotations
 

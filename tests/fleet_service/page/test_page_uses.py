@@ -1,5 +1,5 @@
-"""The page as it is used beside the desk: a night played, a sound, on paper, on a wall, a
-dropped route, read aloud.
+"""Other uses of the page: a night played, a sound, on paper, on a wall, a dropped route, read
+aloud.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Records say what the map says, never drier; ancestors say the worst of what is below them."""
+"""Records agree with the map and are never drier; ancestors have the worst value of their cells."""
 
 from __future__ import annotations
 

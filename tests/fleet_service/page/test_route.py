@@ -1,4 +1,4 @@
-"""Grip along a route: what is unknown stays unknown, and speed comes from the lower end."""
+"""Grip along a route: an unknown part stays unknown, and speed follows from the lower end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's server: what it refuses, what it says on connect, how many watch, who is told to
+"""The page's server: refused requests, messages at connect, number of watchers, and requests to
 reload.
 """
 

@@ -42,8 +42,8 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
 
 
 def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
-    """Imports become what a module gave; a name that two modules have for themselves is two
-    things.
+    """An import becomes the exported value; a private name that two modules use stays two
+    variables.
     """
     modules = {
         "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',

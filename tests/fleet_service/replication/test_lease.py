@@ -1,5 +1,5 @@
-"""A service that is gone, frozen or cut off is followed by another; what it acknowledged is
-there, once.
+"""A service that is gone, frozen or cut off is followed by another, which has every acknowledged
+row once.
 """
 
 from __future__ import annotations

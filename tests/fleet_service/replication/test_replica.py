@@ -1,5 +1,5 @@
-"""The second place: what is settled is there, what goes here goes there, and an empty disk has
-it all again.
+"""The bucket replica: settled rows are there, deletions follow, and an empty disk is restored from
+it.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ def called(
     return fusion, under[len(vehicles) :]
 
 
-def test_two_witnesses_of_new_ice_raise_an_alert_on_a_road_that_was_dry_before() -> None:
+def test_two_witnesses_of_new_ice_raise_an_alert_on_a_dry_road() -> None:
     _, under = called(0.85, range(20), 0.2, range(5, 11), wait=700.0)
     assert under == [False, True, True, True, True, True]
 

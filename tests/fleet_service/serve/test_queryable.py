@@ -193,7 +193,7 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
 
 
 def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
-    """Whoever asks for many small things waits with the heavy ones; nothing of it is refused."""
+    """A client with many small queries waits with the heavy ones; none of them is refused."""
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]
     assert half.counts["queries"] > half.counts["heavy_queries"] > 0

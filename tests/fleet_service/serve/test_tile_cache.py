@@ -1,5 +1,5 @@
-"""A tile is shown again while it is good: a second at the most, and never without what was
-acknowledged or alerted.
+"""A cached tile is served again for at most a second, and never without acknowledged or alerted
+reports.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ COST_S = SHARE_S / 2.0  # that a tile takes
 
 
 class Made:
-    """Tiles that change, a clock, and what was put when."""
+    """Tiles that change, a clock, and a list of the puts with their times."""
 
     def __init__(self) -> None:
         self.now = 100.0

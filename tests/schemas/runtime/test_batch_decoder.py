@@ -1,5 +1,5 @@
-"""The compiled reader beside the protobuf module: what it understands it reads as the module
-does, to the last bit.
+"""The compiled decoder compared with the protobuf module: a message that it accepts is decoded
+identically, to the last bit.
 """
 
 from __future__ import annotations

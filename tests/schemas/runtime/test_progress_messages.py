@@ -13,7 +13,7 @@ from tests.waiting import until
 
 
 class Terminal(io.StringIO):
-    """Takes what is said, as a terminal."""
+    """A terminal that collects its output."""
 
     def isatty(self) -> bool:
         """It is one."""

@@ -132,7 +132,7 @@ def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(
     assert found["width"] == pytest.approx([0.25, 0.25])
 
 
-def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(
+def test_arrival_counts_from_the_change_or_to_the_end_if_it_never_comes(
     jumping: DriveSet,
 ) -> None:
     assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
@@ -159,7 +159,7 @@ def test_sides_are_told_apart() -> None:
     assert found["high_coverage90"] == pytest.approx([0.0, 0.0])
 
 
-def test_the_noise_of_paper_004_is_on_three_signals_and_follows_its_schedule() -> None:
+def test_noise_of_paper_004_affects_three_signals_by_its_schedule() -> None:
     exact = repeated(ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
     variance = variances(exact.t[:, 0], "variable")
     assert [variance[k] for k in (0, 150, 250, 350, 450)] == [0.04, 0.01, 0.05, 0.04, 0.01]

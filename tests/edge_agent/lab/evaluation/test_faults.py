@@ -41,7 +41,7 @@ def test_every_fault_that_was_asked_for_has_a_row_with_an_expectation() -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_no_fault_loses_an_estimate_and_health_tells_every_one_that_can_be_told(
+def test_no_fault_loses_an_estimate_and_health_reports_detectable_ones(
     estimator: str,
 ) -> None:
     found = faults.campaign(range(1), [estimator], ("slalom", "braking"))

@@ -36,7 +36,7 @@ def turning() -> DriveSet:
     return realistic(replace(PAPERS["003.turn"], duration_s=4.0), range(3))
 
 
-def test_truths_drawn_from_what_was_stated_lie_below_each_quantile_as_often_as_stated() -> None:
+def test_truths_from_the_stated_distribution_match_each_quantile() -> None:
     rng = np.random.default_rng(0)
     mean = rng.uniform(0.5, 0.7, 20_000)
     truth = mean + 0.05 * rng.normal(size=mean.shape)
@@ -53,7 +53,7 @@ def test_an_overconfident_answer_is_seen_at_both_ends() -> None:
     assert output[-1] < 0.85
 
 
-def test_the_prior_is_uniform_and_a_posterior_on_the_grid_is_its_own_distribution() -> None:
+def test_prior_is_uniform_and_grid_posterior_is_its_own_distribution() -> None:
     truth = np.array([0.05, 0.34, 1.2])
     flat = np.zeros((3, BINS))
     assert on_the_grid(truth, flat) == pytest.approx((truth - 0.05) / 1.15)
@@ -81,7 +81,7 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
 
 
-def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(
+def test_posterior_of_the_default_has_its_reported_quantiles(
     turning: DriveSet,
 ) -> None:
     """The ends are told at the levels at which they hold, and patches of ice lower the lower
@@ -102,7 +102,7 @@ def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_with
             assert (side * (ranks - level) > 0.0).all()
 
 
-def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_times_too_small(
+def test_consistency_is_one_for_the_right_spread_and_zero_for_a_tenth(
     turning: DriveSet,
 ) -> None:
     reported = fake(0.35, 0.3, 0.4, turning)

@@ -16,7 +16,7 @@ def test_drives_that_judge_are_those_of_the_figures() -> None:
     assert max(tuned_on) < FIGURES
 
 
-def test_worth_is_the_ratio_of_the_means_with_its_spread_and_tells_every_surface() -> None:
+def test_worth_is_the_ratio_of_means_with_its_spread_per_surface() -> None:
     scores = {
         way: {"all": np.array(values), "ice": np.array(values), "dry": np.array([np.nan, np.nan])}
         for way, values in {

@@ -159,7 +159,7 @@ def test_a_block_needs_at_least_one_sample() -> None:
         SimulatedFleet(SCENARIOS["test"], 1, 0, 100.0).step(0)
 
 
-def test_a_driver_who_is_warned_slows_down_for_the_stretch_and_drives_on_after_it() -> None:
+def test_warned_driver_slows_down_only_for_the_stretch() -> None:
     """The same driver, warned and not, from the same start."""
     speeds = []
     for warned in (False, True):

@@ -162,9 +162,7 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
         Patch("line", 0.0, 0.0, 1.0, 0.0, 0.5)
 
 
-def test_vehicles_start_on_the_lanes_that_are_given_and_keep_the_speed_that_traffic_leaves_them() -> (
-    None
-):
+def test_vehicles_start_on_given_lanes_at_the_speed_of_traffic() -> None:
     """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a
     driver of 5 m/s².
     """

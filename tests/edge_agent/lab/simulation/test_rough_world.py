@@ -81,7 +81,7 @@ def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope:
 
 
 @pytest.mark.parametrize("slope", SLOPES)
-def test_climbing_at_constant_speed_takes_the_torque_that_the_slope_asks_for(slope: float) -> None:
+def test_climbing_at_constant_speed_takes_the_torque_of_the_slope(slope: float) -> None:
     light = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     log, _ = simulate_manoeuvre("straight", sensors="ideal", slope=slope, vehicle=light)
     vehicle = light.vehicle
@@ -126,7 +126,7 @@ def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> Non
     assert (x[Motion.VX] - 15.0) * slope < 0.0
 
 
-def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill() -> None:
+def test_loads_sum_to_the_normal_weight_and_shift_downhill() -> None:
     x, p, u, w = still(0.08, -0.05)
     command(p, u, 0.0, -8000.0)
     advance(x, p, u, w, 1e-3, 1000)
@@ -228,7 +228,7 @@ def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
         np.testing.assert_allclose([ahead for ahead, _ in falls], 0.0, atol=1e-12)
 
 
-def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy() -> None:
+def test_hilly_town_reaches_eight_per_cent_but_is_flatter_on_ice() -> None:
     scenario = SCENARIOS["hills"]
     points = scenario.network.points
     table = scenario.relief.table
@@ -272,7 +272,7 @@ def two(
 
 
 @pytest.mark.parametrize("name", ONLY)
-def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(name: str) -> None:
+def test_misalignment_changes_exactly_the_signals_of_its_row(name: str) -> None:
     exact, reported, row = two("sine", ONLY[name])
     wanted = {key: value.copy() for key, value in exact.items()}
     t = np.arange(len(exact["ax"])) / 100.0
@@ -304,7 +304,7 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
     assert any(not np.array_equal(reported[c], exact[c], equal_nan=True) for c in CHANNELS)
 
 
-def test_one_misalignment_does_not_move_another_and_sizes_are_those_of_the_table() -> None:
+def test_misalignments_are_independent_with_the_sizes_of_the_table() -> None:
     whole = SENSORS["rough"].mounted
     rows = np.array([misalignment_row(whole, 1, k) for k in range(400)])
     alone = np.array([misalignment_row(ONLY["radius"], 1, k) for k in range(400)])
@@ -344,7 +344,7 @@ def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> N
     assert (mixed.truth.vx[:, ::2] > 0.0).all()
 
 
-def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number() -> None:
+def test_rough_fleet_on_hills_is_independent_of_blocks_and_number() -> None:
     whole, parts, one = (SimulatedFleet("hills", n, 5, 100.0, rough=1.0) for n in (4, 4, 1))
     _, signals = whole.step(600)
     pieces = [parts.step(n)[1] for n in (1, 7, 92, 300, 200)]

@@ -99,7 +99,7 @@ def test_a_rolling_body_lets_gravity_into_the_accelerometer() -> None:
     assert leak == pytest.approx(PRESETS["sedan"].roll_leak, rel=0.05)
 
 
-def test_vehicle_files_are_wrong_by_a_few_per_cent_and_only_where_it_is_said() -> None:
+def test_vehicle_files_are_wrong_by_a_few_per_cent_in_listed_fields() -> None:
     truth = PRESETS["sedan"].vehicle
     reported = [simulate_manoeuvre("straight", duration_s=0.1, seed=seed)[1] for seed in range(200)]
     for name in type(truth).model_fields:

@@ -57,7 +57,7 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 
 
 @pytest.mark.parametrize("family", [bowl, decoy])
-def test_colony_beats_random_search_of_equal_budget_in_at_least_21_of_24_trials(
+def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
     """By chance alone, 21 wins of 24 happen once in 7 000 times."""
@@ -70,7 +70,7 @@ def test_colony_beats_random_search_of_equal_budget_in_at_least_21_of_24_trials(
     assert wins >= 21
 
 
-def test_colony_reaches_the_optimum_where_random_search_of_equal_budget_does_not() -> None:
+def test_colony_reaches_the_optimum_where_random_search_does_not() -> None:
     found = {"colony": 0, "random": 0}
     for trial in range(TRIALS):
         for name, search in (("colony", colony), ("random", random_search)):
@@ -85,7 +85,7 @@ def test_colony_reaches_the_optimum_where_random_search_of_equal_budget_does_not
     assert found["random"] == 0
 
 
-def test_transition_probabilities_sum_to_one_and_vanish_where_there_is_no_position() -> None:
+def test_transition_probabilities_sum_to_one_over_valid_positions() -> None:
     reachable = Graph.of([np.arange(3.0), np.arange(5.0), np.arange(1.0)]).reachable
     rng = np.random.default_rng(4)
     pheromone, visibility = rng.random((2, 3, 5)) + 0.01
@@ -112,7 +112,7 @@ def test_evaporation_takes_its_share_and_the_deposit_is_added() -> None:
     np.testing.assert_allclose(renewed, [[0.7, 0.6]])
 
 
-def test_pheromone_stays_between_its_bounds_however_long_one_path_is_praised() -> None:
+def test_pheromone_stays_in_bounds_when_one_path_always_wins() -> None:
     reachable = Graph.of([np.arange(4.0)] * 3).reachable
     lowest = lowest_pheromone(reachable, 0.3)
     pheromone = np.ones(reachable.shape)
@@ -150,7 +150,7 @@ def test_progress_tells_every_iteration_and_the_best_never_falls(search: object)
 
 
 @pytest.mark.parametrize("search", [colony, random_search])
-def test_result_is_never_worse_than_the_start_and_no_vector_is_evaluated_twice(
+def test_result_is_never_worse_than_the_start_and_vectors_are_unique(
     search: object,
 ) -> None:
     start = CHOICES[0][np.random.default_rng(3).integers(POSITIONS, size=VERTICES)]

@@ -48,7 +48,7 @@ def test_recorded_drives_stand_side_by_side(drives: TuningSet) -> None:
     assert np.isfinite(drives.signals[:, :, 2]).mean() > 0.9
 
 
-def test_drives_that_judge_share_no_seed_and_no_setting_with_those_that_are_searched_on() -> None:
+def test_judging_drives_share_no_seed_or_setting_with_search_drives() -> None:
     assert not {drive.seed for drive in TRAIN} & {drive.seed for drive in HELD_OUT}
     assert len({drive.seed for drive in TRAIN + HELD_OUT}) == len(TRAIN + HELD_OUT)
     searched, judged = (
@@ -223,7 +223,7 @@ def test_options_out_of_range_are_refused_by_name(option: str, value: str) -> No
         tune.run(arguments("--quick", option, value))
 
 
-def test_progress_line_tells_iteration_best_mean_elapsed_and_remaining_time() -> None:
+def test_progress_line_has_iteration_best_mean_elapsed_and_remaining() -> None:
     lines: list[str] = []
     now = iter([100.0, 102.0])
     tell = tune.reporter("colony", 5, lambda: next(now), lines.append)

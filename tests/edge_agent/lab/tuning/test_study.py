@@ -38,9 +38,7 @@ def drives() -> StudySet:
     return record(TRAIN[:2])
 
 
-def test_drives_that_judge_share_neither_seed_nor_manoeuvre_with_those_that_are_searched_on() -> (
-    None
-):
+def test_judging_drives_share_no_seed_or_manoeuvre_with_search_drives() -> None:
     for name in ("seed", "manoeuvre"):
         assert not {getattr(drive, name) for drive in TRAIN} & {
             getattr(drive, name) for drive in HELD_OUT
@@ -68,7 +66,7 @@ def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
     assert scales == pytest.approx([1.0, 0.1, 10.0])
 
 
-def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(
+def test_right_noise_without_adaptation_is_most_likely_with_nis_one(
     drives: StudySet,
 ) -> None:
     right, small, large = (
@@ -89,7 +87,7 @@ def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: StudySet) 
         assert left < 0.2 * lost
 
 
-def test_a_search_is_never_worse_than_the_untuned_sets_and_the_same_every_time(
+def test_search_is_reproducible_and_never_worse_than_untuned_sets(
     drives: StudySet,
 ) -> None:
     for way in study.WAYS:

@@ -1,5 +1,5 @@
-"""`contract`: how long grip was not kept, at the least and at the most; what nobody measured is
-never kept.
+"""`contract`: shortest and longest possible time below the contracted grip; a place that was not
+measured never counts as kept.
 """
 
 from __future__ import annotations

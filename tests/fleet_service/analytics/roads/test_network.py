@@ -1,4 +1,4 @@
-"""Directed links from an extract of OpenStreetMap and from files of lines; what is none is said
+"""Directed links from an extract of OpenStreetMap and from files of lines; other input is refused
 by name.
 """
 

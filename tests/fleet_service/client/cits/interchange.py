@@ -1,4 +1,6 @@
-"""An AMQP interchange: accepts what is sent to it, and hands out what a test gives it."""
+"""An AMQP interchange that accepts every message it receives and delivers the messages that a test
+gives it.
+"""
 
 from __future__ import annotations
 

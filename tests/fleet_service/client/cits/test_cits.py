@@ -212,7 +212,7 @@ def test_a_quadtree_selector_finds_all_events_of_a_square_and_no_other() -> None
     assert found > 300
 
 
-def test_denm_reach_an_interchange_that_comes_late_and_foreign_ones_come_in(tmp_path: Path) -> None:
+def test_denm_reach_a_late_interchange_and_foreign_ones_are_received(tmp_path: Path) -> None:
     url = free_url()
     settled = list[str]()
     came = list[bytes]()
