@@ -80,11 +80,11 @@ BARS: Final[dict[str, MapBar]] = {
     ),
     "fusion.value.alert.precision.r20": MapBar(0.90, "more", "of cell-minutes under alert"),
     "fusion.value.alert.recall.r20": MapBar(0.95, "more", "of slippery cell-minutes"),
-    "fusion.value.alert.unnoticed.r5": MapBar(20, "less", "min, median, 5 cars an hour"),
+    "fusion.value.unnoticed.r5": MapBar(20, "less", "min, median, 5 cars an hour"),
     "fusion.demand.slippery.grip_raised": MapBar(
         0.05, "less", "of cells with grip on gentle roads: P(slippery) > .5"
     ),
-    "fusion.same_manoeuvre.false_alerts": MapBar(0, "less", "fleets on a wet curve"),
+    "fusion.same_manoeuvre.false_alerts": MapBar(1, "less", "of 20 fleets on a wet curve"),
     "fusion.bounds.lower_excess": MapBar(0.05, "less", "lower end over what was used"),
     "fusion.backlog.fused": MapBar(0.95, "more", "of an hour's rows"),
     "fusion.gentle_after_dry.safe_excess": MapBar(0, "less", "m/s^2 over the truth's"),

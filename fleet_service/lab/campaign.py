@@ -43,6 +43,7 @@ END_TO_END: Final = (
 )  # prefixes of what is measured end to end
 # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 EXACT_SEEDS: Final = 8
+END_TO_END_PART: Final = "end-to-end"
 
 LogLine = Callable[[str], None]
 Part = Callable[[], dict[str, float]]
@@ -50,7 +51,7 @@ Drives = Mapping[end_to_end.World, end_to_end.Drive]
 
 
 def run(
-    folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: bool = False
+    folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, only: str | None = None
 ) -> list[Figure]:
     """Run all parts and write `figures.json` and `figures.md` into `folder`.
 
@@ -58,28 +59,37 @@ def run(
         folder: is made.
         quick: one seed, to see that everything works; says nothing about the bars.
         drives: end to end; without one, its figures are missing.
-        tell: hears progress lines.
-        alone: end to end and nothing else; other figures are then not listed.
+        log_line: gets progress lines.
+        only: name of one part and nothing else; figures that it does not measure are not listed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(JUDGING, JUDGING + (QUICK_SEEDS if quick else SEEDS))
+    parts = parts_of(seeds, log_line)
+    listed = [(name, part) for name, part in parts.items() if only in (None, name)]
+    if only in (None, END_TO_END_PART):
+        listed += _ways(drives, folder, seeds)
     found: dict[str, float] = {}
-    for name, part in ([] if alone else _parts(seeds, log_line)) + _ways(drives, folder, seeds):
+    for name, part in listed:
         began = time.perf_counter()
         found |= part()
         log_line(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [
-        figure for figure in bars.judged(found) if not alone or figure.name.startswith(END_TO_END)
-    ]
+    judged = [figure for figure in bars.judged(found) if _is_listed(figure.name, only, found)]
     figures.write(
         folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged
     )
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
     (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")
-    for path in [] if alone else plots.draw(judged, folder):
+    for path in plots.draw(judged, folder) if only is None else []:
         log_line(f"plot {path}")
     return judged
+
+
+def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
+    """Whether a figure belongs to a run: end to end, its missing ones as well."""
+    if only == END_TO_END_PART:
+        return name.startswith(END_TO_END)
+    return only is None or name in found
 
 
 def drives_end_to_end(quick: bool) -> Drives:
@@ -126,19 +136,20 @@ def _resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, float]:
     return models.measure_real(visits, seeds)
 
 
-def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
+def parts_of(seeds: range, log_line: LogLine) -> dict[str, Part]:
+    """Return the parts that need no simulated vehicle, by their names for `--only`."""
     few = seeds[:EXACT_SEEDS]
-    return [
-        ("order, replay, unexcited", lambda: _exact(few)),
-        ("ice comes and goes", lambda: changes.measure(seeds)),
-        ("fleets and rules", lambda: fleets.measure(seeds, log_line)),
-        ("attacks", lambda: attacks.measure(seeds)),
-        ("fleets that err otherwise", lambda: models.measure(seeds, log_line)),
-        ("how long a dry road stays dry", lambda: fading.measure(seeds)),
-        ("a third party's fleet", lambda: third_party.measure(seeds, log_line)),
-        ("value to users", lambda: value.measure(seeds, log_line)),
-        ("bounds, a backlog, gentle drivers, a wet curve", lambda: situations.measure(seeds)),
-    ]
+    return {
+        "exact": lambda: _exact(few),
+        "ice": lambda: changes.measure(seeds),
+        "fleets": lambda: fleets.measure(seeds, log_line),
+        "attacks": lambda: attacks.measure(seeds),
+        "models": lambda: models.measure(seeds, log_line),
+        "fading": lambda: fading.measure(seeds),
+        "third-party": lambda: third_party.measure(seeds, log_line),
+        "value": lambda: value.measure(seeds, log_line),
+        "situations": lambda: situations.measure(seeds),
+    }
 
 
 def _exact(seeds: range) -> dict[str, float]:

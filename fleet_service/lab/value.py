@@ -200,9 +200,8 @@ def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, floa
         )
         out[f"{label}.precision.r{cars}"] = precision(truth, warned)
         out[f"{label}.recall.r{cars}"] = recall(truth, warned)
-        out[f"{label}.unnoticed.r{cars}"] = (
-            float(np.median(minutes)) if len(minutes) else float("nan")
-        )
+        unnoticed = "unnoticed" if label == "alert" else f"{label}.unnoticed"
+        out[f"{unnoticed}.r{cars}"] = float(np.median(minutes)) if len(minutes) else float("nan")
     return out
 
 

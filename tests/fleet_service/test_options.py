@@ -215,7 +215,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "hand-over": ("shards/test_moving",),
 }
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
-CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
+CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end", "--only"}
 
 
 class Done(NamedTuple):
@@ -321,18 +321,23 @@ def test_a_standby_without_a_copy_to_follow_is_refused(
 def test_the_end_to_end_part_of_a_campaign_is_left_out_or_run_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    seen: list[tuple[bool, bool, bool]] = []
+    seen: list[tuple[bool, bool, str | None]] = []
 
     def note(
-        folder: Path, quick: bool, drives: object, log_line: object, *, alone: bool
+        folder: Path, quick: bool, drives: object, log_line: object, *, only: str | None
     ) -> list[object]:
-        seen.append((quick, bool(drives), alone))
+        seen.append((quick, bool(drives), only))
         return []
 
     monkeypatch.setattr(campaign, "run", note)
-    for more in ([], ["--skip-end-to-end"], ["--end-to-end"]):
+    for more in ([], ["--skip-end-to-end"], ["--end-to-end"], ["--only", "value"]):
         assert main(["evaluate", "--out", str(tmp_path), "--quick", *more]) == 0
-    assert seen == [(True, True, False), (True, False, False), (True, True, True)]
+    assert seen == [
+        (True, True, None),
+        (True, False, None),
+        (True, True, "end-to-end"),
+        (True, False, "value"),
+    ]
 
 
 @pytest.mark.parametrize(

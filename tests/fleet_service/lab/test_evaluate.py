@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_service.cli import main
+from fleet_service.cli import evaluate, main
 from fleet_service.lab import (
     agent,
     attacks,
@@ -89,7 +89,7 @@ def test_quick_campaign_writes_figures_with_bars_table_and_plots(
 
 
 def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> None:
-    found = campaign.run(tmp_path, True, {}, lambda _line: None, alone=True)
+    found = campaign.run(tmp_path, True, {}, lambda _line: None, only="end-to-end")
     names = {figure.name for figure in found}
     assert names == {name for name in bars.BARS if name.startswith(campaign.END_TO_END)}
     assert "fusion.whole_way.hills.coverage90" in names
@@ -99,6 +99,20 @@ def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> Non
         0.5,
         *[0.5] * 10,
     ]
+
+
+def test_one_part_lists_the_figures_that_it_measures_and_no_others(tmp_path: Path) -> None:
+    found = campaign.run(tmp_path, True, {}, lambda _line: None, only="situations")
+    assert {figure.name for figure in found} == {
+        "fusion.bounds.lower_excess",
+        "fusion.backlog.fused",
+        "fusion.gentle_after_dry.safe_excess",
+        "fusion.same_manoeuvre.false_alerts",
+    }
+    header, *rows = json.loads((tmp_path / "figures.json").read_text())
+    assert header["campaign"] == "fusion --quick"
+    assert len(rows) == len(found)
+    assert set(evaluate.PARTS) == {*campaign.parts_of(range(1), print), "end-to-end"}
 
 
 def test_a_missing_figure_fails_the_campaign() -> None:
