@@ -86,7 +86,7 @@ def run(
 
 
 def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
-    """Whether a figure belongs to a run: end to end, its missing ones as well."""
+    """Return whether a figure belongs to a run; end to end, its missing ones do as well."""
     if only == END_TO_END_PART:
         return name.startswith(END_TO_END)
     return only is None or name in found
