@@ -48,8 +48,8 @@ class Restart(NamedTuple):
 
 
 def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
-    """Load the initial state from the archive in a folder; `extra_tables` names additional tables that
-    the service stored with those of `image_of`.
+    """Load the initial state from the archive in a folder; `extra_tables` names additional tables
+    that the service stored with those of `image_of`.
     """
     refused = 0
     for path in checkpoints.newest(root):
