@@ -52,7 +52,7 @@ test: $(PAPERS)  ## tests that take seconds
 test-all: $(PAPERS)  #- all tests, and the campaigns in their quick form
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[cits]' \
 	  || echo "no compiler for python-qpid-proton: the tests of C-ITS are skipped" >&2
-	$(TESTS) --durations 10
+	$(TESTS) --durations 10 -rs
 
 test-shuffled: $(PAPERS)  #- all tests ten times in random order
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
@@ -96,7 +96,7 @@ ahead-bench: setup  #= warnings in the car, and the map as a prior
 	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
 	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
 
-iov-bench: setup  #= DENM, routes around ice, planner, Kuksa, MCAP
+iov-bench: setup  #= DENM, routes around ice, planner, Kuksa, MCAP, clients in C and TypeScript
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[cits]'
 	$(BIN)/python -m tests.benchmarks.iov
 

@@ -17,6 +17,7 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.thresholds import METRES_PER_DEGREE
 from tests.benchmarks.iov import interfaces, routes
+from tests.benchmarks.iov.clients import measure_clients
 from tests.benchmarks.iov.denm import measure_denm
 from tests.benchmarks.iov.planner import measure_planner
 
@@ -148,6 +149,7 @@ PARTS: Final = {
     "planner": measure_planner,
     "kuksa": interfaces.measure_kuksa,
     "mcap": interfaces.measure_mcap,
+    "clients": measure_clients,
 }
 
 
