@@ -45,6 +45,9 @@ _SPREAD: Final = (
     (1, 0x5555555555555555),
 )
 
+# the two base-4 digits of each hexadecimal one
+_BASE_4: Final = {ord(f"{digit:x}"): f"{digit >> 2}{digit & 3}" for digit in range(16)}
+
 
 def _spread(v: IntArray) -> IntArray:
     for shift, mask in _SPREAD:
@@ -168,7 +171,8 @@ def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
 
 def quadkey(cell: int, zoom: int) -> str:
     """Return the digits of one quadint: a string of `zoom` digits 0–3."""
-    return "".join(str((cell >> (2 * place)) & 3) for place in range(zoom - 1, -1, -1))
+    digits = f"{cell:x}".translate(_BASE_4).zfill(zoom)
+    return digits[len(digits) - zoom :]
 
 
 def from_quadkey(digits: str) -> int:

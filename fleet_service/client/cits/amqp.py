@@ -71,6 +71,7 @@ class _AmqpEvents(MessagingHandler):
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
         """Send the messages that another thread queued."""
+        self._link.is_waking = False
         self._send()
 
     def on_leave(self, _: Any) -> None:  # noqa: ANN401
@@ -120,6 +121,7 @@ class AmqpLink:
 
     Attributes:
         is_connected: True while the interchange answers.
+        is_waking: True from the first message that is queued until the thread looks at the queue.
         rejected: messages that it refused.
 
     Args:
@@ -155,6 +157,7 @@ class AmqpLink:
         self.on_message = on_message
         self.queue: deque[Parcel] = deque()
         self.is_connected = False
+        self.is_waking = False
         self.rejected = 0
         self.injector = EventInjector()
         self._container = Container(_AmqpEvents(self))
@@ -168,7 +171,9 @@ class AmqpLink:
     def send(self, parcel: Parcel) -> None:
         """Queue a message; it is sent until the interchange accepts it."""
         self.queue.append(parcel)
-        self.injector.trigger(ApplicationEvent("send"))
+        if not self.is_waking:
+            self.is_waking = True
+            self.injector.trigger(ApplicationEvent("send"))
 
     def close(self) -> None:
         """Close the connection."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,24 @@ from typing import Any
 import numpy as np
 import proton
 import pytest
+from hypothesis import given, settings, strategies
 from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
 from fleet_service.app.engine import Engine
 from fleet_service.client.cits.amqp import AmqpLink, Parcel
-from fleet_service.client.cits.denm import ICE, SALTED, Denm, Termination, approach, decode, encode
+from fleet_service.client.cits.denm import (
+    EPOCH_NS,
+    ICE,
+    LEAP_MS,
+    SALTED,
+    TERMINATIONS,
+    Denm,
+    Termination,
+    approach,
+    compiled_denm,
+    decode,
+    encode,
+)
 from fleet_service.client.cits.events import RENEW_NS, VALID_NS
 from fleet_service.client.cits.foreign import reports
 from fleet_service.client.cits.output import DenmOutput
@@ -63,25 +77,106 @@ def random_denm(draw: np.random.Generator) -> Denm:
     )
 
 
-def test_second_decoder_reads_and_writes_the_same_bytes() -> None:
-    draw = np.random.default_rng(42)
+latitudes = strategies.floats(-89.9, 89.9)
+longitudes = strategies.floats(-179.9, 179.9)
+offsets = strategies.lists(
+    strategies.tuples(
+        strategies.integers(-140_000, 140_000), strategies.integers(-140_000, 140_000)
+    ),
+    max_size=45,
+)
+times = strategies.integers(EPOCH_NS, EPOCH_NS + (1 << 42) * 10**6 - LEAP_MS * 10**6 - 1)
+stations = strategies.integers(0, (1 << 32) - 1)
+bytes_of_causes = strategies.integers(0, 255)
+
+
+@strategies.composite
+def any_denm(draw: strategies.DrawFn) -> Denm:
+    """A DENM with any content that its fields allow."""
+    position = (draw(latitudes), draw(longitudes))
+
+    def points() -> tuple[tuple[float, float], ...]:
+        return tuple(
+            (position[0] + 1e-7 * north, position[1] + 1e-7 * east) for north, east in draw(offsets)
+        )
+
+    return Denm(
+        station=draw(stations),
+        sequence=draw(strategies.integers(0, 65_535)),
+        sender=draw(stations),
+        detected=draw(times),
+        referenced=draw(times),
+        termination=draw(strategies.sampled_from([None, None, *TERMINATIONS])),
+        position=position,
+        position_std=draw(strategies.floats(0.0, 100.0)),
+        validity_s=draw(strategies.integers(0, 86_400) | strategies.just(600)),
+        quality=draw(strategies.integers(0, 7)),
+        cause=draw(bytes_of_causes),
+        sub_cause=draw(bytes_of_causes),
+        history=points(),
+        traces=tuple(points() for _ in range(draw(strategies.integers(0, 8)))),
+        heading=draw(strategies.none() | strategies.floats(-360.0, 720.0)),
+    )
+
+
+@settings(max_examples=300, deadline=None)
+@given(any_denm())
+def test_two_other_encoders_write_the_same_bytes(sent: Denm) -> None:
+    data = encode(sent)
     oracle = DENM_PDU_Descriptions.DENM
-    for _ in range(100):
-        sent = random_denm(draw)
-        data = encode(sent)
-        oracle.from_uper(data)
-        assert oracle.to_uper() == data
-        management = oracle.get_val()["denm"]["management"]
-        assert management["actionID"]["sequenceNumber"] == sent.sequence
-        assert management["eventPosition"]["latitude"] == round(1e7 * sent.position[0])
-        assert management.get("termination") == sent.termination
-        read = decode(data)
-        assert encode(read) == data
-        if sent.termination is None:
-            assert (read.sub_cause, len(read.history)) == (
-                sent.sub_cause,
-                min(len(sent.history), 23),
-            )
+    oracle.from_uper(data)
+    assert oracle.to_uper() == data
+    general = compiled_denm()
+    assert general.encode("DENM", general.decode("DENM", data)) == data
+    management = oracle.get_val()["denm"]["management"]
+    assert management["actionID"]["sequenceNumber"] == sent.sequence
+    assert management["eventPosition"]["latitude"] == round(1e7 * sent.position[0])
+    assert management.get("termination") == sent.termination
+
+
+@settings(max_examples=300, deadline=None)
+@given(any_denm())
+def test_an_encoded_denm_is_read_as_it_was(sent: Denm) -> None:
+    read = decode(encode(sent))
+    for name in ("station", "sequence", "sender", "termination", "validity_s"):
+        assert getattr(read, name) == getattr(sent, name), name
+    assert read.detected == sent.detected // 10**6 * 10**6
+    assert read.position == pytest.approx(sent.position, abs=6e-8)
+    if sent.termination is not None:
+        return
+    for name in ("quality", "cause", "sub_cause"):
+        assert getattr(read, name) == getattr(sent, name), name
+    assert (read.heading is None) == (sent.heading is None)
+    if read.heading is not None and sent.heading is not None:
+        assert math.cos(math.radians(read.heading - sent.heading)) > 0.999
+    for got, given_points, most in (
+        (read.history, sent.history, 23),
+        *((one, other, 40) for one, other in zip(read.traces, sent.traces, strict=False)),
+    ):
+        near = [
+            point
+            for point in given_points
+            if max(abs(round(1e7 * (a - b))) for a, b in zip(point, sent.position, strict=True))
+            <= 131_071
+        ][:most]
+        assert len(got) == len(near)
+        assert np.allclose(got, near, rtol=0, atol=1.1e-7)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"station": 1 << 32},
+        {"sequence": -1},
+        {"validity_s": 1 << 17},
+        {"quality": 8},
+        {"position": (91.0, 400.0)},
+    ],
+)
+def test_a_number_too_large_for_its_field_is_not_encoded(wrong: dict[str, Any]) -> None:
+    denm = random_denm(np.random.default_rng(5))
+    with pytest.raises(OverflowError):
+        encode(replace(denm, **{"termination": None, **wrong}))
 
 
 def test_a_foreign_denm_with_further_containers_is_read() -> None:
