@@ -41,12 +41,15 @@ class ObjectBucket:
         url: for example s3://bucket/folder.
         options: of obstore, in addition to the environment: endpoint, region, access_key_id …
         timeout_s: of one request in total.
+        retries: of a failed request.
 
     Raises:
         InputError: obstore is not installed, or does not accept the URL or an option.
     """
 
-    def __init__(self, url: str, options: Mapping[str, str], timeout_s: float) -> None:
+    def __init__(
+        self, url: str, options: Mapping[str, str], timeout_s: float, retries: int = 2
+    ) -> None:
         if SCHEMES.match(url) is None:
             raise InputError(
                 "archive.copy", f"{url} is no bucket", "give a URL such as s3://bucket/folder"
@@ -75,7 +78,7 @@ class ObjectBucket:
             **seconds,
             **({"allow_http": True} if plain else {}),
         }  # else the environment decides
-        retry: Any = {"max_retries": 2, "retry_timeout": timedelta(seconds=timeout_s)}
+        retry: Any = {"max_retries": retries, "retry_timeout": timedelta(seconds=timeout_s)}
         given: Any = dict(options)
         try:
             self._store: ObjectStore = from_url(

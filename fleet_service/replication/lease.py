@@ -14,7 +14,9 @@ A valid renewal saw no higher number, so it began before T. B takes over when it
 turn for `lease_s` (or for HINT of it, when A's token fell): then A's last renewal began before B
 saw it first, and A's time was over before T. If the turn has changed after T, a renewal landed in
 between, and B waits for `lease_s` more: twice the time in which A acknowledges, so that A's clock
-may be slower. Only then B lists the bucket: everything that A acknowledged is there. An
+may be slower. A turn is written at most once, even if the write failed: it may take effect late,
+and a later renewal with the same content would look like none. So the bucket must not repeat a
+request either (`retries=0`). Only then B lists the bucket: everything that A acknowledged is there. An
 acknowledgement that A's network delivers later is still true. If A was frozen and uploads after the
 listing, its files have an older epoch and are not in B's fence (`archive.terms`): they do not
 count, and A acknowledged none of them. A deletes only after it uploaded the replacement and saw no
@@ -124,7 +126,7 @@ class Lease:
     Args:
         holder: identity of this folder, see `holder_of`; this process has it locked, so no other
             start of it runs.
-        bucket: of the copy.
+        bucket: of the copy; it repeats no request.
         service: its name.
         lease_s: time after which a lease that is not renewed may be taken.
 
@@ -293,9 +295,8 @@ class Lease:
         if self._mine is None or self.lost:
             return
         began = elapsed_seconds()
-        turn = self._mine._replace(turn=self._mine.turn + 1)
-        self._bucket.put(turn.name, turn.content)
-        self._mine = turn
+        self._mine = self._mine._replace(turn=self._mine.turn + 1)
+        self._bucket.put(self._mine.name, self._mine.content)
         self.assert_not_superseded()
         self._renewed = began
 

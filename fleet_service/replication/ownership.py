@@ -164,9 +164,8 @@ def _leased(
     options = config.archive.options
     empty = not any((root / folder).exists() for folder in FOLDERS)
     holder, known = holder_of(root, url)
-    lease = Lease(
-        holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s
-    )
+    bucket = ObjectBucket(url, options, config.lease_s / REQUESTS, retries=0)
+    lease = Lease(holder, bucket, config.name, config.lease_s)
     copy = BucketReplica(root, url, options)
     mirrors = empty or known
     standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)

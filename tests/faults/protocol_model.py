@@ -7,7 +7,7 @@ be taken: a service that takes none for a while is frozen, or cut off. Uploads a
 effect in the bucket at any time after they began.
 
     renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal
-             counts from its begin
+             counts from its begin; one that is given up may still write its turn later
     ack      only within lease / 2 of the begin of the last valid renewal, and only for batches
              that are uploaded
     take     a standby that saw the same turn for its lease time creates the next number; if the
@@ -44,6 +44,7 @@ class Rules(NamedTuple):
     wait_share: int = 2  # halves of the lease time for which it waits before it lists
     has_fence: bool = True
     remembers_erasure: bool = True
+    writes_turn_once: bool = True
 
 
 BROKEN: Final = {
@@ -52,6 +53,7 @@ BROKEN: Final = {
     "waits half a lease next to a slow clock": Rules(wait_share=1),
     "no fence": Rules(has_fence=False),
     "erasure forgotten": Rules(remembers_erasure=False),
+    "turn written again after a failure": Rules(writes_turn_once=False),
 }  # each lacks one rule
 
 
@@ -70,6 +72,8 @@ class Service(NamedTuple):
         sending: batches whose upload is under way.
         uploaded: own uploads that it knows to be in the bucket.
         slow: its clock did not advance in the last tick.
+        turn: last turn of its lease that it used up.
+        late: turn of a renewal that it gave up and that may still be written; 0 for none.
     """
 
     role: str = "waiting"
@@ -83,6 +87,8 @@ class Service(NamedTuple):
     sending: frozenset[int] = frozenset()
     uploaded: frozenset[int] = frozenset()
     slow: bool = False
+    turn: int = 0
+    late: int = 0
 
 
 class World(NamedTuple):
@@ -185,6 +191,9 @@ def steps(
             landed = world._replace(objects=world.objects | {(batch, one.number)})
             known = one._replace(sending=one.sending - {batch}, uploaded=one.uploaded | {batch})
             yield f"upload of {batch} by {me} lands", _with(landed, me, known)
+        if one.late and world.number == one.number:
+            written = world._replace(turn=one.late, released=False)
+            yield f"late turn {one.late} of {me} lands", _with(written, me, one._replace(late=0))
         yield from _serve(world, me, rules, most_turn)
         yield from _stand_by(world, me, rules, most_number)
 
@@ -194,13 +203,20 @@ def _serve(world: World, me: int, rules: Rules, most_turn: int) -> Iterator[tupl
     if one.role != "serving":
         return
     lease = rules.lease[me]
+    turn = one.turn if rules.writes_turn_once else one.turn + 1  # of a renewal under way
     if one.begun == NOT_YET:
-        yield f"{me} begins a renewal", _with(world, me, one._replace(begun=0))
+        if one.turn < most_turn:
+            begun = one._replace(begun=0, turn=one.turn + rules.writes_turn_once)
+            yield f"{me} begins a renewal", _with(world, me, begun)
     elif world.number != one.number:
         yield f"{me} sees that it lost the lease", _with(world, me, _gone(one))
-    elif not world.released and world.turn < most_turn:
-        renewed = one._replace(age=one.begun, begun=NOT_YET)
-        yield f"{me} renews", _with(world._replace(turn=world.turn + 1), me, renewed)
+    else:
+        renewed = one._replace(age=one.begun, begun=NOT_YET, turn=turn)
+        if not world.released:
+            yield f"{me} renews turn {turn}", _with(world._replace(turn=turn), me, renewed)
+        if not one.late:
+            given_up = one._replace(begun=NOT_YET, late=turn)
+            yield f"{me} gives up the renewal {turn}", _with(world, me, given_up)
     is_fresh = one.age < lease / 2 or not rules.acknowledges_within_half
     for batch in BATCHES:
         is_refused = batch in world.erased and rules.remembers_erasure
@@ -284,7 +300,7 @@ def _tick(world: World, slow: int, rules: Rules) -> World:
 
 def _gone(one: Service) -> Service:
     """Return a service that serves no more; messages of it that the network still holds may land."""
-    return Service("gone", one.number, age=0, sending=one.sending)
+    return Service("gone", one.number, age=0, sending=one.sending, late=one.late)
 
 
 def _with(world: World, me: int, one: Service) -> World:

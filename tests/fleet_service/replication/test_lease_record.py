@@ -113,6 +113,27 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
     assert json.loads(bucket.objects[name])["service"] == "one"
 
 
+def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The write may take effect late, and the next renewal must differ from it."""
+    bucket = MemoryBucket()
+    holder = lease_on(bucket, "one", 0.5)
+    assert holder._take(None, lambda: 0, threading.Event())
+    written: list[bytes] = []
+
+    def fail(_: str, content: bytes) -> None:
+        written.append(content)
+        raise CopyError("no answer")
+
+    with monkeypatch.context() as cut:
+        cut.setattr(bucket, "put", fail)
+        with pytest.raises(CopyError):
+            holder.renew()
+    holder.renew()
+    holder.release()
+    turns = [json.loads(one)["turn"] for one in (*written, *bucket.objects.values())]
+    assert turns == [1, 3]
+
+
 def test_damaged_fence_is_an_error_of_the_copy() -> None:
     bucket = MemoryBucket()
     for content in (b"", b"no gzip", gzip.compress(b"[]"), gzip.compress(b'{"epoch": 1}')):
