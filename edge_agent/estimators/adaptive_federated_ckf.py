@@ -22,7 +22,7 @@ import numpy as np
 
 from edge_agent.adaptation.rules import ALPHA, RATE, infer_two, rule_table
 from edge_agent.estimators.bank import EstimatorBank
-from edge_agent.estimators.common.motion import diverged
+from edge_agent.estimators.common.motion import has_diverged
 from edge_agent.estimators.common.output import write_prior, write_states
 from edge_agent.estimators.common.run import kernel_of, new_filters
 from edge_agent.estimators.common.tyre_option import TyreOption
@@ -91,7 +91,7 @@ which nothing printed measures, by decimetres per second.
 """
 
 
-def bank(
+def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
     """Return a bank of N of these filters, on a road whose friction is given."""
@@ -106,25 +106,25 @@ def bank(
 
 
 @compiled
-def _begin(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001 the design is the step's
+def _begin_filter(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001 the design is the step's
     begin_motion(memory)
     memory.actual[:], memory.expected[:], memory.alpha[:] = 0.0, 0.0, 0.0
 
 
 @compiled
-def _step(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> bool:
+def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> bool:
     motion = memory.motion
     step_motion(memory, design.friction, dt)
-    if diverged(motion.mean, motion.root, PlanarState.YAW_RATE):
+    if has_diverged(motion.mean, motion.root, PlanarState.YAW_RATE):
         return False
     if design.adaptive:
-        _adapt(memory, design, dt)
+        _adapt_noise_and_shares(memory, design, dt)
     memory.adaptation = max(motion.factor[0], motion.factor[1])
     return True
 
 
 @compiled
-def _adapt(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
+def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
     """Compute the factors on R and the shares for the next sample."""
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)
@@ -152,13 +152,13 @@ def _adapt(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
 
 
 @compiled
-def _report(memory: AdaptiveMemory, design: AdaptiveDesign, output: FloatArray) -> float:
+def _write_estimates(memory: AdaptiveMemory, design: AdaptiveDesign, output: FloatArray) -> float:
     write_states(output, memory.motion.mean, memory.motion.root, PlanarState.YAW_RATE)
     write_prior(output, Column.MU)
     return float(design.friction[0])
 
 
-KERNEL = kernel_of(_begin, _step, _report)
+KERNEL = kernel_of(_begin_filter, _step_filter, _write_estimates)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
     Element(
@@ -188,14 +188,14 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "exponential window, half-life .5 s: M is not given, and a box needs M innovations in "
         "memory",
-        "adaptive_federated_ckf._adapt",
+        "adaptive_federated_ckf._adapt_noise_and_shares",
     ),
     Element(
         "(17), (18)",
         "mismatch alpha = tr C - tr P_zz",
         "corrected",
         "mean of ratios less one: the traces add squares of unlike units",
-        "adaptive_federated_ckf._adapt",
+        "adaptive_federated_ckf._adapt_noise_and_shares",
     ),
     Element("(19)", "R times the factor epsilon", "as printed", where="gaussian.federated_motion"),
     Element(
@@ -218,7 +218,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "adaptive shares",
         "corrected",
         "e'*S^-1*e, where e*e' over a trace is printed; no sub-filter is starved",
-        "adaptive_federated_ckf._adapt",
+        "adaptive_federated_ckf._adapt_noise_and_shares",
     ),
     Element(
         "(34) to (52)",

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from edge_agent.estimators.estimates import ONE_FRICTION, Estimates
-from edge_agent.estimators.shares import checked, in_shares
+from edge_agent.estimators.shares import check_arrays, in_shares
 from schemas.mugrid import BINS
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.jit import entry_point
@@ -82,7 +82,7 @@ class EstimatorBank:
             InputError: shapes do not agree with the bank, or threads is below 1.
         """
         count = len(self._filters)
-        t, signals = checked(t, signals, closes, count)
+        t, signals = check_arrays(t, signals, closes, count)
         samples = t.shape[0]
         visits = self._nowhere
         evidence = None
@@ -96,14 +96,14 @@ class EstimatorBank:
                 self._entered = entry_point(
                     self._kernel
                 )  # `checked` sees to it that all arguments are of one kind
-            return _estimates(values, evidence, closes)
+            return _pack_estimates(values, evidence, closes)
         if threads > len(self._contexts):
             self._contexts = np.repeat(self._contexts[:1], threads)
         whole = (self._filters, self._contexts, t, signals, values, *visits)
         in_shares(
             lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads
         )
-        return _estimates(values, evidence, closes)
+        return _pack_estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
         """Return a copy of the field `name` of all filters, (N, ...), for plots of a filter's
@@ -124,7 +124,7 @@ class EstimatorBank:
         return own, visit
 
 
-def _estimates(
+def _pack_estimates(
     values: FloatArray, evidence: FloatArray | None, closes: BoolArray | None
 ) -> Estimates:
     if evidence is None or closes is None:

@@ -34,7 +34,7 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.adaptive_federated_ckf import DRY
 from edge_agent.estimators.bank import EstimatorBank
-from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, diverged
+from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, has_diverged
 from edge_agent.estimators.common.output import write_prior, write_states
 from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
@@ -105,7 +105,7 @@ class FrictionSet:
     work: Annotated[FloatArray, A_ROWS + A_STATES, 4 * A_STATES]
 
 
-def bank(
+def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
 ) -> EstimatorBank:
     """Return a bank of N of these filters, on a road whose friction is given; the tyre holds C_f
@@ -117,7 +117,7 @@ def bank(
 
 
 @compiled
-def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001 the context is the step's
+def _begin_filter(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001 the context is the step's
     row = memory.row
     mean = memory.mean
     root = memory.root
@@ -145,17 +145,18 @@ def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: AR
 
 
 @compiled
-def _step(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
-    _preliminary(memory, context, dt)
-    _fuse(memory, context, dt)
+def _step_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
+    _step_wheel_filter(memory, context, dt)
+    _step_motion_filter(memory, context, dt)
     rate = DriveWheelState.YAW_RATE
     return not (
-        diverged(memory.fused, memory.fused_root, rate) or diverged(memory.mean, memory.root, rate)
+        has_diverged(memory.fused, memory.fused_root, rate)
+        or has_diverged(memory.mean, memory.root, rate)
     )
 
 
 @compiled
-def _forces(
+def _compensated_forces(
     row: FloatArray,
     x: FloatArray,
     use: FloatArray,
@@ -185,7 +186,7 @@ def _forces(
 
 
 @compiled
-def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
+def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """Run WCKF-A; its lateral forces come from the tyre model at the last motion of B."""
     row = memory.row
     mean = memory.mean
@@ -198,7 +199,9 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
     force_x = np.empty(4)
     force_y = np.empty(4)
     noise = np.zeros((A_STATES, A_STATES))
-    _forces(row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
+    _compensated_forces(
+        row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y
+    )
     delta = use[S.DELTA : S.DELTA + 4]
     sigma_points(mean, root, A_XI, points)
     for p in range(points.shape[0]):
@@ -237,7 +240,7 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
 
 
 @compiled
-def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
+def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """Run WCKF-B: estimate the motion from the compensated forces."""
     row = memory.row
     track = memory.track
@@ -263,7 +266,7 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
         sigma_points(mean, root, B_XI, points)
         for p in range(count):
             x = points[p]
-            _forces(
+            _compensated_forces(
                 row,
                 x,
                 track.inputs_before if act == 0 else use,
@@ -302,20 +305,20 @@ def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     used, log_likelihood, square = update(
         mean, root, state, measured, innovation, std, context.work
     )
-    _forces(row, mean, use, context.friction, observed, memory.compensated, force_y)
+    _compensated_forces(row, mean, use, context.friction, observed, memory.compensated, force_y)
     memory.nis = square / max(used, 1)
     memory.log_likelihood = log_likelihood
     memory.adaptation = largest
 
 
 @compiled
-def _report(memory: CompensatedMemory, context: FrictionSet, output: FloatArray) -> float:
+def _write_estimates(memory: CompensatedMemory, context: FrictionSet, output: FloatArray) -> float:
     write_states(output, memory.fused, memory.fused_root, DriveWheelState.YAW_RATE)
     write_prior(output, Column.MU)
     return float(context.friction[0])
 
 
-KERNEL = kernel_of(_begin, _step, _report)
+KERNEL = kernel_of(_begin_filter, _step_filter, _write_estimates)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
     Element("(1) to (3)", "3-DOF model", "as printed", where="dynamics.body"),
@@ -366,7 +369,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(30), (32)",
         "WCKF-A: 19 states, 9 measurements",
         "as printed",
-        where="compensated_wckf._preliminary",
+        where="compensated_wckf._step_wheel_filter",
     ),
     Element(
         "(31)",
@@ -389,7 +392,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "the tyre model is evaluated at its points: with forces as plain inputs nothing observes "
         "v_x and v_y",
-        "compensated_wckf._fuse",
+        "compensated_wckf._step_motion_filter",
     ),
     Element(
         "(37), (38)",

@@ -30,7 +30,7 @@ class Element(NamedTuple):
     where: str = ""
 
 
-def unexplained(elements: tuple[Element, ...]) -> list[str]:
+def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
     """Return the places of elements that lack a reason or a home."""
     found = []
     for element in elements:

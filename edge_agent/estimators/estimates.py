@@ -55,7 +55,7 @@ class _View:
         return estimates.values[..., self._place]
 
 
-def _column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says the type
+def _view_column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says the type
     return _View(place)
 
 
@@ -66,21 +66,21 @@ class Estimates:
 
     __slots__ = ("evidence", "jumps", "values")
 
-    vx: FloatArray = _column(Column.VX)
-    vy: FloatArray = _column(Column.VY)
-    yaw_rate: FloatArray = _column(Column.YAW_RATE)
-    sideslip: FloatArray = _column(Column.SIDESLIP)
-    vx_std: FloatArray = _column(Column.VX_STD)
-    vy_std: FloatArray = _column(Column.VY_STD)
-    yaw_rate_std: FloatArray = _column(Column.YAW_RATE_STD)
-    sideslip_std: FloatArray = _column(Column.SIDESLIP_STD)
-    mu: FloatArray = _column(Column.MU)
-    mu_lower: FloatArray = _column(Column.MU_LOWER)
-    mu_upper: FloatArray = _column(Column.MU_UPPER)
-    mu_utilised: FloatArray = _column(Column.MU_UTILISED)
-    innovation_nis: FloatArray = _column(Column.INNOVATION_NIS)
-    adaptation: FloatArray = _column(Column.ADAPTATION)
-    innovation_log_likelihood: FloatArray = _column(Column.INNOVATION_LOG_LIKELIHOOD)
+    vx: FloatArray = _view_column(Column.VX)
+    vy: FloatArray = _view_column(Column.VY)
+    yaw_rate: FloatArray = _view_column(Column.YAW_RATE)
+    sideslip: FloatArray = _view_column(Column.SIDESLIP)
+    vx_std: FloatArray = _view_column(Column.VX_STD)
+    vy_std: FloatArray = _view_column(Column.VY_STD)
+    yaw_rate_std: FloatArray = _view_column(Column.YAW_RATE_STD)
+    sideslip_std: FloatArray = _view_column(Column.SIDESLIP_STD)
+    mu: FloatArray = _view_column(Column.MU)
+    mu_lower: FloatArray = _view_column(Column.MU_LOWER)
+    mu_upper: FloatArray = _view_column(Column.MU_UPPER)
+    mu_utilised: FloatArray = _view_column(Column.MU_UTILISED)
+    innovation_nis: FloatArray = _view_column(Column.INNOVATION_NIS)
+    adaptation: FloatArray = _view_column(Column.ADAPTATION)
+    innovation_log_likelihood: FloatArray = _view_column(Column.INNOVATION_LOG_LIKELIHOOD)
 
     def __init__(
         self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None

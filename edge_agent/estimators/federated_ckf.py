@@ -27,7 +27,7 @@ from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
 from edge_agent.dynamics.parameters import body, four
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import wheel_force
-from edge_agent.estimators.common.motion import diverged
+from edge_agent.estimators.common.motion import has_diverged
 from edge_agent.estimators.common.output import (
     PRIOR_MU,
     PRIOR_MU_STD,
@@ -50,7 +50,7 @@ from edge_agent.estimators.gaussian.federated_motion import (
 from edge_agent.estimators.gaussian.planar import PlanarState
 from edge_agent.estimators.gaussian.wheel_friction import (
     PRIOR_ROOT,
-    dependence,
+    dependence_factor,
     mean_friction,
     return_to_prior,
 )
@@ -87,7 +87,7 @@ class JointMemory(FederatedMemory):
     yaw_rate: float  # of the master at the sample before
 
 
-def bank(
+def make_bank(
     vehicles: Sequence[Vehicle],
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
@@ -101,17 +101,17 @@ def bank(
 
 
 @compiled
-def _begin(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
+def _begin_filter(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
     begin_motion(memory)
     memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5
 
 
 @compiled
-def _step(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
+def _step_filter(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     motion = memory.motion
     memory.yaw_rate = motion.mean[PlanarState.YAW_RATE]
     step_motion(memory, memory.mean, dt)
-    if diverged(motion.mean, motion.root, PlanarState.YAW_RATE):
+    if has_diverged(motion.mean, motion.root, PlanarState.YAW_RATE):
         return False
     motion.beta = share_by_information(motion.size[0], motion.size[1])
     _step_friction(memory, dt)
@@ -140,7 +140,7 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
     for sub in range(2):
         share(memory.root, memory.beta if sub == 0 else 1.0 - memory.beta, root)
         mean[:] = memory.mean
-        _measure(memory, sub, dt, mean, root, work)
+        _update_sub_filter(memory, sub, dt, mean, root, work)
         sizes[sub] = 0.0
         for i in range(WHEELS):
             sizes[sub] += variance(root, i)
@@ -154,7 +154,7 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
 
 
 @compiled
-def _measure(
+def _update_sub_filter(
     memory: JointMemory, sub: int, dt: float, mean: FloatArray, root: FloatArray, work: FloatArray
 ) -> None:
     row = memory.row
@@ -194,7 +194,7 @@ def _measure(
     weighted_mean(outcomes, WEIGHT, predicted)
     deviations(points, mean, WEIGHT, state, 0)
     deviations(outcomes, predicted, WEIGHT, measured, 0)
-    inflation = dependence(math.hypot(use[S.AX], use[S.AY]) / GRAVITY, dt)
+    inflation = dependence_factor(math.hypot(use[S.AX], use[S.AY]) / GRAVITY, dt)
     for r in range(ROWS):
         innovation[r] = now[r] - predicted[r]
         std[r] = inflation * NOISE_STD[r] * (1.0 if r == 0 else math.sqrt(2.0))
@@ -205,7 +205,7 @@ def _measure(
 
 
 @compiled
-def _report(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
+def _write_estimates(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
     write_states(output, memory.motion.mean, memory.motion.root, PlanarState.YAW_RATE)
     for wheel in range(WHEELS):
         std = math.sqrt(variance(memory.root, wheel))
@@ -215,7 +215,7 @@ def _report(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> fl
     return float(output[Column.MU])
 
 
-KERNEL = kernel_of(_begin, _step, _report)
+KERNEL = kernel_of(_begin_filter, _step_filter, _write_estimates)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
     Element(

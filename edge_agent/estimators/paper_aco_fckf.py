@@ -24,7 +24,7 @@ from edge_agent.adaptation.fuzzy import adapted_within
 from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.bank import EstimatorBank
-from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, diverged
+from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, has_diverged
 from edge_agent.estimators.common.output import (
     PRIOR_MU,
     PRIOR_MU_STD,
@@ -37,7 +37,7 @@ from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
 from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import Column
-from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, carry
+from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.columns import gather, spread
 from edge_agent.filters.householder import LOG_TWO_PI
@@ -127,7 +127,7 @@ class FuzzyContext:
     gain: Annotated[FloatArray, STATES]
 
 
-def bank(
+def make_bank(
     vehicles: Sequence[Vehicle],
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
@@ -153,7 +153,7 @@ def bank(
 
 
 @compiled
-def _begin(memory: FuzzyMemory, context: FuzzyContext) -> None:
+def _begin_filter(memory: FuzzyMemory, context: FuzzyContext) -> None:
     """Start at the speed of the wheels, straight ahead."""
     mean = memory.mean
     root = memory.root
@@ -174,16 +174,16 @@ def _begin(memory: FuzzyMemory, context: FuzzyContext) -> None:
 
 
 @compiled
-def _step(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
+def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
     mean = memory.mean
     root = memory.root
     points = context.points
     noise = context.adapted
     pace = dt / STEP_S
     spread(mean, root, points)
-    carry(memory.row, points, memory.factor, memory.track, dt, False, context.dual_motor)
+    propagate_points(memory.row, points, memory.factor, memory.track, dt, False, context.dual_motor)
     gather(points, context.process, math.sqrt(pace), mean, root)
-    _adapt(memory, context, pace, math.exp(-math.log(2.0) * dt / WINDOW_S))
+    _adapt_noise(memory, context, pace, math.exp(-math.log(2.0) * dt / WINDOW_S))
     used = 0
     square = 0.0
     determinant = 1.0
@@ -198,11 +198,11 @@ def _step(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
     memory.nis = square / max(used, 1)
     memory.log_likelihood = -0.5 * (used * LOG_TWO_PI + math.log(determinant) + square)
     limit_friction(mean, root, PlanarState.MU, PRIOR_MU_STD)
-    return not diverged(mean, root, PlanarState.YAW_RATE)
+    return not has_diverged(mean, root, PlanarState.YAW_RATE)
 
 
 @compiled
-def _adapt(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
+def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
     """Compute context.adapted = R of this sample, and the factors on R for the next."""
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]
@@ -224,7 +224,7 @@ def _adapt(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float)
 
 
 @compiled
-def _report(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> float:  # noqa: ARG001 as of all filters
+def _write_estimates(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> float:  # noqa: ARG001 as of all filters
     mean = memory.mean
     root = memory.root
     write_states(output, mean, root, PlanarState.YAW_RATE)
@@ -234,7 +234,7 @@ def _report(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> f
     return float(mean[PlanarState.MU])
 
 
-KERNEL = kernel_of(_begin, _step, _report)
+KERNEL = kernel_of(_begin_filter, _step_filter, _write_estimates)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
     Element(
@@ -305,7 +305,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "input [omega, gamma]",
         "corrected",
         "[omega, delta]: yaw rate is measured, steering moves it",
-        "gaussian.planar.carry",
+        "gaussian.planar.propagate_points",
     ),
     Element(
         "(30)",
@@ -313,7 +313,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "the innovation, where z-hat is printed; a quotient, row by row, because rows have unlike "
         "units",
-        "paper_aco_fckf._adapt",
+        "paper_aco_fckf._adapt_noise",
     ),
     Element(
         "III.B a to c",

@@ -26,7 +26,7 @@ from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.calibrated import means_of, spreads_of
 from edge_agent.estimators.friction_mixture.design import design_of
-from edge_agent.estimators.friction_mixture.tyre_curve import Curve, proven
+from edge_agent.estimators.friction_mixture.tyre_curve import Curve, check_curve
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 
@@ -46,10 +46,10 @@ TUNED: Final = {"aco-fckf": "aco-fckf", "paper-aco-fckf": "paper-aco-fckf"}
 
 # the papers' estimators without fuzzy sets that could be tuned
 PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
-    "federated-ckf": federated_ckf.bank,
-    "adaptive-federated-ckf": adaptive_federated_ckf.bank,
-    "compensated-wckf": compensated_wckf.bank,
-    "sr-ukf": sr_ukf.bank,
+    "federated-ckf": federated_ckf.make_bank,
+    "adaptive-federated-ckf": adaptive_federated_ckf.make_bank,
+    "compensated-wckf": compensated_wckf.make_bank,
+    "sr-ukf": sr_ukf.make_bank,
 }
 
 
@@ -85,7 +85,7 @@ def create(
         if name in PLAIN or name == "paper-aco-fckf":
             raise InputError("tyre-curve", f"{name} has its own", "leave it out")
         try:
-            proven(curve)
+            check_curve(curve)
         except (ValueError, TypeError) as error:
             raise InputError(
                 "tyre-curve",
@@ -105,7 +105,7 @@ def create(
             )
         memberships = Memberships()
     if name == "paper-aco-fckf":
-        return paper_aco_fckf.bank(vehicles, memberships)
+        return paper_aco_fckf.make_bank(vehicles, memberships)
     design = design_of(memberships, adaptive=name != "ckf", curve=curve)
     spreads = spreads_of(vehicles, design.nominal.std)
     means = means_of(vehicles, design.nominal.mean)

@@ -19,7 +19,7 @@ CHANNEL_COUNT = len(CHANNELS)
 DOUBLE = np.dtype(np.float64)
 
 
-def checked(
+def check_arrays(
     t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.

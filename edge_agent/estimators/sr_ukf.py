@@ -37,7 +37,7 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body, four
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
-from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, diverged
+from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, has_diverged
 from edge_agent.estimators.common.output import (
     PRIOR_MU,
     PRIOR_MU_STD,
@@ -51,9 +51,9 @@ from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
 from edge_agent.estimators.gaussian.federated_motion import (
-    doubted,
     mean_wheel_velocity,
     slip_free_speed,
+    widened_speed_std,
 )
 from edge_agent.estimators.gaussian.wheel_friction import (
     FORGET_M,
@@ -116,7 +116,7 @@ class UnscentedMemory(PaperMemory):
     refused: float  # downdates
 
 
-def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
+def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
     """Return a bank of N of these filters."""
     return EstimatorBank(
         new_filters(UnscentedMemory, vehicles, tyre),
@@ -127,7 +127,7 @@ def bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Estimat
 
 
 @compiled
-def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
+def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
     mean = memory.mean
     root = memory.root
     X = WheelFrictionState
@@ -147,7 +147,7 @@ def _begin(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG0
 
 
 @compiled
-def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
+def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
     """Compute mu (4,) of a point x (7,), within the range of friction; its deviation from the mean
     is scaled by `share`.
     """
@@ -157,7 +157,9 @@ def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> 
 
 
 @compiled
-def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> tuple[float, float]:
+def _tyre_accelerations(
+    row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray
+) -> tuple[float, float]:
     """Return (a_y, yaw acceleration) from the tyres at x (7,)."""
     use = track.inputs
     unknown = (math.nan, math.nan, math.nan, math.nan)
@@ -170,7 +172,7 @@ def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> 
 
 
 @compiled
-def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
+def _step_filter(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     row = memory.row
     track = memory.track
     mean = memory.mean
@@ -188,8 +190,8 @@ def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # 
     sigma_points(mean, root, XI, points)
     for p in range(count):
         x = points[p]
-        _friction(x, middle, share, mu)
-        _, turn = _felt(row, x, track, mu)
+        _point_friction(x, middle, share, mu)
+        _, turn = _tyre_accelerations(row, x, track, mu)
         rate = x[WheelFrictionState.YAW_RATE]
         x[0], x[1] = advance_velocity(x[0], x[1], use[S.AX], use[S.AY], rate, dt)
         x[WheelFrictionState.YAW_RATE] = rate + dt * turn
@@ -200,14 +202,14 @@ def _step(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # 
     noise[first:, first:] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
     predict(points, W_MEAN, W_COV, noise, mean, root, work)
     sigma_points(mean, root, XI, points)
-    _measure(memory, dt, share, points, work)
+    _update_filter(memory, dt, share, points, work)
     for wheel in range(4):
         limit_friction(mean, root, first + wheel, PRIOR_MU_STD)
-    return not diverged(mean, root, WheelFrictionState.YAW_RATE)
+    return not has_diverged(mean, root, WheelFrictionState.YAW_RATE)
 
 
 @compiled
-def _measure(
+def _update_filter(
     memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray
 ) -> None:
     row = memory.row
@@ -234,8 +236,8 @@ def _measure(
             mean_wheel_velocity(row, track, points[p], rate),
             points[p, rate],
         )
-        _friction(points[p], middle, share, mu)
-        outcomes[p, 2], _ = _felt(row, points[p], track, mu)
+        _point_friction(points[p], middle, share, mu)
+        outcomes[p, 2], _ = _tyre_accelerations(row, points[p], track, mu)
         motion[:3] = points[p, :3]
         tyre_forces(row, motion, wheels, mu, DUGOFF, outcomes[p, 3:], force_y)
     weighted_mean(outcomes, W_MEAN, predicted)
@@ -259,7 +261,7 @@ def _measure(
         innovation[3 + wheel] = math.nan if missing else force
     for r in range(ROWS):
         innovation[r] -= predicted[r]
-    std[0] = doubted(std[0], innovation[0])
+    std[0] = widened_speed_std(std[0], innovation[0])
     used, log_likelihood, square, refused = update_by_downdate(
         mean, root, state, measured, innovation, std, work
     )
@@ -269,7 +271,7 @@ def _measure(
 
 
 @compiled
-def _report(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
+def _write_estimates(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
     mean = memory.mean
     root = memory.root
     first = WheelFrictionState.MU
@@ -282,7 +284,7 @@ def _report(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -
     return float(output[Column.MU])
 
 
-KERNEL = kernel_of(_begin, _step, _report)
+KERNEL = kernel_of(_begin_filter, _step_filter, _write_estimates)
 
 ELEMENTS: Final[tuple[Element, ...]] = (
     Element(

@@ -92,7 +92,7 @@ def new_tracks(vehicles: int) -> RecordArray:
     return tracks
 
 
-def locate(
+def locate_vehicles(
     tracks: RecordArray, t: FloatArray, signals: FloatArray, *, lost: bool = False
 ) -> tuple[RecordArray, Located]:
     """Follow N vehicles through a block.
@@ -120,11 +120,11 @@ def locate(
         np.full(shape, np.nan),
         np.full(shape, np.nan),
     )
-    _follow(t, _fixes(signals), after, located)
+    _advance_tracks(t, _receiver_samples(signals), after, located)
     return after, located
 
 
-def _fixes(signals: FloatArray) -> RecordArray:
+def _receiver_samples(signals: FloatArray) -> RecordArray:
     """Return the receiver's part of signals (T, N, channels), as records (T, N)."""
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
@@ -139,7 +139,7 @@ def _fixes(signals: FloatArray) -> RecordArray:
 
 
 @compiled
-def _course(track: CellTrack, latitude: float, longitude: float) -> None:
+def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
     """Update the course over ground [rad from east] when the vehicle has moved far enough."""
     north = (latitude - track.course_latitude) * METRES_PER_DEGREE
     east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
@@ -152,7 +152,7 @@ def _course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 
 @compiled
-def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
+def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
     """Return True if a fix still belongs to the visit, margins included."""
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
@@ -165,7 +165,7 @@ def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 
 @compiled
-def _receive(track: CellTrack, fix: ReceiverSample, now: float) -> None:
+def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
     """Store the readings of a sample."""
     if np.isfinite(fix.yaw):
         track.yaw_time = now
@@ -174,11 +174,11 @@ def _receive(track: CellTrack, fix: ReceiverSample, now: float) -> None:
         track.fix_time = now
         track.latitude = fix.latitude
         track.longitude = fix.longitude
-        _course(track, fix.latitude, fix.longitude)
+        _update_course(track, fix.latitude, fix.longitude)
 
 
 @compiled
-def _begin(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
+def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
     """Begin a visit of the fix's cell."""
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
@@ -189,16 +189,16 @@ def _begin(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
 
 
 @compiled
-def _follow(
+def _advance_tracks(
     t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located
 ) -> None:
-    """Sequential core of `locate`: advance the tracks and fill `located`."""
+    """Sequential core of `locate_vehicles`: advance the tracks and fill `located`."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
             track = tracks[n]
             fix = fixes[k, n]
             now = t[k, n]
-            _receive(track, fix, now)
+            _store_readings(track, fix, now)
             heading = track.yaw if now - track.yaw_time <= FIX_HELD_S else track.course
             held = now - track.fix_time <= FIX_HELD_S
             if held:
@@ -211,9 +211,9 @@ def _follow(
             elif (
                 fix.cell != NOWHERE
                 and np.isfinite(heading)
-                and not (track.cell != NOWHERE and _stays(track, fix, heading))
+                and not (track.cell != NOWHERE and _stays_in_cell(track, fix, heading))
             ):
-                _begin(track, fix, heading)
+                _begin_visit(track, fix, heading)
                 located.closes[k, n] = True
             located.inside[k, n] = fix.cell != NOWHERE and fix.cell == track.cell
             located.outside[k, n] = fix.cell != NOWHERE and fix.cell != track.cell

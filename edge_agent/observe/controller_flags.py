@@ -88,7 +88,7 @@ def trusted_context(
             np.nan_to_num(wheels).max(axis=-1) < STANDING_RATE,
             False,
         )
-    _check(after, t, standing.astype(np.float64), checked)
+    _check_flags(after, t, standing.astype(np.float64), checked)
     return after, checked
 
 
@@ -109,7 +109,7 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 
 
 @compiled
-def _check(
+def _check_flags(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
     """Sequential core of `trusted_context`: advance the records, and remove doubtful flags from the
@@ -128,13 +128,13 @@ def _check(
                     else 0.0
                 )
                 record.time = t[k, n]
-                _count(record, dt, value > 0.5, standing[k, n] > 0.5)
+                _count_sample(record, dt, value > 0.5, standing[k, n] > 0.5)
                 if value > 0.5 and record.doubt > 0:
                     context[k, n, i] = np.nan
 
 
 @compiled
-def _count(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
+def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
     """Count one more known sample of a flag, `dt` [s] after the previous one."""
     keep = np.exp(-dt / MEMORY_S)
     record.known = record.known * keep + dt

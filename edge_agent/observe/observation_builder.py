@@ -2,7 +2,7 @@
 set rate.
 
 For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is
-advanced with these `closes`, and `observe` makes the records. State between blocks is an
+advanced with these `closes`, and `build_records` makes the records. State between blocks is an
 `OpenVisits`. Any split of the samples gives the same records in the same order. Pure.
 """
 
@@ -118,14 +118,14 @@ class OpenVisits:
     slot: IntArray
 
     @staticmethod
-    def start(vehicles: int) -> OpenVisits:
+    def before_any(vehicles: int) -> OpenVisits:
         """Return the state before any visit."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
 
 
-def observe(
+def build_records(
     before: OpenVisits,
     time: IntArray,
     located: Located,
@@ -142,15 +142,21 @@ def observe(
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
-    notes = _notes(estimates, context)
-    count = _visit(
-        time, located, _samples(estimates, signals), notes, after.visits, ended, config.position_std
+    notes = _sample_notes(estimates, context)
+    count = _advance_visits(
+        time,
+        located,
+        _visit_samples(estimates, signals),
+        notes,
+        after.visits,
+        ended,
+        config.position_std,
     )
     ended = ended[:count]
     return (
         after,
-        _observations(ended, estimates.evidence, config),
-        _states(after, time, located, estimates, config),
+        _build_observations(ended, estimates.evidence, config),
+        _build_states(after, time, located, estimates, config),
     )
 
 
@@ -166,7 +172,7 @@ class SampleNotes(NamedTuple):
     context: FloatArray
 
 
-def _notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
+def _sample_notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
     heard = np.zeros((0, 0, len(CONTEXT))) if context is None else np.ascontiguousarray(context)
     row = np.full(estimates.mu.shape, -1)
     if estimates.jumps is None or estimates.evidence is None:
@@ -176,7 +182,7 @@ def _notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
     return SampleNotes(row, told, heard)
 
 
-def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
+def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
     """Return the inputs of visits from the estimates and the accelerometers, as records (T, N)."""
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
@@ -188,7 +194,7 @@ def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
 
 
 @compiled
-def _visit(
+def _advance_visits(
     time: IntArray,
     located: Located,
     samples: Records[Sample],
@@ -210,13 +216,13 @@ def _visit(
                     visit.vehicle = n
                     ended[count] = visit
                     count += 1
-                _begin(visit, time[k, n], located.cell[k, n], located.sector[k, n])
+                _begin_visit(visit, time[k, n], located.cell[k, n], located.sector[k, n])
             if visit.cell != NOWHERE:
                 if located.inside[k, n]:
                     visit.from_fix = 0.0
                 elif located.outside[k, n]:
                     visit.from_fix = np.inf
-                _add(visit, time[k, n], samples[k, n], position_std)
+                _add_sample(visit, time[k, n], samples[k, n], position_std)
                 if k < len(notes.context):
                     _add_context(visit, notes.context[k, n])
                 if located.inside[k, n]:
@@ -229,7 +235,7 @@ def _visit(
 
 
 @compiled
-def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
+def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
     """Start a visit without a sample in a record."""
     visit.enter_time = time
     visit.cell = cell
@@ -275,9 +281,9 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 
 @compiled
-def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
+def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
     """Add one sample to a visit."""
-    _feel(visit, (time - visit.leave_time) / NS, sample, position_std)
+    _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
     visit.health |= sample.health
@@ -304,7 +310,7 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 
 @compiled
-def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
+def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
     """Update the grip felt by the accelerometers `dt` [s] after the last sample; a visit without
     them excludes no friction.
     """
@@ -321,13 +327,13 @@ def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
     visit.from_fix += sample.speed * dt
 
 
-def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
+def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
     return {
         name: columns[name].astype(dtype, copy=False) for name, dtype in column_types(kind).items()
     }
 
 
-def _directions(ended: RecordArray) -> dict[str, FloatArray]:
+def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
     """Return the grip used along and across the vehicle, (n,): divided by squared acceleration; NaN
     where there was none.
 
@@ -337,7 +343,7 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
     whole = np.where(along + across > 0.0, along + across, np.nan)
-    used = _used(ended)
+    used = _grip_used(ended)
     return {
         "used_longitudinal": used
         * np.sqrt(along / whole)
@@ -348,7 +354,7 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
     }
 
 
-def _used(ended: RecordArray) -> FloatArray:
+def _grip_used(ended: RecordArray) -> FloatArray:
     """Return the grip used in visits (n,). Its window may reach into the previous cell; where
     friction jumped, that of the part with least grip is used.
     """
@@ -356,13 +362,13 @@ def _used(ended: RecordArray) -> FloatArray:
     return np.asarray(np.minimum(last, ended["earlier_used"]))
 
 
-def _observations(
+def _build_observations(
     ended: RecordArray, evidence: FloatArray | None, config: AgentConfig
 ) -> RecordBlock:
     n = len(ended)
     mu = ended["mu"]
     upper = ended["mu_upper"]
-    used = _used(ended)
+    used = _grip_used(ended)
     carried = (
         "enter_time",
         "leave_time",
@@ -379,19 +385,19 @@ def _observations(
         "position_std": np.full(n, config.position_std),
         "yaw_std": np.full(n, config.yaw_std),
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
-        "log_likelihood": _likelihood(ended, evidence),
+        "log_likelihood": _likelihood_bytes(ended, evidence),
         "tyre_season": np.full(n, config.tyre_season),
-        **_context(ended),
-        **_directions(ended),
+        **_context_columns(ended),
+        **_grip_directions(ended),
     }
     limit = config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
     return RecordBlock(
-        Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent
+        Kind.OBSERVATION, _cast_columns(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent
     )
 
 
-def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
+def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     """Return the columns of controllers and surroundings of visits, (n,) each.
 
     A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of
@@ -409,7 +415,7 @@ def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     }
 
 
-def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
+def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
     """Return likelihood bytes (n, 32) of visits; (n, 0) of a bank without evidence.
 
     A visit that the bank did not follow from its start is flat. Where the friction jumped in the
@@ -424,7 +430,7 @@ def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.u
     return mugrid.encode_log_likelihood(np.where(known, reported, 0.0))
 
 
-def _states(
+def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
     """Return the first sample of each time slot where the position is known; advance
@@ -447,7 +453,7 @@ def _states(
     }
     return RecordBlock(
         Kind.STATE,
-        _typed(Kind.STATE, columns),
+        _cast_columns(Kind.STATE, columns),
         n.astype(np.int64),
         np.zeros(len(k), dtype=np.bool_),
     )

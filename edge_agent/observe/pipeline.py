@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.block import Block
-from edge_agent.observe.cell_tracker import NOWHERE, locate, new_tracks
+from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles, new_tracks
 from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
-from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
+from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, build_records
 from edge_agent.observe.trip_privacy import TripEnds
 from schemas.grid import SECTORS
 from schemas.numeric import FloatArray, IntArray
@@ -60,7 +60,7 @@ class Pipeline:
         self._bank = bank
         self._config = config
         self._tracks = new_tracks(vehicles)
-        self._open = OpenVisits.start(vehicles)
+        self._open = OpenVisits.before_any(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
         self._flags = new_flag_records(vehicles)
@@ -72,12 +72,12 @@ class Pipeline:
         """Return estimates, observations and states of a block of at least one sample; the records
         leave out the ends of trips.
         """
-        self._tracks, located = locate(self._tracks, block.t, block.signals)
+        self._tracks, located = locate_vehicles(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
         context = block.context
         if context is not None:
             self._flags, context = trusted_context(self._flags, block.t, block.signals, context)
-        self._open, observations, states = observe(
+        self._open, observations, states = build_records(
             self._open, block.time, located, estimates, self._config, block.signals, context
         )
         self._last = block
@@ -98,8 +98,12 @@ class Pipeline:
         cell = located.cell[-1]
         sector = located.sector[-1]
         self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)
-        self._ends.drive(block.time, estimates.vx)
-        return estimates, self._ends.cut(observations), self._ends.cut(states)
+        self._ends.advance(block.time, estimates.vx)
+        return (
+            estimates,
+            self._ends.release_records(observations),
+            self._ends.release_records(states),
+        )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
         """Return the current beliefs of the estimators, and the evidence of the visits so far; see
@@ -124,8 +128,10 @@ class Pipeline:
         t = self._last.t[-1:] + FINAL_STEP_S
         time = self._last.time[-1:] + round(FINAL_STEP_S * NS)
         empty = np.full((1, *self._last.signals.shape[1:]), np.nan)
-        tracks, located = locate(self._tracks, t, empty, lost=True)
+        tracks, located = locate_vehicles(self._tracks, t, empty, lost=True)
         estimates = self._bank.advance(t, empty, located.closes)
         self._tracks = tracks
-        self._open, observations, _ = observe(self._open, time, located, estimates, self._config)
-        return self._ends.cut(observations)
+        self._open, observations, _ = build_records(
+            self._open, time, located, estimates, self._config
+        )
+        return self._ends.release_records(observations)

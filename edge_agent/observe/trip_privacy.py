@@ -19,8 +19,8 @@ _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 
 class TripEnds:
-    """The filter of trip ends for N vehicles. Call `drive` with each block, then `cut` with its
-    records.
+    """The filter of trip ends for N vehicles. Call `advance` with each block, then
+    `release_records` with its records.
 
     Args:
         vehicles: N.
@@ -37,12 +37,12 @@ class TripEnds:
         self._waiting: dict[Kind, RecordBlock] = {}
 
     @property
-    def _off(self) -> bool:
+    def _is_off(self) -> bool:
         return self._metres == 0.0 and self._ns == 0
 
-    def drive(self, time: IntArray, speed: FloatArray) -> None:
+    def advance(self, time: IntArray, speed: FloatArray) -> None:
         """Advance by a block: time (T, N) [ns], speed (T, N) [m/s]."""
-        if self._off:
+        if self._is_off:
             return
         if self._began is None:
             self._began = time[0].copy()
@@ -53,25 +53,25 @@ class TripEnds:
         self._driven = odometer[-1]
         self._times.append(time[-1:])
         self._odometers.append(odometer[-1:])
-        self._forget()
+        self._drop_old_track()
 
-    def cut(self, records: RecordBlock) -> RecordBlock:
+    def release_records(self, records: RecordBlock) -> RecordBlock:
         """Return those of the records, and of the earlier waiting ones, that may be published
         now.
         """
-        if self._off or self._began is None:
+        if self._is_off or self._began is None:
             return records
         waiting = self._waiting.get(records.kind)
-        both = records if waiting is None else _joined(waiting, records)
+        both = records if waiting is None else _join_blocks(waiting, records)
         time: IntArray = both.columns[_TIME[records.kind]]
-        driven = self._odometer(time, both.vehicle)
+        driven = self._distance_at(time, both.vehicle)
         now = self._times[-1][-1][both.vehicle]
         begun = (driven >= self._metres) & (time - self._began[both.vehicle] >= self._ns)
         passed = (self._driven[both.vehicle] - driven >= self._metres) & (now - time >= self._ns)
-        self._waiting[records.kind] = _selected(both, begun & ~passed)
-        return _selected(both, begun & passed)
+        self._waiting[records.kind] = _select_rows(both, begun & ~passed)
+        return _select_rows(both, begun & passed)
 
-    def _forget(self) -> None:
+    def _drop_old_track(self) -> None:
         """Drop the track before the oldest waiting record."""
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
@@ -80,7 +80,7 @@ class TripEnds:
         while len(self._times) > 2 and self._times[1].max() <= oldest:
             del self._times[0], self._odometers[0]
 
-    def _odometer(self, time: IntArray, vehicle: IntArray) -> FloatArray:
+    def _distance_at(self, time: IntArray, vehicle: IntArray) -> FloatArray:
         """Return the distance that each vehicle had driven at a time, (n,), interpolated between
         the ends of blocks.
         """
@@ -96,14 +96,14 @@ class TripEnds:
         return out
 
 
-def _selected(
+def _select_rows(
     records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]
 ) -> RecordBlock:
     columns = {name: column[rows] for name, column in records.columns.items()}
     return RecordBlock(records.kind, columns, records.vehicle[rows], records.urgent[rows])
 
 
-def _joined(first: RecordBlock, second: RecordBlock) -> RecordBlock:
+def _join_blocks(first: RecordBlock, second: RecordBlock) -> RecordBlock:
     columns = {
         name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns
     }

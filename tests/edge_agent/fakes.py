@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from edge_agent.inputs.block import Block, absolute
-from edge_agent.observe.cell_tracker import Located, locate, new_tracks
-from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
+from edge_agent.observe.cell_tracker import Located, locate_vehicles, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, build_records
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
@@ -112,13 +112,13 @@ class Watch:
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
         """Nothing seen yet."""
-        return Watch(new_tracks(vehicles), OpenVisits.start(vehicles), config or AgentConfig())
+        return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
         """One block."""
-        self.tracks, located = locate(self.tracks, block.t, block.signals)
+        self.tracks, located = locate_vehicles(self.tracks, block.t, block.signals)
         reported = cast("Estimates", output)  # which has more, of what nobody reads here
-        self.open, observations, states = observe(
+        self.open, observations, states = build_records(
             self.open, block.time, located, reported, self.config
         )
         return located, observations, states

@@ -9,7 +9,7 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def put(target: FloatArray, source: FloatArray) -> None:
+def copy_vector(target: FloatArray, source: FloatArray) -> None:
     """Copy: target (n,) = source (n,)."""
     for i in range(target.shape[0]):
         target[i] = source[i]
@@ -24,7 +24,7 @@ def put_square(target: FloatArray, source: FloatArray) -> None:
 
 
 @compiled
-def clear(target: FloatArray) -> None:
+def clear_vector(target: FloatArray) -> None:
     """Clear: target (n,) = 0."""
     for i in range(target.shape[0]):
         target[i] = 0.0

@@ -45,11 +45,11 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
         ring.largest = ring.used[place]
         ring.largest_time = ring.time[place]
     elif not ring.largest_time > time - UTILISED_WINDOW_S:
-        _search(ring, time)
+        _find_largest(ring, time)
 
 
 @compiled
-def _search(ring: Excitation, time: float) -> None:
+def _find_largest(ring: Excitation, time: float) -> None:
     """Find `largest` again from all slots, because the slot it came from has expired."""
     ring.largest = 0.0
     for k in range(SLOTS):

@@ -19,9 +19,9 @@ from edge_agent.estimators.common.excitation import Excitation, begin_excitation
 from edge_agent.estimators.common.readings import (
     GAP_S,
     INPUTS,
-    believe,
     position_health,
     position_time,
+    read_plausible,
     rolling_speed,
 )
 from schemas.numeric import FloatArray
@@ -50,7 +50,7 @@ class InputTrack:
 
 
 @compiled
-def take(
+def take_sample_in(
     track: InputTrack, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, int, float]:
     """Process sample (18,) of a vehicle at `time` [s]: return (health flags, REFUSED | BEGUN |
@@ -62,22 +62,22 @@ def take(
         return flags.TIME_GAP, REFUSED, 0.0
     silent = not begins and dt > GAP_S
     if begins:
-        _begin(track)
-    health = believe(sample, track.now)
+        _reset_track(track)
+    health = read_plausible(sample, track.now)
     track.position_time = position_time(sample, time, track.position_time)
     health |= position_health(time, track.position_time)
-    _remember(track)
-    _renew(track, row, begins or silent)
+    _store_inputs(track)
+    _fill_inputs(track, row, begins or silent)
     track.time = time
     note_excitation(track.excitation, time, _grip_used(track, row))
     if begins or silent:
-        _remember(track)
+        _store_inputs(track)
         return health | flags.RESET | (flags.TIME_GAP if silent else 0), BEGUN, 0.0
     return health, STEPPED, dt
 
 
 @compiled
-def _begin(track: InputTrack) -> None:
+def _reset_track(track: InputTrack) -> None:
     """Reset the track: no sample has been seen, and the wheels point straight ahead."""
     track.started = True
     track.position_time = -math.inf
@@ -87,7 +87,7 @@ def _begin(track: InputTrack) -> None:
 
 
 @compiled
-def _remember(track: InputTrack) -> None:
+def _store_inputs(track: InputTrack) -> None:
     """Store the inputs as those of the previous sample."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
@@ -97,7 +97,7 @@ def _remember(track: InputTrack) -> None:
 
 
 @compiled
-def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
+def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
     """Fill `inputs`. If the last argument is True, the previous inputs are not used as
     replacements.
     """

@@ -20,7 +20,7 @@ FASTEST_TURN = 20.0  # [rad/s]
 
 
 @compiled
-def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
+def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
     """Return True if a filter has diverged. Its first states are v_x and v_y; state `yaw_rate` is
     the yaw rate.
     """
@@ -32,7 +32,7 @@ def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 
 
 @compiled
-def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
+def sliding_flag(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
     """Return the health flag of a wheel whose longitudinal slip is past the peak, at the inputs in
     use.
     """

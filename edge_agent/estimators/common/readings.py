@@ -40,7 +40,7 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 
 @compiled
-def believe(sample: FloatArray, now: FloatArray) -> int:
+def read_plausible(sample: FloatArray, now: FloatArray) -> int:
     """Fill now (15,) with the readings of a sample (18,), NaN where missing, infinite or
     implausible; return the health flags.
     """

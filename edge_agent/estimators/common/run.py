@@ -12,8 +12,8 @@ from typing import Annotated, TypeVar
 from edge_agent.dynamics.parameters import Parameter, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import Kernel, Part
-from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take
-from edge_agent.estimators.common.motion import sliding
+from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take_sample_in
+from edge_agent.estimators.common.motion import sliding_flag
 from edge_agent.estimators.common.output import write_quality, write_unknown
 from edge_agent.estimators.common.tyre_option import TyreOption, fit_tyres
 from edge_agent.estimators.estimates import Column
@@ -52,7 +52,7 @@ def kernel_of(
     """
 
     @nogil
-    def advance(
+    def advance_filters(
         filters: Records[Memory],
         contexts: Records[Context],
         t: FloatArray,
@@ -67,7 +67,7 @@ def kernel_of(
             for k in range(t.shape[0]):
                 output = outputs[k, n]
                 memory.log_likelihood = 0.0
-                health, kind, dt = take(memory.track, memory.row, t[k, n], signals[k, n])
+                health, kind, dt = take_sample_in(memory.track, memory.row, t[k, n], signals[k, n])
                 if kind == STEPPED and not step(memory, context, dt):
                     health = health | flags.RESET
                     kind = BEGUN
@@ -85,14 +85,14 @@ def kernel_of(
                         memory.adaptation,
                         memory.log_likelihood,
                     )
-                    health |= sliding(
+                    health |= sliding_flag(
                         memory.row, memory.track, output[Column.VX], output[Column.VY], mu
                     )
                 else:
                     write_unknown(output)
                 output[Column.HEALTH] = health
 
-    return advance
+    return advance_filters
 
 
 def new_filters(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from edge_agent.estimators.bank import EstimatorBank, Part
-from edge_agent.estimators.common.arrays import clear, put
+from edge_agent.estimators.common.arrays import clear_vector, copy_vector
 from edge_agent.estimators.common.output import write_motion, write_quality, write_unknown
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
 from edge_agent.estimators.friction_mixture.beliefs import report_beliefs
@@ -13,8 +13,8 @@ from edge_agent.estimators.friction_mixture.friction_grid import quantile, visit
 from edge_agent.estimators.friction_mixture.grip_guard import reported_upper
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
 from edge_agent.estimators.friction_mixture.reported_interval import LOWER_END, UPPER_END
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
-from edge_agent.estimators.friction_mixture.step import step, velocity
+from edge_agent.estimators.friction_mixture.split_sides import BOTH, project_weights
+from edge_agent.estimators.friction_mixture.step import mean_velocity, step
 from edge_agent.estimators.friction_mixture.visit_parts import begin_part, end_part
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
@@ -46,7 +46,7 @@ def mixture_bank(
             design.nominal.std if spreads is None else spreads,
         ),
         context,
-        _advance,
+        _advance_filters,
         columns=FOUR_FRICTIONS,
         evidence=True,
         beliefs=report_beliefs,
@@ -54,7 +54,7 @@ def mixture_bank(
 
 
 @nogil
-def _advance(
+def _advance_filters(
     filters: Records[MixtureMemory],
     contexts: Records[MixtureContext],
     t: FloatArray,
@@ -80,7 +80,7 @@ def _advance(
                 closes.shape[0] > 0 and memory.started and memory.block.samples == 0
             ):  # a block has ended
                 end_part(memory, design, evidence[k, n])
-            report(memory, design, output)
+            write_estimates(memory, design, output)
             output[Column.HEALTH] = health | memory.health
 
 
@@ -90,26 +90,26 @@ def close_visit(
 ) -> None:
     """Write the evidence (32,) of the visit that ends, and begin the next visit from the prior."""
     if not memory.started:
-        clear(evidence)
+        clear_vector(evidence)
     elif memory.split:
-        project(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
-        project(design.sides.prior, design.sides.share[BOTH], scratch.expected)
+        project_weights(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
+        project_weights(design.sides.prior, design.sides.share[BOTH], scratch.expected)
         visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, evidence)
-        put(memory.visit_weight, design.sides.prior)
+        copy_vector(memory.visit_weight, design.sides.prior)
     else:
         visit_evidence(design.mu, design.prior, memory.visit_weight[:NODES], CENTRES, evidence)
-        put(memory.visit_weight[:NODES], design.prior)
+        copy_vector(memory.visit_weight[:NODES], design.prior)
     begin_part(memory, design)
 
 
 @compiled
-def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
+def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
     """Write the current estimates of the vehicle's filter, except health."""
     if not memory.started:
         report_prior(design, output)
         return
     last = memory.last
-    vx, vy = velocity(memory)
+    vx, vy = mean_velocity(memory)
     constants = design.constants
     var_x = memory.overall_covariance[NodeState.VX, NodeState.VX]
     var_x += (constants.radius_std * vx) ** 2 + (

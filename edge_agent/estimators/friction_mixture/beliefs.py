@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from edge_agent.estimators.common.arrays import clear
+from edge_agent.estimators.common.arrays import clear_vector
 from edge_agent.estimators.friction_mixture.constants import NODES
 from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
+from edge_agent.estimators.friction_mixture.split_sides import BOTH, project_weights
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
@@ -29,13 +29,13 @@ def report_beliefs(
     for n in range(own.shape[0]):
         memory = filters[n]
         if not memory.started:
-            clear(own[n])
-            clear(visit[n])
+            clear_vector(own[n])
+            clear_vector(visit[n])
         elif memory.split:
-            project(design.sides.prior, design.sides.share[BOTH], scratch.expected)
-            project(memory.weight, design.sides.share[BOTH], scratch.projected)
+            project_weights(design.sides.prior, design.sides.share[BOTH], scratch.expected)
+            project_weights(memory.weight, design.sides.share[BOTH], scratch.projected)
             visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, own[n])
-            project(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
+            project_weights(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
             visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, visit[n])
         else:
             visit_evidence(design.mu, design.prior, memory.weight[:NODES], CENTRES, own[n])

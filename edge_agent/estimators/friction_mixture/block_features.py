@@ -49,7 +49,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     last = memory.last
     block = memory.block
     constants = design.constants
-    _kinematics(block, features)
+    _average_kinematics(block, features)
     features.yaw_rate = mean_or(block, S.YAW_RATE, last.yaw_rate)
     ax = mean_or(block, S.AX, 0.0)
     ay = mean_or(block, S.AY, 0.0)
@@ -63,13 +63,13 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.spin[wheel] = 0.0 if math.isnan(change) else change
     features.steering = 0.5 * (last.delta[0] + last.delta[1])
     features.change, features.steer_rate = ax, _steer_rate(memory, features.duration)
-    health = _forces(memory, constants, features)
-    _sides(memory, features)
+    health = _compute_wheel_forces(memory, constants, features)
+    _compute_side_forces(memory, features)
     health |= _drop_unknown_sides(memory, features)
-    _noise(memory, design, features)
-    features.demand = demand(features)
-    _inform(constants, features)
-    features.asymmetry = asymmetry(memory, constants, features)
+    _compute_noise(memory, design, features)
+    features.demand = grip_demand(features)
+    _compute_information(constants, features)
+    features.asymmetry = unexplained_slip_difference(memory, constants, features)
     return health
 
 
@@ -80,7 +80,7 @@ def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
 
 
 @compiled
-def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
+def _average_kinematics(block: BlockSums, features: BlockFeatures) -> None:
     share = 1.0 / block.samples
     features.cos = block.cos_sum * share
     features.sin = block.sin_sum * share
@@ -100,7 +100,9 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 
 
 @compiled
-def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> int:
+def _compute_wheel_forces(
+    memory: MixtureMemory, constants: Constants, features: BlockFeatures
+) -> int:
     """Compute force and the force part of noise_std of the four wheels; return the health flags."""
     health = 0
     loads = features.loads
@@ -185,7 +187,7 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 
 
 @compiled
-def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
+def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None:
     """Compute the side force with its derivatives, and the load share, of both axles; NaN without
     a_y.
     """
@@ -234,7 +236,7 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 
 @compiled
-def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
+def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
     """Combine slip noise and force noise: each enters the total-least-squares residual with half
     the variance.
     """
@@ -253,7 +255,7 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
         linear = row[Parameter.SLOPE_X] / speed
         slip_variance = linear**2 * (noise**2 + step**2)
         features.abrupt_noise[wheel] = (
-            linear * constants.abrupt_share * abruptness(memory, constants, features, wheel)
+            linear * constants.abrupt_share * wheel_speed_jump(memory, constants, features, wheel)
         ) ** 2
         shape = constants.shape_share * features.force[wheel] ** 2
         variance = (
@@ -294,7 +296,7 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
 
 
 @compiled
-def abruptness(
+def wheel_speed_jump(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
     """Return how far a wheel is from its smoothed speed, advanced by the car's acceleration [m/s];
@@ -325,7 +327,7 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 
 @compiled
-def _inform(constants: Constants, features: BlockFeatures) -> None:
+def _compute_information(constants: Constants, features: BlockFeatures) -> None:
     """Compute informs_x and informs_y. Below some force, the stiffness that slip suggests is only
     noise.
     """
@@ -339,7 +341,9 @@ def _inform(constants: Constants, features: BlockFeatures) -> None:
 
 
 @compiled
-def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> float:
+def unexplained_slip_difference(
+    memory: MixtureMemory, constants: Constants, features: BlockFeatures
+) -> float:
     """Return the largest slip difference between the sides of an axle (as linear force over load)
     that no force explains.
 
@@ -374,7 +378,7 @@ def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatur
 
 
 @compiled
-def demand(features: BlockFeatures) -> float:
+def grip_demand(features: BlockFeatures) -> float:
     """Return the larger force over load of the two axles [1]; a missing lateral force counts as
     none.
 

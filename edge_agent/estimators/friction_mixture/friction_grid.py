@@ -65,7 +65,7 @@ def change_road(
 
 
 @compiled
-def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
+def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
     """Compute w *= exp(log_likelihood), normalised; log_likelihood (K,) about 0 or below."""
     total = 0.0
     for j in range(w.shape[0]):
@@ -83,10 +83,10 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
     count = mu.shape[0]
     total = 0.0
     for j in range(count + 1):
-        total += _segment(mu, prior, w, j)
+        total += _segment_mass(mu, prior, w, j)
     target = q * total
     for j in range(count + 1):
-        mass = _segment(mu, prior, w, j)
+        mass = _segment_mass(mu, prior, w, j)
         if target <= mass or j == count:
             left = LOWER if j == 0 else mu[j - 1]
             right = UPPER if j == count else mu[j]
@@ -100,7 +100,7 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 
 @compiled
-def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
+def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
     """Return the mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
     count = mu.shape[0]
     if j == 0:

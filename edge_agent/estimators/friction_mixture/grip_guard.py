@@ -38,7 +38,7 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
 
 
 @compiled
-def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
+def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
     """Return the penalty [nat] of friction side_mu (2,) for lying below the grip in use."""
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
     return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))

@@ -21,7 +21,7 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def drive_onto(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
+def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
     """Increase the probability of patches over `metres`."""
     share = 1.0 - math.exp(-metres / design.constants.patch_length)
     for j in range(PATCH_NODES):
@@ -29,7 +29,7 @@ def drive_onto(memory: MixtureMemory, design: MixtureDesign, metres: float) -> N
 
 
 @compiled
-def refute(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
+def shrink_patches(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
     """Reduce the probability of patches (PATCH_NODES,) where a block supports them less than the
     mixture (K,).
     """

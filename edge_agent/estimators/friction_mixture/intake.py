@@ -16,15 +16,15 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.common.readings import (
     GAP_S,
     INPUTS,
-    believe,
     position_health,
     position_time,
+    read_plausible,
 )
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.grip_guard import note_grip
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, PlanarVector, VelocityGain
-from edge_agent.estimators.friction_mixture.restart import UNKNOWN_YAW_VAR, YAW_STD, bridge
+from edge_agent.estimators.friction_mixture.restart import UNKNOWN_YAW_VAR, YAW_STD, bridge_gap
 from edge_agent.estimators.friction_mixture.wheel_readings import note_step, refuse_jumps
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -51,25 +51,25 @@ def take_sample(
         return flags.TIME_GAP, False
     now = last.now
     health = (
-        believe(sample, now) & ~flags.NO_STEERING
+        read_plausible(sample, now) & ~flags.NO_STEERING
     )  # which the block judges: a single angle is bridged
     health |= refuse_jumps(memory.row, now)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)
     if dt > GAP_S:
-        health |= flags.TIME_GAP | bridge(memory, design, dt)
+        health |= flags.TIME_GAP | bridge_gap(memory, design, dt)
         last.time = time
         begin_block(memory)
         return health, False
     _filter_yaw_rate(memory, dt)
-    ax = _believed(now[S.AX], last.ax, last.read_ax)
-    ay = _believed(now[S.AY], last.ay, last.read_ay)
+    ax = _drop_outlier(now[S.AX], last.ax, last.read_ax)
+    ay = _drop_outlier(now[S.AY], last.ay, last.read_ay)
     last.read_ax = now[S.AX]
     last.read_ay = now[S.AY]
     if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
         health |= flags.OUTLIER
-    _move(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
-    _add(memory, ax, ay)
+    _integrate_motion(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
+    _add_sample(memory, ax, ay)
     last.time = time
     return health, time - memory.block.time >= design.constants.block_time - EARLY_S
 
@@ -82,8 +82,8 @@ def begin_block(memory: MixtureMemory) -> None:
     block.time = last.time
     block.samples = 0
     block.angle = block.cos_sum = block.sin_sum = 0.0
-    _clear(block.gain)
-    _clear(block.gain_sum)
+    _clear_gain(block.gain)
+    _clear_gain(block.gain_sum)
     block.start_yaw_rate = last.yaw_rate
     for channel in range(INPUTS):
         block.sums[channel] = 0.0
@@ -93,7 +93,7 @@ def begin_block(memory: MixtureMemory) -> None:
 
 
 @compiled
-def _clear(gain: VelocityGain) -> None:
+def _clear_gain(gain: VelocityGain) -> None:
     gain.measured.x = gain.measured.y = 0.0
     gain.leak_y.x = gain.leak_y.y = gain.unit.x = gain.unit.y = 0.0
 
@@ -123,7 +123,7 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 
 @compiled
-def _believed(value: float, used: float, read: float) -> float:
+def _drop_outlier(value: float, used: float, read: float) -> float:
     """Return the accelerometer's reading; NaN where it is far from both the last used and the last
     read value.
     """
@@ -132,7 +132,7 @@ def _believed(value: float, used: float, read: float) -> float:
 
 
 @compiled
-def _move(
+def _integrate_motion(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
     """Integrate the velocity gained since the block began, in the current axes: the exact solution
@@ -163,31 +163,31 @@ def _move(
     note_grip(memory.grip, ax, ay, dt)
     gain = block.gain
     total = block.gain_sum
-    _advance(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)
-    _advance(gain.leak_y, 0.0, leak_y, rate, dt)
-    _advance(gain.unit, 1.0, 0.0, rate, dt)
+    _advance_gain(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)
+    _advance_gain(gain.leak_y, 0.0, leak_y, rate, dt)
+    _advance_gain(gain.unit, 1.0, 0.0, rate, dt)
     block.angle += rate * dt
     block.cos_sum += math.cos(block.angle)
     block.sin_sum += math.sin(block.angle)
-    _accumulate(total.measured, gain.measured)
-    _accumulate(total.leak_y, gain.leak_y)
-    _accumulate(total.unit, gain.unit)
+    _add_vector(total.measured, gain.measured)
+    _add_vector(total.leak_y, gain.leak_y)
+    _add_vector(total.unit, gain.unit)
     block.samples += 1
 
 
 @compiled
-def _advance(gained: PlanarVector, ax: float, ay: float, rate: float, dt: float) -> None:
+def _advance_gain(gained: PlanarVector, ax: float, ay: float, rate: float, dt: float) -> None:
     gained.x, gained.y = advance_velocity(gained.x, gained.y, ax, ay, rate, dt)
 
 
 @compiled
-def _accumulate(total: PlanarVector, part: PlanarVector) -> None:
+def _add_vector(total: PlanarVector, part: PlanarVector) -> None:
     total.x += part.x
     total.y += part.y
 
 
 @compiled
-def _add(memory: MixtureMemory, ax: float, ay: float) -> None:
+def _add_sample(memory: MixtureMemory, ax: float, ay: float) -> None:
     last = memory.last
     now = memory.last.now
     block = memory.block

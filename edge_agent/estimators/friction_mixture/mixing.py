@@ -18,13 +18,13 @@ import math
 
 import numpy as np
 
-from edge_agent.estimators.common.arrays import clear, clear_rows, put, put_square
+from edge_agent.estimators.common.arrays import clear_rows, clear_vector, copy_vector, put_square
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, change_road
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.restart import put_split_to_sleep
-from edge_agent.estimators.friction_mixture.trust import credence
+from edge_agent.estimators.friction_mixture.trust import used_evidence_share
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -40,7 +40,7 @@ LARGEST_DRIFT = 0.5
 
 
 @compiled
-def awake(memory: MixtureMemory) -> int:
+def active_nodes(memory: MixtureMemory) -> int:
     """Return the number of active nodes."""
     return ALL_NODES if memory.split else NODES
 
@@ -68,20 +68,22 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
         for j in range(NODES, ALL_NODES):
             weight[j] = visit[j] = design.sides.prior[j]
             memory.penalty[j] = 0.0
-            put(memory.mean[j], memory.overall_mean)
+            copy_vector(memory.mean[j], memory.overall_mean)
             put_square(memory.covariance[j], memory.overall_covariance)
 
 
 @compiled
-def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float) -> None:
+def apply_road_change(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
+) -> None:
     """Apply the road change over `metres`: move probability between nodes, and mix each node with
     its inflow.
     """
-    count = awake(memory)
+    count = active_nodes(memory)
     constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
     hazard = 1.0 - math.exp(-metres * constants.hazard)
-    doubt = 1.0 - credence(memory.trust, constants)
+    doubt = 1.0 - used_evidence_share(memory.trust, constants)
     forgotten = 1.0 - math.exp(-(doubt**BRINK) * scratch.features.duration / FORGOTTEN_S)
     slid = 1.0 - math.exp(-metres * constants.slip_hazard * memory.slip.ended)
     hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
@@ -91,23 +93,23 @@ def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, met
     weight = memory.weight[:count]
     visit = memory.visit_weight[:count]
     change_road(visit, prior, NODES, hazard, leaving, drift, predicted)
-    put(visit, predicted)
+    copy_vector(visit, predicted)
     change_road(weight, prior, NODES, hazard, leaving, drift, predicted)
     for j in range(count):
         zeta = min(hazard * prior[j] / predicted[j], 1.0)
         memory.penalty[j] *= 1.0 - zeta
-        mix(
+        mix_node(
             memory.mean[j],
             memory.covariance[j],
             zeta,
             memory.overall_mean,
             memory.overall_covariance,
         )
-    put(weight, predicted)
+    copy_vector(weight, predicted)
 
 
 @compiled
-def mix(
+def mix_node(
     mean: FloatArray,
     covariance: FloatArray,
     zeta: float,
@@ -139,7 +141,7 @@ def match_moments(
     """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
     count = weight.shape[0]
     n = mean.shape[1]
-    clear(overall_mean)
+    clear_vector(overall_mean)
     clear_rows(overall_covariance)
     for k in range(count):
         for i in range(n):
@@ -172,6 +174,6 @@ def reset_diverged(
             abs(mean[j, NodeState.VY] - mean[best, NodeState.VY]) / constants.diverged_y,
         )
         if astray > 1.0:
-            put(mean[j], mean[best])
+            copy_vector(mean[j], mean[best])
             put_square(root[j], root[best])
             weight[j] = SMALLEST

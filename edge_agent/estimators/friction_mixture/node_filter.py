@@ -81,8 +81,8 @@ def update_node(
     innovation = scratch.innovation[j]
     theoretical = scratch.theoretical[j]
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
-    price = linearize(memory, design, scratch, j)
-    spread(memory, design, scratch, j)
+    price = linearize_node(memory, design, scratch, j)
+    spread_points(memory, design, scratch, j)
     across = inflation * doubted_noise(memory.trust, constants) / features.novelty
     unlike = rear_noise(memory, constants)
     plain = square = 0.0
@@ -114,7 +114,7 @@ def update_node(
 
 
 @compiled
-def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
+def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
     """Fill node.derivative of node j, leave node.force as at the mean, and return the penalty of
     sliding.
 
@@ -225,21 +225,23 @@ def weigh_slopes(
             along = slope_along(curve, g_x, g_y, mu)
             across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
             node.noise[wheel] = (
-                features.noise_std[wheel] ** 2 - unfelt(along) * features.slip_noise[wheel]
+                features.noise_std[wheel] ** 2
+                - slip_noise_correction(along) * features.slip_noise[wheel]
             )
-            node.abrupt[wheel] = (0.5 - unfelt(along)) * features.abrupt_noise[wheel]
+            node.abrupt[wheel] = (0.5 - slip_noise_correction(along)) * features.abrupt_noise[wheel]
             if not math.isnan(features.rolling[wheel]):
                 price -= min(math.log(along / flat), 0.0)
         side = 4 + axle
         node.noise[side] = (
-            features.noise_std[side] ** 2 - unfelt(across) * features.slip_noise[side]
+            features.noise_std[side] ** 2
+            - slip_noise_correction(across) * features.slip_noise[side]
         )
         node.abrupt[side] = 0.0
     return price
 
 
 @compiled
-def unfelt(slope: float) -> float:
+def slip_noise_correction(slope: float) -> float:
     """Return the share of slip noise that does not enter a residual on a curve of this slope,
     relative to the half that enters on slope 1.
 
@@ -251,7 +253,7 @@ def unfelt(slope: float) -> float:
 
 
 @compiled
-def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
+def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
     """Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with
     its variance.
 

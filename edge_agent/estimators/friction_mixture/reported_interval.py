@@ -4,7 +4,7 @@ Evidence is tempered so that a repeated error does not count twice. Therefore th
 than its errors where much has been measured, and equal to the prior, which has the right width,
 where nothing has been measured. The level of the upper end moves between the two with the amount
 learned, the divergence of the belief from its prior (Kullback and Leibler 1951). It moves further
-for a car that matches its vehicle file (`trust.likeness`). The upper end never falls below a
+for a car that matches its vehicle file (`trust.nominal_agreement`). The upper end never falls below a
 slippery friction unless the belief itself holds 99 % below it.
 """
 

@@ -27,7 +27,7 @@ from edge_agent.estimators.friction_mixture.constants import Constants, NodeStat
 from edge_agent.estimators.friction_mixture.memory import VelocityGain
 from edge_agent.estimators.friction_mixture.tyre_curve import (
     TyreCurve,
-    interpolated,
+    interpolate_table,
     ratio_at,
     theta_at,
 )
@@ -41,7 +41,7 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 
 @compiled
-def distance(along: float, across: float) -> float:
+def curve_distance(along: float, across: float) -> float:
     """Return e of e_a = along and e_b = across; an infinite e_a (force beyond the peak) leaves
     e_b.
     """
@@ -80,7 +80,8 @@ def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
     theta = math.sqrt(square) / mu
     u = theta / (1.0 + theta)
     return max(
-        (interpolated(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y) / square,
+        (interpolate_table(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y)
+        / square,
         FLATTEST,
     )
 
@@ -166,7 +167,9 @@ def find_shape_force(
         size = math.sqrt(g_x * g_x + g_y * g_y)
         theta = size / mu
         change = (
-            0.0 if size < TINY else mu * interpolated(curve.shape, theta / (1.0 + theta)) / size
+            0.0
+            if size < TINY
+            else mu * interpolate_table(curve.shape, theta / (1.0 + theta)) / size
         )
         out[wheel] = change * g_x
         out[4 + wheel // 2] += features.load_share[wheel] * change * g_y
@@ -284,12 +287,12 @@ def find_residuals(
                 math.nan
                 if math.isnan(features.rolling[wheel])
                 else slip.scale_x[axle]
-                * distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
+                * curve_distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
             )
         row = 4 + axle
         out[row] = (
             math.nan
             if math.isnan(force[row])
             else slip.scale_y[axle]
-            * distance(slip_at_force[row] - side_slip, force[row] - side_model)
+            * curve_distance(slip_at_force[row] - side_slip, force[row] - side_model)
         )

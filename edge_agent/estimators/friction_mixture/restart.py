@@ -8,10 +8,10 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
-from edge_agent.estimators.common.arrays import clear, put, put_square
+from edge_agent.estimators.common.arrays import clear_vector, copy_vector, put_square
 from edge_agent.estimators.common.excitation import begin_excitation
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
-from edge_agent.estimators.common.readings import believe, rolling_speed
+from edge_agent.estimators.common.readings import read_plausible, rolling_speed
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
@@ -44,7 +44,7 @@ SLOWEST_M_S = 1.5
 
 
 @compiled
-def start(
+def start_vehicle(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
     """Start the vehicle at its first sample with a finite time; all of its memory is zero."""
@@ -53,7 +53,7 @@ def start(
     last = memory.last
     now = memory.last.now
     block = memory.block
-    believe(sample, now)
+    read_plausible(sample, now)
     refuse_jumps(memory.row, now)
     last.time = block.time = time
     last.position_time = last.inertial_time = -math.inf
@@ -75,7 +75,7 @@ def start(
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
-        put(memory.mean[j], memory.overall_mean)
+        copy_vector(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
         find_interval(design, design.prior, memory.patch, scratch.blended, 0.0, friction)
@@ -103,7 +103,7 @@ def forget_vehicle(memory: MixtureMemory) -> None:
         for j in range(i + 1):
             covariance[i, j] = covariance[j, i] = 0.0
         covariance[i, i] = nominal.std[i] ** 2
-    clear(memory.penalty)
+    clear_vector(memory.penalty)
 
 
 @compiled
@@ -137,12 +137,12 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
         FIRST_V_STD**2,
     )
     for j in range(ALL_NODES):
-        put(memory.mean[j], memory.overall_mean)
+        copy_vector(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
 
 
 @compiled
-def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
+def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     """Bridge a gap of dt [s]: friction is forgotten over the metres driven meanwhile, and the
     motion restarts.
     """
@@ -167,7 +167,9 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 
 
 @compiled
-def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
+def reset_to_wheel_speed(
+    memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
+) -> int:
     """Reset the motion where it is far from the speed of wheels that agree and roll; return the
     health flags.
 
@@ -224,7 +226,7 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0
     put_split_to_sleep(memory)
-    clear(memory.patch)
+    clear_vector(memory.patch)
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
     return flags.RESET

@@ -68,7 +68,7 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         fastest = max(fastest, abs(speed))
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
     still = seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
-    _stand(memory, constants, features, still)
+    _update_standstill(memory, constants, features, still)
     held = fastest < LOCKED_SHARE * features.speed and abs(features.change) > SLIDES_M_S2
     locked = features.speed >= SLOW_M_S and (held or (still and not rolling.stands))
     if seen < 3 or locked:
@@ -83,11 +83,11 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     if unsure and seen == 4:
         middle = 0.5 * (total - least - most)
     if unsure or time - rolling.disagreed_time >= constants.agreeing_time:
-        _tell(memory, constants, features, middle, step)
+        _compute_velocities(memory, constants, features, middle, step)
 
 
 @compiled
-def _stand(
+def _update_standstill(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, still: bool
 ) -> None:
     rolling = memory.rolling
@@ -106,7 +106,7 @@ def _stand(
 
 
 @compiled
-def _tell(
+def _compute_velocities(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
 ) -> None:
     """Return the velocities that wheels at `middle` [m/s] imply, and their spreads."""

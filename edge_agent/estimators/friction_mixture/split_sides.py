@@ -44,7 +44,7 @@ class Triangle(NamedTuple):
     width: float  # of the cell that it stands for, the share of a uniform prior
 
 
-def triangles(edges: tuple[float, ...]) -> list[Triangle]:
+def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
     """Return one triangle per cell, about its middle; the outermost ones end at the outer edges."""
     middles = [0.5 * (a + b) for a, b in pairwise(edges)]
     lefts = [edges[0], *middles[:-1]]
@@ -62,7 +62,10 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
     mass = []
     share = []
     for low, high in (
-        (a, b) for a in triangles(LOW) for b in triangles(HIGH) if b.middle > LEAST_RATIO * a.middle
+        (a, b)
+        for a in triangular_cells(LOW)
+        for b in triangular_cells(HIGH)
+        if b.middle > LEAST_RATIO * a.middle
     ):
         mean = Triangle._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
         for left, right in ((low, high), (high, low)):
@@ -88,7 +91,7 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 
 @compiled
-def project(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
+def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
     """Compute out (K,) = probabilities of the cells of the K nodes; the probabilities of the split
     nodes are distributed by `share` (SPLIT_NODES, K).
     """

@@ -21,24 +21,28 @@ from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
 from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
-from edge_agent.estimators.friction_mixture.ice_patch import drive_onto
+from edge_agent.estimators.friction_mixture.ice_patch import grow_patches
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import (
-    awake,
-    drive_on,
+    active_nodes,
+    apply_road_change,
     match_moments,
     wake_or_sleep,
 )
 from edge_agent.estimators.friction_mixture.node_filter import predict_node
 from edge_agent.estimators.friction_mixture.reported_interval import find_interval
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
-from edge_agent.estimators.friction_mixture.restart import recover, start
+from edge_agent.estimators.friction_mixture.restart import reset_to_wheel_speed, start_vehicle
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
-from edge_agent.estimators.friction_mixture.trust import LEAST_VARIANCE, judge, likeness
+from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project_weights
+from edge_agent.estimators.friction_mixture.trust import (
+    LEAST_VARIANCE,
+    nominal_agreement,
+    update_consistency,
+)
 from edge_agent.estimators.friction_mixture.used_grip import used_grip
-from edge_agent.estimators.friction_mixture.weighing import measure
+from edge_agent.estimators.friction_mixture.weighing import apply_measurement
 from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
@@ -51,7 +55,7 @@ def step(
 ) -> int:
     """Process one sample (18,); return the health flags of this sample alone."""
     if not memory.started:
-        return start(memory, design, scratch, time, sample) | flags.RESET
+        return start_vehicle(memory, design, scratch, time, sample) | flags.RESET
     health, whole = take_sample(memory, design, time, sample)
     if whole:
         finish_block(memory, design, scratch)
@@ -69,16 +73,16 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     update_slip(memory, design.constants, features)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
-    drive_on(memory, design, scratch, features.speed * features.duration)
-    drive_onto(memory, design, features.speed * features.duration)
-    measure(memory, design, scratch)
+    apply_road_change(memory, design, scratch, features.speed * features.duration)
+    grow_patches(memory, design, features.speed * features.duration)
+    apply_measurement(memory, design, scratch)
     predict(memory, design, scratch)
-    memory.health = health | recover(memory, design, features)
+    memory.health = health | reset_to_wheel_speed(memory, design, features)
     ratio = scratch.actual_sum[1] / max(scratch.stated_sum, LEAST_VARIANCE)
-    judge(memory, design, features.duration, ratio, memory.health)
+    update_consistency(memory, design, features.duration, ratio, memory.health)
     if memory.trust.distrust > 0.0:
         memory.health |= flags.CONTRADICTION
-    conclude(memory, design, scratch)
+    conclude_friction(memory, design, scratch)
     begin_block(memory)
     memory.block.missing_x = memory.block.missing_y = 0.0
 
@@ -113,7 +117,7 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
     cos = math.cos(block.angle)
     sin = math.sin(block.angle)
-    count = awake(memory)
+    count = active_nodes(memory)
     for j in range(count):
         predict_node(memory, scratch, j, cos, sin)
     match_moments(
@@ -126,7 +130,7 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 
 
 @compiled
-def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Compute friction with its interval, the grip used in the last second, and whether wheels
     slide.
     """
@@ -158,7 +162,7 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, RIGHT, memory.friction_right)
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
-        alike = likeness(memory.trust, design.constants)
+        alike = nominal_agreement(memory.trust, design.constants)
         find_interval(
             design, memory.weight[:NODES], memory.patch, scratch.blended, alike, memory.friction
         )
@@ -173,13 +177,13 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
 def _find_side(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
 ) -> None:
-    project(memory.weight, design.sides.share[side], scratch.projected)
-    alike = likeness(memory.trust, design.constants)
+    project_weights(memory.weight, design.sides.share[side], scratch.projected)
+    alike = nominal_agreement(memory.trust, design.constants)
     find_interval(design, scratch.projected, memory.patch, scratch.blended, alike, friction)
 
 
 @compiled
-def velocity(memory: MixtureMemory) -> tuple[float, float]:
+def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
     """Return the current (v_x, v_y) [m/s] of the mixture."""
     x = memory.overall_mean
     angle = memory.block.angle

@@ -14,7 +14,7 @@ states alone. Log-likelihood ratios against the model add up to `odd` [nat] and 
 a straight, on which the model cannot fail, does not count for it. At `odd_least` the filter draws
 no conclusions: the interval returns to the prior, the axles do not affect the motion, and states
 learned meanwhile are forgotten. The test leaves out slides, slippery road and walking pace
-(`unexplained`). After `patience` [s] without a possible test the model is tried again, and each
+(`unexplained_ratio`). After `patience` [s] without a possible test the model is tried again, and each
 relapse makes that time four times as long because sensors do not repair themselves. A motion reset
 by the wheels counts as half a contradiction.
 """
@@ -47,7 +47,7 @@ SLOW_PEAK = 6.0
 
 
 @compiled
-def judge(
+def update_consistency(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
     """Update memory.trust with the states, the innovations and the health of the block.
@@ -61,7 +61,7 @@ def judge(
     # by what any car may be: a calibration makes the belief of this one narrower, and contradicts
     # nothing
     cost = belief_cost(memory.overall_mean, design.nominal)
-    trust.strain = strain(
+    trust.strain = belief_strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
     )
     trust.hurry = hurry(
@@ -78,7 +78,7 @@ def judge(
         return
     keep = math.exp(-duration / FORGIVEN_S)
     fading = math.exp(-duration / constants.window)
-    trust.ratio = fading * trust.ratio + (1.0 - fading) * unexplained(memory, design, ratio)
+    trust.ratio = fading * trust.ratio + (1.0 - fading) * unexplained_ratio(memory, design, ratio)
     pace = axles_ratio(trust.ratio) / constants.window
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
@@ -92,7 +92,7 @@ def judge(
 
 
 @compiled
-def unexplained(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
+def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
     """Return the part of `ratio`, squared innovations over their variance, that neither a slide nor
     slippery road explains.
 
@@ -117,7 +117,7 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 
 @compiled
-def strain(cost: float, learned: float, prior: float) -> float:
+def belief_strain(cost: float, learned: float, prior: float) -> float:
     """Return chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was
     learned.
     """
@@ -143,13 +143,13 @@ def strained_noise(trust: Trust, constants: Constants) -> float:
 
 
 @compiled
-def likeness(trust: Trust, constants: Constants) -> float:
+def nominal_agreement(trust: Trust, constants: Constants) -> float:
     """Return the agreement of the car with its vehicle file, 0 to 1; 0 from the usual strain on."""
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 
 
 @compiled
-def credence(trust: Trust, constants: Constants) -> float:
+def used_evidence_share(trust: Trust, constants: Constants) -> float:
     """Return the share of the evidence that is used: less while a contradiction grows, none once it
     is accepted.
     """

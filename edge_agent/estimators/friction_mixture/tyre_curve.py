@@ -49,7 +49,7 @@ falling beyond.
 """
 
 
-def proven(curve: Curve) -> Curve:
+def check_curve(curve: Curve) -> Curve:
     """Return the curve if it is valid; raise ValueError with the fault otherwise."""
     theta = np.linspace(0.0, 10.0, 10_001)
     f = np.asarray(curve(theta), dtype=np.float64)
@@ -83,7 +83,7 @@ def curve_tables(curve: Curve) -> TyreCurve:
 
 
 @compiled
-def interpolated(table: FloatArray, place: float) -> float:
+def interpolate_table(table: FloatArray, place: float) -> float:
     """Return the value of a table over [0, 1] at `place`, linear between its cells."""
     cells = table.shape[0] - 1
     scaled = place * cells
@@ -98,7 +98,7 @@ def ratio_at(curve: TyreCurve, theta: float) -> float:
     last = curve.ratio.shape[0] - 2
     if theta >= last:
         return float(curve.ratio[last] * last / theta)
-    return interpolated(curve.ratio, theta / (1.0 + theta))
+    return interpolate_table(curve.ratio, theta / (1.0 + theta))
 
 
 @compiled
@@ -106,4 +106,4 @@ def theta_at(curve: TyreCurve, force: float) -> float:
     """Return theta at 0 <= force over mu*F_z on the rising branch; infinite at and beyond the
     peak.
     """
-    return math.inf if force >= 1.0 else interpolated(curve.inverse, math.sqrt(1.0 - force))
+    return math.inf if force >= 1.0 else interpolate_table(curve.inverse, math.sqrt(1.0 - force))

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.estimators.common.arrays import put
+from edge_agent.estimators.common.arrays import copy_vector
 from edge_agent.estimators.friction_mixture.constants import NODES
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
@@ -38,7 +38,7 @@ KNOWING = 0.7
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
     """Reset the part: it has no evidence yet."""
-    put(memory.surest, design.prior)
+    copy_vector(memory.surest, design.prior)
     memory.information = 0.0
 
 
@@ -65,5 +65,5 @@ def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray)
     if jumped:
         visit_evidence(design.mu, p, s, CENTRES, evidence)
     if jumped or (known > memory.information and excluded < COMPATIBLE):
-        put(s, w)
+        copy_vector(s, w)
         memory.information = known

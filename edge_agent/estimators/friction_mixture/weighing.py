@@ -10,15 +10,15 @@ from edge_agent.adaptation.fuzzy import adapted
 from edge_agent.adaptation.rule_base import evidence_share
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import reweigh
-from edge_agent.estimators.friction_mixture.grip_guard import guard
-from edge_agent.estimators.friction_mixture.ice_patch import refute
+from edge_agent.estimators.friction_mixture.friction_grid import multiply_likelihood
+from edge_agent.estimators.friction_mixture.grip_guard import guard_penalty
+from edge_agent.estimators.friction_mixture.ice_patch import shrink_patches
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
+from edge_agent.estimators.friction_mixture.mixing import active_nodes, reset_diverged
 from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.trust import credence
+from edge_agent.estimators.friction_mixture.trust import used_evidence_share
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
@@ -30,23 +30,23 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 
 @compiled
-def measure(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Update all nodes, reweigh them, and adapt R."""
     update_all(memory, design, scratch)
-    temper(memory, design, scratch)
-    weight = memory.weight[: awake(memory)]
+    temper_evidence(memory, design, scratch)
+    weight = memory.weight[: active_nodes(memory)]
     reset_diverged(memory.mean, scratch.root, weight, design.constants)
-    refute(memory.patch, weight, scratch.log_likelihood)
-    reweigh(weight, scratch.log_likelihood)
-    reweigh(memory.visit_weight[: awake(memory)], scratch.log_likelihood)
-    adapt(memory, design, scratch)
+    shrink_patches(memory.patch, weight, scratch.log_likelihood)
+    multiply_likelihood(weight, scratch.log_likelihood)
+    multiply_likelihood(memory.visit_weight[: active_nodes(memory)], scratch.log_likelihood)
+    adapt_noise(memory, design, scratch)
 
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Update every active node; store NIS and the predictive log-likelihood of the mixture."""
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
-    count = awake(memory)
+    count = active_nodes(memory)
     for group in range(2):
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
     scratch.stated_sum = 0.0
@@ -56,7 +56,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     rows = 0
     features = scratch.features
     steady = design.constants.steady_share
-    features.new = novelty(memory.usual_force, features, design.constants)
+    features.new = force_novelty(memory.usual_force, features, design.constants)
     features.novelty = steady + (1.0 - steady) * features.new
     for j in range(count):
         factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
@@ -83,7 +83,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 
 
 @compiled
-def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Replace scratch.log_likelihood by the tempered evidence of the block for each node [nat].
 
     A node below the grip in use pays its penalty whatever the demand. At full distrust no evidence
@@ -92,7 +92,7 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
     """
     constants = design.constants
     features = scratch.features
-    count = awake(memory)
+    count = active_nodes(memory)
     best = -math.inf
     for j in range(count):
         best = max(best, scratch.log_likelihood[j])
@@ -104,7 +104,7 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
         share = math.exp(
             evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
         )
-    believed = credence(memory.trust, constants)
+    believed = used_evidence_share(memory.trust, constants)
     believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
     moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
     for j in range(count):
@@ -112,13 +112,13 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
         beyond = min(loss + constants.plausible_loss, 0.0)
         loss = max(loss, -constants.plausible_loss)
         loss = max(moving * (share * loss + beyond), -constants.largest_loss)
-        loss -= moving * guard(memory.grip, constants, design.sides.mu[j])
-        charged = charge(memory, j, moving * need / (1.0 + need) * scratch.moved[j])
+        loss -= moving * guard_penalty(memory.grip, constants, design.sides.mu[j])
+        charged = charge_penalty(memory, j, moving * need / (1.0 + need) * scratch.moved[j])
         scratch.log_likelihood[j] = 0.0 if blind else loss - charged
 
 
 @compiled
-def charge(memory: MixtureMemory, node: int, price: float) -> float:
+def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
     """Return the penalty [nat] for the vehicle states that a node has moved to; a refund is at most
     the amount charged before.
 
@@ -144,7 +144,7 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 
 
 @compiled
-def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
+def force_novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
     """Return the membership of the forces in "new": compared with their smoothed past `usual` (6,),
     which is advanced by a block.
     """
@@ -159,7 +159,7 @@ def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) ->
 
 
 @compiled
-def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Update the windowed innovation variances, and the factors on R for the next block."""
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):

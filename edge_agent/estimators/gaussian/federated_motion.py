@@ -25,7 +25,7 @@ from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.common.run import PaperMemory
-from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, carry
+from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
 from edge_agent.filters.federated import fuse, share
 from edge_agent.filters.householder import predict, update
 from edge_agent.filters.points import axis_points, deviations, weighted_mean
@@ -159,12 +159,12 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
         share(motion.root, beta, root)
         axis_points(motion.mean, root, XI, points)
         columns[:] = points.T
-        carry(row, columns, friction, track, dt, True)
+        propagate_points(row, columns, friction, track, dt, True)
         points[:] = columns.T
         for i in range(STATES):
             process[i, i] = motion.process[i] * math.sqrt(dt / STEP_S / beta)
         predict(points, WEIGHT, WEIGHT, process, mean, root, work)
-        _measure(memory, SubFilter(sub, mean, root, points, work), dt)
+        _update_sub_filter(memory, SubFilter(sub, mean, root, points, work), dt)
         if sub == 0:
             first_mean[:], first_root[:] = mean, root
     fuse(first_mean, first_root, mean, root, work)
@@ -172,7 +172,7 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
 
 
 @compiled
-def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
+def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
     motion = memory.motion
     track = memory.track
     row = memory.row
@@ -199,7 +199,7 @@ def _measure(memory: FederatedMemory, at: SubFilter, dt: float) -> None:
         std[r] = math.sqrt(motion.factor[sub] * motion.noise[sub, r])
     speed, std[3] = slip_free_speed(row, track, dt)
     innovation[3] = speed - predicted[3]
-    std[3] = doubted(std[3], innovation[3])
+    std[3] = widened_speed_std(std[3], innovation[3])
     if not motion.wheel_speed:
         innovation[3] = math.nan
     if sub == 1:
@@ -234,7 +234,7 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 
 
 @compiled
-def doubted(std: float, innovation: float) -> float:
+def widened_speed_std(std: float, innovation: float) -> float:
     """Return the standard deviation [m/s] of the wheels' speed, at most twice `std` for spinning or
     locked wheels.
     """

@@ -57,7 +57,7 @@ class HeunInputs(NamedTuple):
 
 
 @compiled
-def substeps(speed: float, dt: float) -> int:
+def stable_steps(speed: float, dt: float) -> int:
     """Return the number of equal steps of Heun's rule that are stable over `dt` [s] at `speed`
     [m/s].
     """
@@ -66,7 +66,7 @@ def substeps(speed: float, dt: float) -> int:
 
 
 @inlined
-def carry(
+def propagate_points(
     row: FloatArray,
     columns: FloatArray,
     friction: FloatArray,
@@ -87,9 +87,9 @@ def carry(
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
         slowest = min(slowest, abs(columns[0, p]))
-    times = substeps(slowest, dt)
+    times = stable_steps(slowest, dt)
     unknown = (math.nan, math.nan, math.nan, math.nan)
-    force_x = _forces(row, track, dt) if by_torque else unknown
+    force_x = _torque_forces(row, track, dt) if by_torque else unknown
     if by_motor:
         force_x = _motor_forces(row, track, dt)
     mu = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if by_torque else unknown
@@ -103,15 +103,17 @@ def carry(
         sin = four(track.steering[1])
         end = WheelInputs(cos, sin, four(use[S.OMEGA : S.TORQUE]), force_x, mu)
         if k + 1 < times:
-            end = _between(track, (k + 1) / times, force_x, mu)
+            end = _interpolate_inputs(track, (k + 1) / times, force_x, mu)
         drive = HeunInputs(begin, end, dt / times, by_torque)
-        _heun(body(row), columns, 0, ABREAST, drive)
-        _heun(body(row), columns, ABREAST, POINTS, drive)
+        _apply_heun_step(body(row), columns, 0, ABREAST, drive)
+        _apply_heun_step(body(row), columns, ABREAST, POINTS, drive)
         begin = end
 
 
 @inlined
-def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs) -> None:
+def _apply_heun_step(
+    vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
+) -> None:
     """Apply one of Heun's steps to the columns [first, last), in place. It is pure arithmetic, so
     that the points are computed in parallel.
     """
@@ -131,7 +133,7 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
         z = column_z[p]
         one = min(max(z, LOWER), UPPER)
         mu = begin.mu if by_torque else (one, one, one, one)
-        _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with(begin, mu))
+        _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with_friction(begin, mu))
         turn = z if by_torque else turn
         slope_x = ax + r * u
         slope_y = ay - r * v
@@ -140,14 +142,14 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
         rate = r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
         felt_x, felt_y, again = response(
-            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu)
+            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         if not by_torque:
             vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
             vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
         rate = r + 0.5 * step * (turn + again)
         felt_x, felt_y, again = response(
-            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu)
+            vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = (
             vx,
@@ -160,13 +162,13 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
 
 
 @inlined
-def _with(wheels: WheelInputs, mu: Four) -> WheelInputs:
+def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
     """Return the same inputs on another friction."""
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 
 @inlined
-def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
+def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
     """Return the inputs at a share of the way from the previous sample to this one."""
     before = track.inputs_before
     use = track.inputs
@@ -194,13 +196,13 @@ def _between(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelI
 @inlined
 def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
     """Return the longitudinal forces [N] from one motor per axle, (4) to (6) of paper 004."""
-    front = _axle(row, track, 0, dt)
-    rear = _axle(row, track, 2, dt)
+    front = _half_axle_force(row, track, 0, dt)
+    rear = _half_axle_force(row, track, 2, dt)
     return front, front, rear, rear
 
 
 @inlined
-def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
+def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
     """Return half of the force [N] of the axle whose left wheel is `first`."""
     use = track.inputs
     before = track.inputs_before
@@ -214,7 +216,7 @@ def _axle(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
 
 
 @inlined
-def _forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
+def _torque_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
     """Return the longitudinal forces [N] from the wheels' torque."""
     return (
         wheel_force(row, track, 0, dt),

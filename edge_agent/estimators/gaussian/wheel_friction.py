@@ -65,7 +65,7 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 
 @compiled
-def dependence(demand: float, dt: float) -> float:
+def dependence_factor(demand: float, dt: float) -> float:
     """Return the factor on the standard deviation of a sample `dt` [s] after the last, at `demand`
     [g] of force.
 

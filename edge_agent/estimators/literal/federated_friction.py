@@ -41,7 +41,7 @@ AS_PRINTED: Final = FederatedSetting()
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
     """Run the filter over a drive."""
-    forces = WheelForces.of(given, proportional=setting.proportional, single=False)
+    forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()
     signals = given.signals
     noise = (np.diag(setting.first), np.diag(setting.second))
@@ -56,13 +56,13 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
         sizes = np.empty(2)
         for sub in range(2):
             predicted = (covariance + setting.process * np.eye(STATES)) / shares[sub]
-            points = _points(mean, predicted)
-            force = forces.tyre(k, points)
+            points = _cubature_points(mean, predicted)
+            force = forces.tyre_forces(k, points)
             force[..., 0] = given_x[k]
-            outcomes = forces.accelerations(k, force)
+            outcomes = forces.body_accelerations(k, force)
             outcomes[:, 2] = signals[k - 1, S.YAW_RATE] + given.step * outcomes[:, 2]
             reading = signals[k, [S.AX, S.AY, S.YAW_RATE]]
-            local, spread = _update(
+            local, spread = _update_sub_filter(
                 mean, predicted, points, outcomes[:, sub:], reading[sub:], noise[sub]
             )
             sizes[sub] = np.trace(spread)
@@ -76,14 +76,14 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
     return FrictionRun(mu, 0.0)
 
 
-def _points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
+def _cubature_points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return cubature points (8, 4) by singular values."""
     axes, sizes, _ = np.linalg.svd(covariance)
     spread = np.sqrt(STATES) * (axes * np.sqrt(sizes)).T
     return np.concatenate([mean + spread, mean - spread])
 
 
-def _update(
+def _update_sub_filter(
     mean: FloatArray,
     covariance: FloatArray,
     points: FloatArray,

@@ -55,9 +55,9 @@ class GivenMotion:
         torque = self.signals[:, S.TORQUE : S.TORQUE + 4]
         turning = np.diff(omega, axis=0, prepend=omega[:1]) / self.step
         force = (torque - row[Parameter.WHEEL_INERTIA] * turning) / row[Parameter.RADIUS]
-        return np.asarray(force - self.rolling * self.loads())
+        return np.asarray(force - self.rolling * self.wheel_loads())
 
-    def loads(self) -> FloatArray:
+    def wheel_loads(self) -> FloatArray:
         """Return the loads of the wheels [N], (T, 4), at the measured accelerations (9)."""
         row = self.row
         p = Parameter

@@ -40,7 +40,7 @@ class WheelForces:
     proportional: bool
 
     @classmethod
-    def of(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
+    def for_drive(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
         """Prepare the drive; single: in single precision."""
         kind: Any = np.float32 if single else np.float64
         row = given.row
@@ -67,7 +67,7 @@ class WheelForces:
         air = given.drag * given.vx * np.abs(given.vx) / row[p.MASS]
         return cls(
             np.asarray(free, kind),
-            np.asarray(given.loads(), kind),
+            np.asarray(given.wheel_loads(), kind),
             np.asarray(turned, kind),
             np.asarray(places, kind),
             np.asarray(mass, kind),
@@ -75,7 +75,7 @@ class WheelForces:
             proportional,
         )
 
-    def tyre(self, k: int, mu: FloatArray) -> FloatArray:
+    def tyre_forces(self, k: int, mu: FloatArray) -> FloatArray:
         """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P,
         4)."""
         free = self.free[k]
@@ -87,7 +87,7 @@ class WheelForces:
         pull = mu * self.loads[k] * curve / size
         return np.asarray(pull[..., None] * free)
 
-    def accelerations(self, k: int, force: FloatArray) -> FloatArray:
+    def body_accelerations(self, k: int, force: FloatArray) -> FloatArray:
         """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at
         sample `k`."""
         cos = self.turned[k, :, 0]

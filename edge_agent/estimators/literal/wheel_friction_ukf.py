@@ -93,7 +93,7 @@ class _Model:
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting
         self.kind: Any = np.float32 if setting.single else np.float64
-        self.forces = WheelForces.of(
+        self.forces = WheelForces.for_drive(
             given, proportional=setting.proportional, single=setting.single
         )
         signals = given.signals
@@ -117,15 +117,15 @@ class _Model:
         self.cov_weights[0] = centre + 1.0 - setting.alpha**2 + setting.beta
         self.bend = self.kind(np.sqrt(setting.beta - setting.alpha**2))
 
-    def points(self, mean: FloatArray, root: FloatArray) -> FloatArray:
+    def sigma_points(self, mean: FloatArray, root: FloatArray) -> FloatArray:
         """Return points (9, 4) of the state."""
         spread = self.spread * root.T
         return np.concatenate([mean[None], mean + spread, mean - spread])
 
-    def outcomes(self, k: int, points: FloatArray) -> FloatArray:
+    def predicted_measurements(self, k: int, points: FloatArray) -> FloatArray:
         """Return measurements (9, rows) of the points at sample `k`."""
-        force = self.forces.tyre(k, points)
-        felt = self.forces.accelerations(k, force)
+        force = self.forces.tyre_forces(k, points)
+        felt = self.forces.body_accelerations(k, force)
         if not self.setting.torque_rows:
             return felt
         return np.concatenate([felt, force[..., 0]], axis=1)
@@ -144,8 +144,8 @@ def _square_root_step(
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Run one step in square-root form; the covariance is not used."""
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
-    points = model.points(mean, axes * sizes)
-    outcomes = model.outcomes(k, points)
+    points = model.sigma_points(mean, axes * sizes)
+    outcomes = model.predicted_measurements(k, points)
     side = np.sqrt(model.side)
     state = side * (points[1:] - points[0]).T
     bent = (outcomes[1:] - outcomes[0]).T
@@ -161,7 +161,7 @@ def _square_root_step(
     return mean + gain @ innovation, covariance, after * lengths, False
 
 
-def _factor(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
+def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
     """Return (Cholesky factor, False), or (the last one, True) where there is none."""
     try:
         return np.asarray(np.linalg.cholesky(covariance)), False
@@ -173,14 +173,14 @@ def _covariance_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Run one step of the textbook filter."""
-    root, lost = _factor(covariance, root)
-    points = model.points(mean, root)
+    root, lost = _cholesky_or_last(covariance, root)
+    points = model.sigma_points(mean, root)
     mean = model.mean_weights @ points
     off = points - mean
     covariance = (model.cov_weights[:, None] * off).T @ off + model.process_root**2
-    root, lost_again = _factor(covariance, root)
-    points = model.points(mean, root)
-    outcomes = model.outcomes(k, points)
+    root, lost_again = _cholesky_or_last(covariance, root)
+    points = model.sigma_points(mean, root)
+    outcomes = model.predicted_measurements(k, points)
     predicted = model.mean_weights @ outcomes
     off = points - mean
     apart = outcomes - predicted

@@ -25,7 +25,7 @@ from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.lab.ahead.known_town import heard, places_of
 from edge_agent.lab.simulation import SimulatedFleet
-from edge_agent.observe.cell_tracker import locate, new_tracks
+from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import GRAVITY, NS, REACTION_S
@@ -121,7 +121,7 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
     fleet.step(round(AFTER_S * RATE_HZ))
     for second in range(int(seconds)):
         t, signals = fleet.step(steps)
-        located_tracks, located = locate(located_tracks, t, signals)
+        located_tracks, located = locate_vehicles(located_tracks, t, signals)
         true = fleet.truth
         moved = np.hypot(np.diff(true.x, axis=0), np.diff(true.y, axis=0)).sum(axis=0)
         driven += moved

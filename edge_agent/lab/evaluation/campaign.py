@@ -125,9 +125,9 @@ def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":
-        return adaptive_federated_ckf.bank(batch.vehicles, friction)
+        return adaptive_federated_ckf.make_bank(batch.vehicles, friction)
     if estimator == "compensated-wckf":
-        return compensated_wckf.bank(batch.vehicles, friction)
+        return compensated_wckf.make_bank(batch.vehicles, friction)
     return bank_of(estimator, batch.vehicles)
 
 

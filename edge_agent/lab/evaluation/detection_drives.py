@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.lab.evaluation.slip_flag import friction_flagged
 from edge_agent.lab.simulation import SimulatedFleet
-from edge_agent.observe.cell_tracker import locate, new_tracks
-from edge_agent.observe.observation_builder import OpenVisits, observe
+from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, build_records
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -88,7 +88,7 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
     vehicles = fleet.vehicles
     config = AgentConfig()
     tracks = new_tracks(len(vehicles))
-    open_visits = OpenVisits.start(len(vehicles))
+    open_visits = OpenVisits.before_any(len(vehicles))
     parts: list[dict[str, FloatArray]] = []
     visits: list[DetectionVisits] = []
     signals_of: list[FloatArray] = []
@@ -97,10 +97,10 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
         steps = min(left, round(CHUNK_S * RATE_HZ))
         left -= steps
         t, signals = fleet.step(steps)
-        tracks, located = locate(tracks, t, signals)
+        tracks, located = locate_vehicles(tracks, t, signals)
         estimates, favoured = _estimate_chunk(bank, t, signals, located.closes)
         time = np.rint(t * NS).astype(np.int64)
-        open_visits, observations, _ = observe(
+        open_visits, observations, _ = build_records(
             open_visits, time, located, estimates, config, signals
         )
         columns = observations.columns

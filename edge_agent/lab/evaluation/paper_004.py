@@ -17,7 +17,7 @@ import numpy as np
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED, Estimates
-from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, bank
+from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, make_bank
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, repeated
 from edge_agent.lab.evaluation.measures import measures
 from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
@@ -73,7 +73,7 @@ def experiments(
             ("paper-fckf", Memberships()),
             ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"])),
         ):
-            reported = estimates(bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
+            reported = estimates(make_bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
             found[name, estimator] = measures(batch, reported)
         drives[f"004.{name}"] = (batch, reported)
     return found, drives

@@ -23,7 +23,7 @@ import numpy as np
 from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, Setting, bank
+from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, Setting, make_bank
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, repeated
 from edge_agent.lab.simulation.white import add_white
 from edge_agent.lab.tuning.colony import Habits, optimise
@@ -77,7 +77,7 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
     """Equation (33) with |e|."""
     batch = drive.batch
-    filters = bank(batch.vehicles, sets, drive.setting)
+    filters = make_bank(batch.vehicles, sets, drive.setting)
     differences = []
     for first in range(0, len(batch.t), CHUNK):
         part = slice(first, first + CHUNK)
@@ -108,7 +108,7 @@ OBJECTIVES: Final[dict[str, Callable[[Sets, LevelDrive], float]]] = {
 
 
 def _reported(sets: Sets, drive: LevelDrive) -> Estimates:
-    return bank(drive.batch.vehicles, sets, drive.setting).advance(
+    return make_bank(drive.batch.vehicles, sets, drive.setting).advance(
         drive.batch.t, drive.batch.signals
     )
 

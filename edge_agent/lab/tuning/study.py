@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.adaptation.memberships import CHANNELS, SETS, Memberships
-from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, Setting, bank
+from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, Setting, make_bank
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import kmh
 from edge_agent.lab.simulation.presets import matched
@@ -156,7 +156,7 @@ def setting(condition: Condition) -> Setting:
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
     """Run the filter over the drives under the condition of that name."""
-    filters = bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
+    filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
@@ -172,7 +172,7 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
     """(interval score, coverage) of the 90 % friction interval under a condition."""
-    reported = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
+    reported = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
         drives.t, drives.signals[name]
     )
     truth = np.full(reported.mu.shape, MU)

@@ -22,7 +22,7 @@ from edge_agent.inputs.context import context_block
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.blocks import blocks
 from edge_agent.lab.truth_file import TruthRecorder
-from edge_agent.observe.cell_tracker import NOWHERE, locate, new_tracks
+from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles, new_tracks
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.pipeline import Pipeline
 from schemas import grid
@@ -81,7 +81,7 @@ def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> N
     assert last is not None
     basket.offer(last)
     whole = joined(parts)
-    _, located = locate(new_tracks(VEHICLES), whole.t, whole.signals)
+    _, located = locate_vehicles(new_tracks(VEHICLES), whole.t, whole.signals)
     visits = np.count_nonzero(located.closes & (located.cell != NOWHERE))
     assert len(basket.column(Kind.OBSERVATION, "cell")) == visits > 20
     assert len(last.vehicle) == np.count_nonzero(located.cell[-1] != NOWHERE)

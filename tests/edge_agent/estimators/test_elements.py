@@ -14,7 +14,7 @@ from edge_agent.estimators import (
     paper_aco_fckf,
     sr_ukf,
 )
-from edge_agent.estimators.elements import VERDICTS, Element, unexplained
+from edge_agent.estimators.elements import VERDICTS, Element, elements_without_reason
 from tests.structure import ROOT
 
 LISTS = {
@@ -32,7 +32,7 @@ SOURCE = "\n".join(
 
 @pytest.mark.parametrize("paper", LISTS)
 def test_every_departure_has_a_reason_and_every_element_a_home(paper: str) -> None:
-    assert unexplained(LISTS[paper]) == []
+    assert elements_without_reason(LISTS[paper]) == []
     assert all(element.verdict in VERDICTS for element in LISTS[paper])
 
 
@@ -40,7 +40,7 @@ def test_an_element_without_reason_or_home_is_found() -> None:
     silent = Element("(1)", "a sign", "corrected", where="dynamics")
     homeless = Element("(2)", "a filter", "as printed")
     said = Element("(3)", "a bench", "left out", "no data")
-    assert unexplained((silent, homeless, said)) == ["(1)", "(2)"]
+    assert elements_without_reason((silent, homeless, said)) == ["(1)", "(2)"]
 
 
 @pytest.mark.parametrize("paper", LISTS)

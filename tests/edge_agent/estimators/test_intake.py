@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.estimators.common.excitation import SLOT_S
-from edge_agent.estimators.common.inputs import BEGUN, STEPPED, take
+from edge_agent.estimators.common.inputs import BEGUN, STEPPED, take_sample_in
 from edge_agent.estimators.common.run import PaperMemory, new_filters
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS, S
@@ -28,7 +28,7 @@ def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: f
         sample = np.zeros(len(CHANNELS))
         time = -1.0 + k * every_s
         sample[S.AY] = 8.0 * rng.random() ** 3 * (0.2 if k > 300 else 1.0)
-        _, kind, _ = take(memory["track"], memory["row"], time, sample)
+        _, kind, _ = take_sample_in(memory["track"], memory["row"], time, sample)
         assert kind == (BEGUN if k == 0 else STEPPED)
         used = sample[S.AY] / GRAVITY
         if time - slots[-1][0] < SLOT_S:
@@ -45,7 +45,7 @@ def test_the_cosines_are_those_of_the_angles_in_use_now_and_before() -> None:
     for k, angle in enumerate((0.1, 0.1, math.nan, -0.3, 9.0, 0.0)):
         sample = np.zeros(len(CHANNELS))
         sample[S.DELTA] = angle
-        take(track, memory["row"], 0.01 * k + (1.0 if k > 4 else 0.0), sample)
+        take_sample_in(track, memory["row"], 0.01 * k + (1.0 if k > 4 else 0.0), sample)
         for turned, inputs in (
             (track["steering"], track["inputs"]),
             (track["steering_before"], track["inputs_before"]),

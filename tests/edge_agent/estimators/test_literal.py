@@ -54,7 +54,9 @@ def test_tyres_are_those_of_the_compiled_model(proportional: bool) -> None:
         given.signals[0, S.DELTA : S.DELTA + 4], given.signals[0, S.OMEGA : S.OMEGA + 4]
     )
     tyre_forces(row, np.array([15.0, 0.3, 0.2, 1.0, 2.0]), wheels, mu, DUGOFF, x, y)
-    found = WheelForces.of(given, proportional=proportional, single=False).tyre(0, mu[None])[0]
+    found = WheelForces.for_drive(given, proportional=proportional, single=False).tyre_forces(
+        0, mu[None]
+    )[0]
     assert found[:, 0] == pytest.approx(x, rel=1e-12)
     assert found[:, 1] == pytest.approx(y, rel=1e-12)
 

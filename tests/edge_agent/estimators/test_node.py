@@ -11,8 +11,8 @@ import pytest
 from edge_agent.dynamics.tyres import magic_formula
 from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS, STATES, Constants
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
-from edge_agent.estimators.friction_mixture.node_filter import take_rows, unfelt
-from edge_agent.estimators.friction_mixture.split_sides import project, side_table
+from edge_agent.estimators.friction_mixture.node_filter import slip_noise_correction, take_rows
+from edge_agent.estimators.friction_mixture.split_sides import project_weights, side_table
 from edge_agent.estimators.friction_mixture.tyre_curve import (
     curve_tables,
     magic_formulas,
@@ -82,7 +82,7 @@ def test_residual_noise_equals_that_of_slip_and_force_about_a_line(
     slip = rng.normal(0.0, 0.03, 100_000)
     force = rng.normal(0.0, 0.01, 100_000)
     distance = (force - slope * slip) / np.hypot(1.0, slope)
-    felt = (0.5 - unfelt(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
+    felt = (0.5 - slip_noise_correction(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
     assert distance.var() == pytest.approx(felt, rel=0.02)
 
 
@@ -110,5 +110,5 @@ def test_split_nodes_exist_for_both_sides_and_their_cells_sum_to_one() -> None:
     assert pairs == {(right, left) for left, right in pairs}
     out = np.empty(NODES)
     for share in sides.share:
-        project(sides.prior, share, out)
+        project_weights(sides.prior, share, out)
         assert out.sum() == pytest.approx(1.0)

@@ -12,9 +12,9 @@ import pytest
 from edge_agent.estimators.friction_mixture.constants import NODES, Constants
 from edge_agent.estimators.friction_mixture.friction_grid import (
     change_road,
+    multiply_likelihood,
     node_table,
     quantile,
-    reweigh,
     visit_evidence,
 )
 from schemas.mugrid import CENTRES
@@ -48,7 +48,7 @@ def test_road_change_keeps_the_mass_and_converges_to_the_prior() -> None:
 def test_evidence_is_the_likelihood_that_was_put_in() -> None:
     w = PRIOR.copy()
     log_likelihood = -((MU - 0.6) ** 2) / 0.02
-    reweigh(w, log_likelihood - log_likelihood.max())
+    multiply_likelihood(w, log_likelihood - log_likelihood.max())
     out = np.empty(len(CENTRES))
     visit_evidence(MU, PRIOR, w, CENTRES, out)
     inner = (CENTRES > 0.3) & (CENTRES < 0.9)

@@ -20,8 +20,8 @@ from edge_agent.estimators import (
 )
 from edge_agent.estimators.estimates import COLUMNS
 from edge_agent.estimators.paper_aco_fckf import Setting
-from edge_agent.observe.cell_tracker import locate, new_tracks
-from edge_agent.observe.observation_builder import OpenVisits, observe
+from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, build_records
 from schemas.config import AgentConfig
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -110,10 +110,10 @@ def test_without_evidence_the_observer_tells_friction_with_its_interval(name: st
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
     t = t[:, None]
     signals = signals[:, None]
-    _, located = locate(new_tracks(1), t, signals)
+    _, located = locate_vehicles(new_tracks(1), t, signals)
     reported = bank_of(name, [vehicle]).advance(t, signals, located.closes)
-    _, output, _ = observe(
-        OpenVisits.start(1), (t * 1e9).astype(np.int64), located, reported, AgentConfig()
+    _, output, _ = build_records(
+        OpenVisits.before_any(1), (t * 1e9).astype(np.int64), located, reported, AgentConfig()
     )
     assert len(output.vehicle) > 0
     assert output.columns["log_likelihood"].shape == (len(output.vehicle), 0)
@@ -133,7 +133,7 @@ def test_the_friction_that_is_set_matters_where_tyres_bend(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     module = adaptive_federated_ckf if name == "adaptive-federated-ckf" else compensated_wckf
     right, wrong = (
-        module.bank([vehicle], mu).advance(t[:, None], signals[:, None]) for mu in (0.3, 0.9)
+        module.make_bank([vehicle], mu).advance(t[:, None], signals[:, None]) for mu in (0.3, 0.9)
     )
     assert right.innovation_nis.mean() < wrong.innovation_nis.mean()
 
@@ -176,7 +176,9 @@ def test_unscented_filter_with_torque_finds_friction_of_snow_in_a_slalom() -> No
 def test_every_setting_of_the_papers_filter_matters(change: dict[str, object]) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
     usual, other = (
-        paper_aco_fckf.bank([vehicle], Memberships(), setting).advance(t[:, None], signals[:, None])
+        paper_aco_fckf.make_bank([vehicle], Memberships(), setting).advance(
+            t[:, None], signals[:, None]
+        )
         for setting in (Setting(), Setting()._replace(**change))  # type: ignore[arg-type]
     )
     assert not np.array_equal(usual.mu, other.mu)

@@ -12,7 +12,7 @@ import numpy as np
 from edge_agent.estimators import sr_ukf
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS
-bank = sr_ukf.bank([PRESETS["sedan"].vehicle])
+bank = sr_ukf.make_bank([PRESETS["sedan"].vehicle])
 bank.advance(np.zeros((1, 1)), np.zeros((1, 1, len(CHANNELS))))
 print(sum(sr_ukf.KERNEL.stats.cache_hits.values()))
 """

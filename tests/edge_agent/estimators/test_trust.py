@@ -18,9 +18,9 @@ from edge_agent.estimators.friction_mixture.memory import Trust
 from edge_agent.estimators.friction_mixture.trust import (
     FACTOR,
     axles_ratio,
-    credence,
-    strain,
+    belief_strain,
     strained_noise,
+    used_evidence_share,
 )
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.records import records
@@ -48,9 +48,9 @@ def after(
 
 
 def test_strain_goes_from_one_to_chi_square_over_degrees_of_freedom() -> None:
-    assert strain(0.0, 0.0, 2.0) == 1.0
-    assert strain(5000.0, 5000.0, 2.0) == pytest.approx(2.0, rel=1e-3)
-    assert strain(0.0, 10.0, 2.0) < 0.2
+    assert belief_strain(0.0, 0.0, 2.0) == 1.0
+    assert belief_strain(5000.0, 5000.0, 2.0) == pytest.approx(2.0, rel=1e-3)
+    assert belief_strain(0.0, 10.0, 2.0) < 0.2
 
 
 def test_axles_are_more_certain_with_a_correct_vehicle_file() -> None:
@@ -70,7 +70,7 @@ def test_innovations_as_stated_support_the_model_threefold_ones_do_not() -> None
 
 def test_weight_of_evidence_falls_to_zero_at_the_limit() -> None:
     shares = [
-        credence(believing(odd=share * CONSTANTS.odd_least), CONSTANTS)
+        used_evidence_share(believing(odd=share * CONSTANTS.odd_least), CONSTANTS)
         for share in (0.0, 0.3, 0.8, 1.0, 2.0)
     ]
     assert shares[0] == 1.0

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from edge_agent.inputs.context import context_block
-from edge_agent.observe.cell_tracker import NOWHERE, locate
+from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles
 from edge_agent.observe.observation_builder import (
     FELT_STD,
     WHEEL_SHARE,
     OpenVisits,
     RecordBlock,
-    observe,
+    build_records,
 )
 from schemas import grid, mugrid
 from schemas.config import AgentConfig
@@ -168,10 +168,10 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     for felt in (0.1, 0.8, np.nan):
         signals = block.signals.copy()
         signals[..., S.AX], signals[..., S.AY] = -felt * GRAVITY, 0.0
-        _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+        _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
         reading = cast("Estimates", used)
-        _, records, _ = observe(
-            OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals
+        _, records, _ = build_records(
+            OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), signals
         )
         told.append(float(records.columns["mu_utilised"][0]))
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
@@ -186,10 +186,10 @@ def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
     reported = estimates(len(east), 1, used=0.9)
     signals = block.signals.copy()
     signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
-    _, located = locate(Watch.of(1).tracks, block.t, signals)
+    _, located = locate_vehicles(Watch.of(1).tracks, block.t, signals)
     reading = cast("Estimates", type(reported)(**{**vars(reported), "vx": flat + 10.0, "vy": flat}))
-    _, records, _ = observe(
-        OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals
+    _, records, _ = build_records(
+        OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), signals
     )
     return [float(used) for used in records.columns["mu_utilised"]]
 
@@ -201,7 +201,7 @@ def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
-    _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+    _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
     border = int(np.flatnonzero(located.closes[:, 0])[1])
     gentle = np.full(450, 0.1)
     at_border = np.full(450, 0.1)
@@ -282,7 +282,7 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
     east = np.arange(samples)[:, None] * 1.0
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
     reported = estimates(samples, 1)
-    _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+    _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     given = {
         "abs_active": np.zeros((samples, 1)),
@@ -293,8 +293,14 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
     given["wiper"] = np.where(np.arange(samples)[:, None] < first, 0.5, np.nan)
     context = context_block(samples, 1, given)
     reading = cast("Estimates", reported)
-    _, told, _ = observe(
-        OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals, context
+    _, told, _ = build_records(
+        OpenVisits.before_any(1),
+        block.time,
+        located,
+        reading,
+        AgentConfig(),
+        block.signals,
+        context,
     )
     columns = told.columns
     assert columns["abs_active"][:2].tolist() == [1, -1]
@@ -307,8 +313,8 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
     assert columns["air_temperature"][:2].tolist() == pytest.approx(expected)
     assert columns["wiper"][0] == 0.5
     assert np.isnan(columns["wiper"][1])
-    _, plain, _ = observe(
-        OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals
+    _, plain, _ = build_records(
+        OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), block.signals
     )
     same = columns.keys() - {"abs_active", "air_temperature", "wiper"}
     for name in same:

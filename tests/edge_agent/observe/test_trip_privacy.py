@@ -28,8 +28,10 @@ def reported(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
     for block in range(round(seconds / block_s)):
         t = (block * block_s + 0.1 * np.arange(1, steps + 1))[:, None]
         time = np.rint(t * NS).astype(np.int64)
-        ends.drive(time, np.full(time.shape, SPEED))
-        out += (ends.cut(states(time[time % NS == 0].ravel())).columns["time"] / NS).tolist()
+        ends.advance(time, np.full(time.shape, SPEED))
+        out += (
+            ends.release_records(states(time[time % NS == 0].ravel())).columns["time"] / NS
+        ).tolist()
     return out
 
 
@@ -54,5 +56,5 @@ def test_who_stands_still_has_not_left_home() -> None:
     ends = TripEnds(1, 50.0, 0.0)
     for k in range(1, 100):
         time = np.array([[k * NS]])
-        ends.drive(time, np.zeros((1, 1)))
-        assert not len(ends.cut(states(time[0])).vehicle)
+        ends.advance(time, np.zeros((1, 1)))
+        assert not len(ends.release_records(states(time[0])).vehicle)

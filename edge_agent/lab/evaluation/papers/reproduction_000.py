@@ -66,10 +66,10 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False)
     )
     joint_batch, joint = without_noise(
-        MATCHED[SCENARIO], lambda vehicles: federated_ckf.bank(vehicles, PROPORTIONAL)
+        MATCHED[SCENARIO], lambda vehicles: federated_ckf.make_bank(vehicles, PROPORTIONAL)
     )
     matched = means(joint_batch, joint)
-    own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.bank))
+    own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.make_bank))
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
     never = seconds_near(similar_batch, similar_mu.mean(axis=1))
     done.tables = [

@@ -61,7 +61,7 @@ def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRu
     batch = ideal(spec)
     friction = float(batch.mu[0, 0])
     reported = {
-        name: estimates(adaptive_federated_ckf.bank(batch.vehicles, friction, setting), batch)
+        name: estimates(adaptive_federated_ckf.make_bank(batch.vehicles, friction, setting), batch)
         for name, setting in settings.items()
     }
     return MotionRun(batch, reported)

@@ -110,7 +110,7 @@ class ForceRun:
 def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
     """Drive with perfect sensors; read WCKF-A and the compensated forces after every sample."""
     batch = ideal(spec)
-    bank = compensated_wckf.bank(batch.vehicles, float(batch.mu[0, 0]), tyre)
+    bank = compensated_wckf.make_bank(batch.vehicles, float(batch.mu[0, 0]), tyre)
     fused = []
     first = []
     forces = []

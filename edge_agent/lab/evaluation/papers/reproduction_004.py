@@ -14,7 +14,7 @@ from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import Estimates, paper_aco_fckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
-from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH, Setting, bank
+from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH, Setting, make_bank
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal, repeated
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import MATCHED
@@ -91,7 +91,7 @@ def run_noise(
     for n, seed in enumerate(seeds):
         add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 4]))
     reported = {
-        name: estimates(bank(batch.vehicles, sets, setting), batch)
+        name: estimates(make_bank(batch.vehicles, sets, setting), batch)
         for name, (sets, setting) in filters.items()
     }
     return NoisyRun(batch, reported)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from edge_agent.estimators.elements import unexplained
+from edge_agent.estimators.elements import elements_without_reason
 from edge_agent.lab.evaluation.papers import (
     reproduction_000,
     reproduction_001,
@@ -39,7 +39,7 @@ def write_paper(
     if plots:
         write_plots(done.plots, folder)
     seconds = time.monotonic() - began
-    unsaid = len(unexplained(done.elements))
+    unsaid = len(elements_without_reason(done.elements))
     done.figures += [
         Figure(f"papers.{paper}.elements.missing_unsaid", unsaid, "1", 0.0, "less"),
         Figure(f"papers.{paper}.seconds", seconds, "s", LONGEST_S, "less"),
