@@ -26,7 +26,7 @@ from edge_agent.inputs.readers.gnss import parse_gpsd, parse_nmea
 from fleet_service.archive.format.version import parse_version
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import fence_of
-from fleet_service.replication.lease import _read
+from fleet_service.replication.lease import _parse_record
 from schemas import keys, query, wire
 from schemas.errors import InputError
 from schemas.runtime.batch_decoder import decode_many
@@ -119,7 +119,7 @@ PARSERS: Final = {
     "dbc": Parser(_text(parse_dbc)),
     "nmea": Parser(_text(parse_nmea), GNSS_ERRORS),
     "gpsd": Parser(_text(parse_gpsd), GNSS_ERRORS),
-    "leases": Parser(lambda data: _read("lease/0000000001.json", data)),
+    "leases": Parser(lambda data: _parse_record("lease/0000000001.json", data)),
     "fences": Parser(
         lambda data: fence_of(cast(ObjectBucket, _OneFence(data))), (InputError, CopyError)
     ),

@@ -311,8 +311,8 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
     road = Stretches()
     ids = set[str]()
     for _, alert in alerts:
-        road.take(alert)
-        ids |= {one.id for one in road.changes()}
+        road.apply_alert(alert)
+        ids |= {one.id for one in road.take_changes()}
     icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
     cell = icy["cell"].to_numpy()
     sector = icy["sector"].to_numpy()

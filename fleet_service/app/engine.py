@@ -75,7 +75,9 @@ class Engine:
         self.counts: Counter[str] = Counter()
         self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
         upload = None if self.copy is None else self.copy.upload_segments
-        log: SegmentLog[BatchId] = SegmentLog(root, config.name, upload, self.holding.epoch)
+        log: SegmentLog[BatchId] = SegmentLog(
+            root, config.name, upload, self.holding.smallest_epoch
+        )
         state = load_state(root, config, set_aside)
         self.counts["checkpoints_refused"] += state.refused
         self._shared = SharedState(state, config.public_vehicles)

@@ -134,7 +134,7 @@ class Service:
         with (
             session,
             claim_regions(
-                session, config.name, config.regions, stop, self.engine.holding.former
+                session, config.name, config.regions, stop, self.engine.holding.all_holders
             ) as mine,
             watch_successors(session, mine) as came,
             self._upkeep,
@@ -162,7 +162,7 @@ class Service:
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
             holding.mark_lost()
-        return holding.lost
+        return holding.is_lost
 
     def _hanging(self) -> str | None:
         """Return the part outside the worker that died or hangs, so that only a restart helps."""
@@ -294,7 +294,7 @@ class Service:
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
         """Process and settle waiting messages within LEAVE_S; senders keep the rest."""
-        if self.engine.holding.lost:
+        if self.engine.holding.is_lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
             self._log_line(

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until a signal."""
     from fleet_service.client.cits import gateway
     from fleet_service.client.cits.properties import Originator
-    from fleet_service.client.map_client import settings
+    from fleet_service.client.map_client import connection_settings
 
     if arguments.to is None and arguments.source is None:
         raise InputError("to", "nothing is sent or received", "give --to, --from or both")
@@ -65,6 +65,6 @@ def run(arguments: argparse.Namespace) -> int:
     receiving = None
     if arguments.source is not None:
         receiving = gateway.Receiving(arguments.source, arguments.selector, arguments.witness)
-    connection = settings(arguments.connect, arguments.config)
-    gateway.run(connection, arguments.amqp, sending, receiving, stop_on_signals())
+    connection = connection_settings(arguments.connect, arguments.config)
+    gateway.run_gateway(connection, arguments.amqp, sending, receiving, stop_on_signals())
     return 0

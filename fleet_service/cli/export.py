@@ -153,15 +153,19 @@ def _route_costs(arguments: argparse.Namespace) -> int:
     links = read_network(arguments.roads).links
     box = {"format": "arrow"} | ({} if arguments.bbox is None else {"bbox": arguments.bbox})
     table = map_client.served_table(
-        map_client.ask(map_client.settings(arguments.connect, arguments.config), box)
+        map_client.query_map(
+            map_client.connection_settings(arguments.connect, arguments.config), box
+        )
     )
     lines = routing.cost_lines(
         table, (routing.RoadLine(link.latitude, link.longitude) for link in links)
     )
     if arguments.what == "graphhopper":
-        costs = routing.graphhopper(lines)
+        costs = routing.graphhopper_model(lines)
     else:
-        costs = routing.valhalla(lines, routing.ice_cells(table) if arguments.exclude_ice else ())
+        costs = routing.valhalla_request(
+            lines, routing.ice_cells(table) if arguments.exclude_ice else ()
+        )
     with commandline.report_write_errors(arguments.out):
         arguments.out.write_text(json.dumps(costs), encoding="utf-8")
     print(f"{len(lines)} stretches of low grip in {arguments.out}", flush=True)
@@ -170,15 +174,15 @@ def _route_costs(arguments: argparse.Namespace) -> int:
 
 def _datex(arguments: argparse.Namespace) -> int:
     from fleet_service.cli.common import stop_on_signals
-    from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish
-    from fleet_service.client.map_client import settings
+    from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish_alerts
+    from fleet_service.client.map_client import connection_settings
 
     commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".xml",))
     feed = DatexFeed(
         DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True))
     )
-    publish(
-        settings(arguments.connect, arguments.config),
+    publish_alerts(
+        connection_settings(arguments.connect, arguments.config),
         feed,
         stop_on_signals() if arguments.follow else None,
     )

@@ -143,7 +143,7 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
             "config", f"the archive has a copy at {url}, where it is to be forgotten too", fix
         )
     with closing(BucketReplica(root, url, config.archive.options)) as copy:
-        copy.begin(
+        copy.sync_without_lease(
             config.name
         )  # what only the copy has comes first, or it would be found there later
         yield

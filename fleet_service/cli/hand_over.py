@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
             "give chunks of 4, 3 and 3 digits, or * for all",
         )
     with map_client.open_connected(
-        map_client.settings(arguments.connect, arguments.config)
+        map_client.connection_settings(arguments.connect, arguments.config)
     ) as session:
         moved = hand_over(session, arguments.region, arguments.to, print)
     if moved is None:

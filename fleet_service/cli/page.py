@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.archive is not None:
         _check_archive(arguments.archive)
     settings = server.PageSettings(
-        connection=map_client.settings(arguments.connect, arguments.config),
+        connection=map_client.connection_settings(arguments.connect, arguments.config),
         host=arguments.host,
         port=arguments.port,
         names=arguments.name,

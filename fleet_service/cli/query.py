@@ -62,7 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = {
         name: value for name, value in (*asked.items(), ("format", form)) if value is not None
     }
-    answer = map_client.ask(map_client.settings(arguments.connect, arguments.config), parameters)
+    answer = map_client.query_map(
+        map_client.connection_settings(arguments.connect, arguments.config), parameters
+    )
     if not answer.served:
         print(
             "no service answers for the map: start one; that is not the same as an empty map",
@@ -72,16 +74,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.bbox is not None and answer.table is not None and not answer.table.num_rows:
         _say_what_is_covered(arguments)
     if arguments.out is None:
-        print(map_client.text(answer))
+        print(map_client.format_answer(answer))
     elif answer.table is not None and arguments.out.suffix in (".parquet", ".csv"):
         from fleet_service.archive.export import extract
         from fleet_service.archive.format import geo
 
         extract.write(geo.with_cells(answer.table), arguments.out)
     else:
-        map_client.write(answer, arguments.out)
-    if answer.gap is not None:
-        print(answer.gap, file=sys.stderr)
+        map_client.write_answer(answer, arguments.out)
+    if answer.gap_description is not None:
+        print(answer.gap_description, file=sys.stderr)
         return NOBODY
     return 0
 
@@ -92,7 +94,9 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
     """
     from fleet_service.client import map_client
 
-    whole = map_client.ask(map_client.settings(arguments.connect, arguments.config), {}).table
+    whole = map_client.query_map(
+        map_client.connection_settings(arguments.connect, arguments.config), {}
+    ).table
     if whole is None or not whole.num_rows:
         return
     west_end, south_end, east_end, north_end = (

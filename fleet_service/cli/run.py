@@ -109,13 +109,13 @@ def _open_archive(
     metrics while it waits.
     """
     from fleet_service.app.metrics import standby_metrics
-    from fleet_service.replication.ownership import acquire
+    from fleet_service.replication.ownership import acquire_archive
     from fleet_service.shards.serving import standby_signs
     from schemas.runtime import watchdog
     from schemas.runtime.metrics import serve_metrics
 
     if not config.standby:
-        return acquire(config, root, stop, log_line)
+        return acquire_archive(config, root, stop, log_line)
     latest = [""]
 
     def say(line: str) -> None:
@@ -131,7 +131,7 @@ def _open_archive(
         ) as address,
         standby_signs(config, stop, watchdog.notify_waiting()) as signs,
     ):
-        return None if stop.is_set() else acquire(config, root, stop, say, signs)
+        return None if stop.is_set() else acquire_archive(config, root, stop, say, signs)
 
 
 def _force_exit_when_stuck(

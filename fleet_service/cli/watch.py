@@ -50,15 +50,15 @@ def run(arguments: argparse.Namespace) -> int:
     wishes = watching.WatchOptions(
         arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json
     )
-    settings = map_client.settings(arguments.connect, arguments.config)
+    settings = map_client.connection_settings(arguments.connect, arguments.config)
     if arguments.webhook is None:
         for name in ("webhook_queue", "health_port"):
             if getattr(arguments, name) is not None:
                 raise InputError(name, "has no meaning without a webhook", "add --webhook URL")
-        watching.watch(settings, wishes, stop, _say)
+        watching.watch_map(settings, wishes, stop, _say)
         return 0
     return _watch_with_webhook(
-        arguments, lambda hear: watching.watch(settings, wishes, stop, _say, hear)
+        arguments, lambda hear: watching.watch_map(settings, wishes, stop, _say, hear)
     )
 
 
@@ -78,7 +78,7 @@ def _watch_with_webhook(
             watch(hook.send)
     finally:
         hook.close()
-    return 1 if hook.lost or hook.waiting else 0
+    return 1 if hook.lost_count or hook.waiting_count else 0
 
 
 def _say(line: str) -> None:

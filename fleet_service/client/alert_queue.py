@@ -62,7 +62,7 @@ class AlertQueue:
                 f"DELETE FROM waiting WHERE number NOT IN ({keep})", (self._most,)
             ).rowcount
 
-    def first(self) -> tuple[int, str] | None:
+    def read_first(self) -> tuple[int, str] | None:
         """Return number and text of the oldest message; None if the queue is empty."""
         with self._guard:
             row = self._file.execute(

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Literal
 
-from fleet_service.client.stretches import StretchAlert, iso
+from fleet_service.client.stretches import StretchAlert, format_time
 from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU, Z_95
@@ -71,7 +71,7 @@ class Supplier:
             raise InputError("supplier", "is empty", "give the supplier's name at the access point")
 
 
-def publication(
+def make_publication(
     supplier: Supplier,
     standing: list[StretchAlert],
     now: int,
@@ -91,33 +91,37 @@ def publication(
     Raises:
         InputError: `before` is not a publication.
     """
-    old = {} if before is None else _records(before)
+    old = {} if before is None else _parse_records(before)
     root = ET.Element(
-        _name("d2:payload"),
-        {_name("xsi:type"): "sit:SituationPublication", "lang": "en", "modelBaseVersion": "3"},
+        _qualified_name("d2:payload"),
+        {
+            _qualified_name("xsi:type"): "sit:SituationPublication",
+            "lang": "en",
+            "modelBaseVersion": "3",
+        },
     )
-    _text(root, "com:publicationTime", iso(now))
-    creator = ET.SubElement(root, _name("com:publicationCreator"))
-    _text(creator, "com:country", supplier.country)
-    _text(creator, "com:nationalIdentifier", supplier.name)
+    _add_text(root, "com:publicationTime", format_time(now))
+    creator = ET.SubElement(root, _qualified_name("com:publicationCreator"))
+    _add_text(creator, "com:country", supplier.country)
+    _add_text(creator, "com:nationalIdentifier", supplier.name)
     written: set[str] = set()
     for alert in standing:
         known = alert.id if alert.id in old else _same_place(alert, old, written)
-        record = _record(alert, known or alert.id, now)
+        record = _make_record(alert, known or alert.id, now)
         if known is not None:
             record = _next_version(record, old[known])
         written.add(record.get("id", ""))
-        root.append(_situation(supplier, record))
+        root.append(_make_situation(supplier, record))
     for name, record in old.items():
         if name in written:
             continue
         place = (
             float(child.text or "nan")
-            for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
+            for child in _find_element(record, "sit:locationReference/loc:coordinatesForDisplay")
         )
         ended = _end_record(record, now) if _has_ended(record) or is_heard(*place) else record
         if ended is not None:
-            root.append(_situation(supplier, ended))
+            root.append(_make_situation(supplier, ended))
     ET.indent(root)
     text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
     used = (
@@ -132,14 +136,18 @@ def same_but_for_time(one: bytes, other: bytes) -> bool:
     return cut.sub(b"", one) == cut.sub(b"", other)
 
 
-def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
+def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     record = ET.Element(
-        _name("sit:situationRecord"),
-        {_name("xsi:type"): "sit:WeatherRelatedRoadConditions", "id": name, "version": "1"},
+        _qualified_name("sit:situationRecord"),
+        {
+            _qualified_name("xsi:type"): "sit:WeatherRelatedRoadConditions",
+            "id": name,
+            "version": "1",
+        },
     )
-    _text(record, "sit:situationRecordCreationTime", iso(now))
-    _text(record, "sit:situationRecordObservationTime", iso(alert.time))
-    _text(record, "sit:situationRecordVersionTime", iso(now))
+    _add_text(record, "sit:situationRecordCreationTime", format_time(now))
+    _add_text(record, "sit:situationRecordObservationTime", format_time(alert.time))
+    _add_text(record, "sit:situationRecordVersionTime", format_time(now))
     sure = (
         "certain"
         if alert.p_slippery > CERTAIN
@@ -147,41 +155,45 @@ def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
         if alert.p_slippery > PROBABLE
         else "riskOf"
     )
-    _text(record, "sit:probabilityOfOccurrence", sure)
-    _text(record, "sit:severity", "high" if alert.mu < SLIPPERY_MU / 2 else "medium")
-    _text(record, "sit:safetyRelatedMessage", "true")
-    source = ET.SubElement(record, _name("sit:source"))
-    _words(source, "com:sourceName", "GripMap: peak friction that vehicles' own dynamics showed")
-    _text(source, "com:sourceType", "vehicleProbeMeasurement")
-    validity = ET.SubElement(record, _name("sit:validity"))
-    _text(validity, "com:validityStatus", "active")
-    period = ET.SubElement(validity, _name("com:validityTimeSpecification"))
-    _text(period, "com:overallStartTime", iso(alert.since))
-    record.append(_location(alert))
-    _text(record, "sit:weatherRelatedRoadConditionType", "slippery")
-    measured = ET.SubElement(record, _name("sit:roadSurfaceConditionMeasurements"))
+    _add_text(record, "sit:probabilityOfOccurrence", sure)
+    _add_text(record, "sit:severity", "high" if alert.mu < SLIPPERY_MU / 2 else "medium")
+    _add_text(record, "sit:safetyRelatedMessage", "true")
+    source = ET.SubElement(record, _qualified_name("sit:source"))
+    _add_english_text(
+        source, "com:sourceName", "GripMap: peak friction that vehicles' own dynamics showed"
+    )
+    _add_text(source, "com:sourceType", "vehicleProbeMeasurement")
+    validity = ET.SubElement(record, _qualified_name("sit:validity"))
+    _add_text(validity, "com:validityStatus", "active")
+    period = ET.SubElement(validity, _qualified_name("com:validityTimeSpecification"))
+    _add_text(period, "com:overallStartTime", format_time(alert.since))
+    record.append(_make_location(alert))
+    _add_text(record, "sit:weatherRelatedRoadConditionType", "slippery")
+    measured = ET.SubElement(record, _qualified_name("sit:roadSurfaceConditionMeasurements"))
     friction = ET.SubElement(
         measured,
-        _name("com:friction"),
+        _qualified_name("com:friction"),
         {
             "numberOfInputValuesUsed": str(alert.vehicles),
             "standardDeviation": f"{(alert.mu_upper - alert.mu_lower) / INTERVAL_STD:.3f}",
         },
     )
-    _text(friction, "com:friction", f"{alert.mu:.2f}")
+    _add_text(friction, "com:friction", f"{alert.mu:.2f}")
     return record
 
 
-def _location(alert: StretchAlert) -> ET.Element:
+def _make_location(alert: StretchAlert) -> ET.Element:
     """Return a line from end to end in driving direction; a point if the stretch is one cell."""
     points = list(alert.points)
     line = len(alert.points) > 1
     kind = "loc:LinearLocation" if line else "loc:PointLocation"
-    place = ET.Element(_name("sit:locationReference"), {_name("xsi:type"): kind})
-    _coordinates(place, "loc:coordinatesForDisplay", alert.latitude, alert.longitude)
-    about = ET.SubElement(place, _name("loc:supplementaryPositionalDescription"))
-    _text(about, "loc:lengthAffected", f"{alert.length_m:.0f}")
-    _words(
+    place = ET.Element(
+        _qualified_name("sit:locationReference"), {_qualified_name("xsi:type"): kind}
+    )
+    _add_coordinates(place, "loc:coordinatesForDisplay", alert.latitude, alert.longitude)
+    about = ET.SubElement(place, _qualified_name("loc:supplementaryPositionalDescription"))
+    _add_text(about, "loc:lengthAffected", f"{alert.length_m:.0f}")
+    _add_english_text(
         about,
         "loc:locationDescription",
         f"{alert.direction}; vehicles heading {' and '.join(alert.headings)}",
@@ -192,18 +204,18 @@ def _location(alert: StretchAlert) -> ET.Element:
         along = {"north": north, "south": -north, "east": east, "west": -east}
         points = points if along[alert.headings[0]] >= 0.0 else points[::-1]
         drawn = ET.SubElement(
-            place, _name("loc:gmlLineString"), {"srsName": "urn:ogc:def:crs:EPSG::4326"}
+            place, _qualified_name("loc:gmlLineString"), {"srsName": "urn:ogc:def:crs:EPSG::4326"}
         )
-        _text(
+        _add_text(
             drawn,
             "loc:posList",
             " ".join(f"{value:.{DIGITS}f}" for point in points for value in point),
         )
     else:
-        point = ET.SubElement(place, _name("loc:pointByCoordinates"))
+        point = ET.SubElement(place, _qualified_name("loc:pointByCoordinates"))
         if len(alert.headings) == 1:
-            _text(point, "loc:bearing", f"{_BEARINGS[alert.headings[0]]:.0f}")
-        _coordinates(point, "loc:pointCoordinates", *points[0])
+            _add_text(point, "loc:bearing", f"{_BEARINGS[alert.headings[0]]:.0f}")
+        _add_coordinates(point, "loc:pointCoordinates", *points[0])
     return place
 
 
@@ -215,14 +227,14 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
         "sit:situationRecordCreationTime",
         "sit:validity/com:validityTimeSpecification/com:overallStartTime",
     ):
-        _found(record, tag).text = _found(old, tag).text
+        _find_element(record, tag).text = _find_element(old, tag).text
     times = ("sit:situationRecordVersionTime", "sit:situationRecordObservationTime")
     compared = [copy.deepcopy(one) for one in (record, old)]
     for one in compared:
         one.set("version", "")
         for tag in times:
-            _found(one, tag).text = ""
-    if _plain(compared[0]) == _plain(compared[1]):
+            _find_element(one, tag).text = ""
+    if _canonical_bytes(compared[0]) == _canonical_bytes(compared[1]):
         return old
     record.set("version", str(int(old.get("version", "0")) + 1))
     return record
@@ -230,14 +242,14 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
 
 def _end_record(record: ET.Element, now: int) -> ET.Element | None:
     """Return a record with its end; None if the end was published long enough."""
-    period = _found(record, "sit:validity/com:validityTimeSpecification")
+    period = _find_element(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)
     if end is not None:
         at = datetime.fromisoformat(end.text or "").timestamp()
         return record if now / NS - at < KEPT_S else None
-    _text(period, "com:overallEndTime", iso(now))
-    _found(record, "sit:validity/com:validityStatus").text = "definedByValidityTimeSpec"
-    _found(record, "sit:situationRecordVersionTime").text = iso(now)
+    _add_text(period, "com:overallEndTime", format_time(now))
+    _find_element(record, "sit:validity/com:validityStatus").text = "definedByValidityTimeSpec"
+    _find_element(record, "sit:situationRecordVersionTime").text = format_time(now)
     record.set("version", str(int(record.get("version", "0")) + 1))
     return record
 
@@ -254,12 +266,12 @@ def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[st
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points
     }
     for name, record in old.items():
-        if name not in written and not _has_ended(record) and cells & _cells(record):
+        if name not in written and not _has_ended(record) and cells & _cell_coordinates(record):
             return name
     return None
 
 
-def _cells(record: ET.Element) -> set[str]:
+def _cell_coordinates(record: ET.Element) -> set[str]:
     words = (record.findtext(".//loc:posList", "", _SPACES)).split()
     point = record.find(".//loc:pointCoordinates", _SPACES)
     if point is not None:
@@ -270,7 +282,7 @@ def _cells(record: ET.Element) -> set[str]:
     }
 
 
-def _records(document: bytes) -> dict[str, ET.Element]:
+def _parse_records(document: bytes) -> dict[str, ET.Element]:
     """Return the records of a publication by id."""
     problem = InputError(
         "out", "holds something else than a publication of this command", "name another file"
@@ -279,55 +291,62 @@ def _records(document: bytes) -> dict[str, ET.Element]:
         root = ET.fromstring(document)
     except ET.ParseError as error:
         raise problem from error
-    if root.tag != _name("d2:payload") or root.get(_name("xsi:type")) != "sit:SituationPublication":
+    if (
+        root.tag != _qualified_name("d2:payload")
+        or root.get(_qualified_name("xsi:type")) != "sit:SituationPublication"
+    ):
         raise problem
     return {
         record.get("id", ""): record for record in root.iterfind(".//sit:situationRecord", _SPACES)
     }
 
 
-def _situation(supplier: Supplier, record: ET.Element) -> ET.Element:
-    situation = ET.Element(_name("sit:situation"), {"id": f"situation-{record.get('id')}"})
-    _text(
+def _make_situation(supplier: Supplier, record: ET.Element) -> ET.Element:
+    situation = ET.Element(
+        _qualified_name("sit:situation"), {"id": f"situation-{record.get('id')}"}
+    )
+    _add_text(
         situation,
         "sit:situationVersionTime",
-        _found(record, "sit:situationRecordVersionTime").text or "",
+        _find_element(record, "sit:situationRecordVersionTime").text or "",
     )
-    header = ET.SubElement(situation, _name("sit:headerInformation"))
-    _text(header, "com:informationStatus", supplier.status)
+    header = ET.SubElement(situation, _qualified_name("sit:headerInformation"))
+    _add_text(header, "com:informationStatus", supplier.status)
     situation.append(record)
     return situation
 
 
-def _coordinates(parent: ET.Element, tag: str, latitude: float, longitude: float) -> None:
-    point = ET.SubElement(parent, _name(tag))
-    _text(point, "loc:latitude", f"{latitude:.{DIGITS}f}")
-    _text(point, "loc:longitude", f"{longitude:.{DIGITS}f}")
+def _add_coordinates(parent: ET.Element, tag: str, latitude: float, longitude: float) -> None:
+    point = ET.SubElement(parent, _qualified_name(tag))
+    _add_text(point, "loc:latitude", f"{latitude:.{DIGITS}f}")
+    _add_text(point, "loc:longitude", f"{longitude:.{DIGITS}f}")
 
 
-def _words(parent: ET.Element, tag: str, text: str) -> None:
-    values = ET.SubElement(ET.SubElement(parent, _name(tag)), _name("com:values"))
-    ET.SubElement(values, _name("com:value"), {"lang": "en"}).text = text
+def _add_english_text(parent: ET.Element, tag: str, text: str) -> None:
+    values = ET.SubElement(
+        ET.SubElement(parent, _qualified_name(tag)), _qualified_name("com:values")
+    )
+    ET.SubElement(values, _qualified_name("com:value"), {"lang": "en"}).text = text
 
 
-def _text(parent: ET.Element, tag: str, text: str) -> None:
-    ET.SubElement(parent, _name(tag)).text = text
+def _add_text(parent: ET.Element, tag: str, text: str) -> None:
+    ET.SubElement(parent, _qualified_name(tag)).text = text
 
 
-def _found(element: ET.Element, path: str) -> ET.Element:
+def _find_element(element: ET.Element, path: str) -> ET.Element:
     found = element.find(path, _SPACES)
     if found is None:
         raise InputError("out", f"holds a record without {path}", "name another file")
     return found
 
 
-def _plain(element: ET.Element) -> bytes:
+def _canonical_bytes(element: ET.Element) -> bytes:
     ET.indent(element)
     element.tail = None
     return bytes(ET.tostring(element))
 
 
-def _name(tag: str) -> str:
+def _qualified_name(tag: str) -> str:
     prefix, _, local = tag.partition(":")
     return f"{{{_SPACES[prefix]}}}{local}"
 

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 import zenoh
 
-from fleet_service.client.datex import Supplier, publication, same_but_for_time
+from fleet_service.client.datex import Supplier, make_publication, same_but_for_time
 from fleet_service.client.map_client import is_place_served, is_served, open_connected
 from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.client.watching import GATHER_S, standing_alerts
@@ -43,7 +43,7 @@ class DatexFile:
         self.document = path.read_bytes() if path.exists() else None
         self._written = 0.0
         if self.document is not None:
-            publication(supplier, [], 0, self.document)
+            make_publication(supplier, [], 0, self.document)
 
     @property
     def is_due(self) -> bool:
@@ -63,7 +63,7 @@ class DatexFile:
             InputError: the file cannot be written; `document` is the new one nevertheless.
         """
         before = self.document
-        new = publication(self._supplier, standing, time.time_ns(), before, is_heard)
+        new = make_publication(self._supplier, standing, time.time_ns(), before, is_heard)
         changed = before is None or not same_but_for_time(new, before)
         if not changed and not self.is_due:
             return
@@ -103,13 +103,13 @@ class DatexFeed:
         self._heard: dict[int, bool] = {}
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
 
-    def take(self, alert: wire.Alert) -> None:
+    def apply_alert(self, alert: wire.Alert) -> None:
         """Record that an alert was raised or cleared, or still stands."""
         with self._lock:
-            self._stretches.take(alert)
+            self._stretches.apply_alert(alert)
             self._has_news = True
 
-    def look(self, session: zenoh.Session) -> None:
+    def query_alerts(self, session: zenoh.Session) -> None:
         """Query all standing alerts. Alerts of places without a service do not end."""
         found = standing_alerts(session)
         self._heard = {}
@@ -122,10 +122,12 @@ class DatexFeed:
 
         self._is_heard = is_heard
         with self._lock:
-            self._stretches.take_all(found, lambda alert: is_heard(alert.latitude, alert.longitude))
+            self._stretches.replace_alerts(
+                found, lambda alert: is_heard(alert.latitude, alert.longitude)
+            )
             self._has_news = True
 
-    def write(self) -> None:
+    def write_if_due(self) -> None:
         """Write the publication if it changed or its time is due.
 
         Raises:
@@ -135,12 +137,14 @@ class DatexFeed:
             if not self._has_news and not self._file.is_due:
                 return
             self._has_news = False
-            self._stretches.changes()
+            self._stretches.take_changes()
             standing = self._stretches.standing
         self._file.keep_up(standing, self._is_heard)
 
 
-def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None) -> None:
+def publish_alerts(
+    connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None
+) -> None:
     """Write the publication once, or with `stop` keep it current until that is set.
 
     Raises:
@@ -148,22 +152,24 @@ def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | 
             dry road.
     """
     with open_connected(connection) as session:
-        session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))
+        session.declare_subscriber(
+            f"{keys.ROOT}/alert/**", lambda sample: _apply_sample(feed, sample)
+        )
         if not is_served(session, query.parse({})):
             raise InputError(
                 "connect",
                 "no service answers for the map",
                 "start one; its silence ends no situation",
             )
-        feed.look(session)
-        feed.write()
+        feed.query_alerts(session)
+        feed.write_if_due()
         looked = time.monotonic()
         while stop is not None and not stop.wait(GATHER_S):
             if time.monotonic() > looked + REFRESH_S:
-                feed.look(session)
+                feed.query_alerts(session)
                 looked = time.monotonic()
-            feed.write()
+            feed.write_if_due()
 
 
-def _take(feed: DatexFeed, sample: zenoh.Sample) -> None:
-    feed.take(wire.decode_alert(sample.payload.to_bytes()))
+def _apply_sample(feed: DatexFeed, sample: zenoh.Sample) -> None:
+    feed.apply_alert(wire.decode_alert(sample.payload.to_bytes()))

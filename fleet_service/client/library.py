@@ -40,4 +40,4 @@ def ask_map(
         asked["route"] = "|".join(f"{longitude},{latitude}" for longitude, latitude in route)
     if at is not None:
         asked["at"] = at.isoformat()
-    return map_client.served_table(map_client.ask(settings, asked))
+    return map_client.served_table(map_client.query_map(settings, asked))

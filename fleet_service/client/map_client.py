@@ -64,7 +64,7 @@ class Answer:
     regions: tuple[str, ...] = ()
 
     @property
-    def gap(self) -> str | None:
+    def gap_description(self) -> str | None:
         """Return a description of the missing part of the answer."""
         if not self.missing:
             return None
@@ -74,7 +74,7 @@ class Answer:
         )
 
 
-def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
+def connection_settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
     """Return the connection settings: the configuration's, with `connect` instead of its
     endpoints.
     """
@@ -82,7 +82,7 @@ def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
     return found if connect is None else found.model_copy(update={"connect": [connect]})
 
 
-def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
+def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     """Query all services for the map.
 
     Raises:
@@ -91,7 +91,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     asked = query.parse(parameters)
     with open_connected(connection) as session, tokens.track_tokens(session) as services:
         before = services.active
-        payloads = sorted(replies(session, EVERYWHERE, parameters))
+        payloads = sorted(query_replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)
         after = services.refresh(session)  # who came meanwhile may not have been asked
         # and who went may have been asked in place of who followed it, even if it is back
@@ -108,7 +108,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         elif (
             not declared and served and not payloads
         ):  # likewise, and its token is on the way; or it has none
-            payloads = sorted(replies(session, EVERYWHERE, parameters))
+            payloads = sorted(query_replies(session, EVERYWHERE, parameters))
     answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
     if not declared:  # services of a former version, or an access list of one
         return answer
@@ -124,7 +124,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     return replace(answer, missing=tuple(missing), regions=found)
 
 
-def replies(
+def query_replies(
     session: zenoh.Session, key: str, parameters: Mapping[str, str]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield key and payload of every reply for a key expression of the map.
@@ -155,13 +155,15 @@ def served_table(answer: Answer) -> pa.Table:
             "no service answers for the map",
             "start one; that is not the same as an empty map",
         )
-    if answer.gap is None:
+    if answer.gap_description is None:
         return answer.table
     if not answer.table.num_rows:
         raise InputError(
-            "connect", answer.gap, "start its service; that is not the same as an empty map"
+            "connect",
+            answer.gap_description,
+            "start its service; that is not the same as an empty map",
         )
-    log.warning("%s", answer.gap)
+    log.warning("%s", answer.gap_description)
     return answer.table.replace_schema_metadata({"missing": ",".join(answer.missing)})
 
 
@@ -177,7 +179,7 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
         return True
-    if point is None and any(True for _ in replies(session, EVERYWHERE, {})):
+    if point is None and any(True for _ in query_replies(session, EVERYWHERE, {})):
         return True
     return any(
         reply.ok is not None
@@ -220,12 +222,14 @@ def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
         parts = [decode_tile(payload) for payload in payloads]
         table = pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table()
         if rank is not None:
-            table = table.take(rank.order(_numbers(table["cell"]), _numbers(table["sector"])))
+            table = table.take(
+                rank.order(_column_array(table["cell"]), _column_array(table["sector"]))
+            )
         return Answer(table, None)
     documents = [json.loads(payload) for payload in payloads]
     if asked.format is Format.JSON:
         return Answer(
-            None, {"tiles": documents if rank is None else sorted(documents, key=_first(rank))}
+            None, {"tiles": documents if rank is None else sorted(documents, key=_tile_rank(rank))}
         )
     features = [feature for document in documents for feature in document["features"]]
     if rank is not None:
@@ -237,15 +241,15 @@ def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
     return Answer(None, {"type": "FeatureCollection", "features": features})
 
 
-def _numbers(column: pa.ChunkedArray[Any]) -> IntArray:
+def _column_array(column: pa.ChunkedArray[Any]) -> IntArray:
     return np.asarray(column.to_numpy(), np.int64)
 
 
-def _first(rank: regions.Rank) -> Callable[[dict[str, Any]], int]:
+def _tile_rank(rank: regions.Rank) -> Callable[[dict[str, Any]], int]:
     return lambda tile: min(rank.of(cell["cell"], cell["sector"]) for cell in tile["cells"])
 
 
-def write(answer: Answer, path: Path) -> None:
+def write_answer(answer: Answer, path: Path) -> None:
     """Write an answer as an Arrow stream or JSON.
 
     Raises:
@@ -262,18 +266,18 @@ def write(answer: Answer, path: Path) -> None:
                 writer.write_table(answer.table)
 
 
-def text(answer: Answer) -> str:
+def format_answer(answer: Answer) -> str:
     """Return an answer for the terminal."""
     if answer.table is None:
         return json.dumps(answer.document, indent=1)
     lines = ["  ".join(f"{name:>12}" for name in SHOWN)]
     for row in answer.table.select(SHOWN).to_pylist():
         row["sector"] = grid.HEADINGS[row["sector"]]
-        lines.append("  ".join(f"{_shown(name, row[name]):>12}" for name in SHOWN))
+        lines.append("  ".join(f"{_format_value(name, row[name]):>12}" for name in SHOWN))
     return "\n".join([*lines, f"{answer.table.num_rows} cells"])
 
 
-def _shown(name: str, value: object) -> str:
+def _format_value(name: str, value: object) -> str:
     if value is None:
         return "-"
     if not isinstance(value, float):

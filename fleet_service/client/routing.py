@@ -55,7 +55,7 @@ class CostLine(NamedTuple):
     points: list[tuple[float, float]]
 
 
-def factors(mu_lower: FloatArray) -> FloatArray:
+def cost_factors(mu_lower: FloatArray) -> FloatArray:
     """Return the factor of each lower bound of grip: 1 from GOOD_GRIP on, at most MOST."""
     ratio = GOOD_GRIP / np.maximum(mu_lower, 1e-3)
     exact = np.clip(ratio**POWER, 1.0, MOST)
@@ -70,10 +70,10 @@ def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
         table: cells of the map, as a query returns them.
         roads: directed links of the network.
     """
-    key, factor = _known(table)
+    key, factor = _sorted_factors(table)
     out: list[CostLine] = []
     for road in roads:
-        latitude, longitude, yaw = _marks(road)
+        latitude, longitude, yaw = _sample_road(road)
         if not len(latitude):
             continue
         place = grid.SECTORS * grid.cell_of(latitude, longitude) + grid.sector_of(yaw)
@@ -82,23 +82,23 @@ def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
         cost = (
             np.where(key[found] == place, factor[found], 1.0) if len(key) else np.ones(len(place))
         )
-        out += _lines(cost, latitude, longitude)
+        out += _find_cost_runs(cost, latitude, longitude)
     return out
 
 
 def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
     """Return rings (longitude, latitude) of the cells that are surely ice."""
     upper, slippery = (
-        np.nan_to_num(_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery")
+        np.nan_to_num(_float_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery")
     )
-    ice = (upper < ICE_LOWER) & (slippery >= ICE_SURE) & _counts(table)
+    ice = (upper < ICE_LOWER) & (slippery >= ICE_SURE) & _has_evidence(table)
     cells = np.unique(np.asarray(table["cell"].to_numpy(), np.int64)[ice])
     west, south, east, north = grid.bounds(cells)
     corners = zip(west.tolist(), south.tolist(), east.tolist(), north.tolist(), strict=True)
     return [[(w, s), (e, s), (e, n), (w, n), (w, s)] for w, s, e, n in corners]
 
 
-def valhalla(
+def valhalla_request(
     lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()
 ) -> dict[str, Any]:
     """Return the fields to merge into a Valhalla request for a route."""
@@ -116,12 +116,12 @@ def valhalla(
     return found
 
 
-def graphhopper(lines: Sequence[CostLine]) -> dict[str, Any]:
+def graphhopper_model(lines: Sequence[CostLine]) -> dict[str, Any]:
     """Return a custom model for GraphHopper: one area per class of cost, and the priority there."""
     areas = []
     priority = []
     for number, factor in enumerate(STEPS[1:], 1):
-        rings = [[_ribbon(line.points)] for line in lines if line.factor == factor]
+        rings = [[_ring_around(line.points)] for line in lines if line.factor == factor]
         if not rings:
             continue
         name = f"low_grip_{number}"
@@ -131,29 +131,29 @@ def graphhopper(lines: Sequence[CostLine]) -> dict[str, Any]:
     return {"priority": priority, "areas": {"type": "FeatureCollection", "features": areas}}
 
 
-def _column(table: pa.Table, name: str) -> FloatArray:
+def _float_column(table: pa.Table, name: str) -> FloatArray:
     return np.asarray(table[name].to_numpy(), np.float64)
 
 
-def _counts(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _has_evidence(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
     return np.array(
         [basis in ("measured", "borrowed") for basis in table["basis"].to_pylist()], np.bool_
     )
 
 
-def _known(table: pa.Table) -> tuple[IntArray, FloatArray]:
+def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
     """Return cell and sector as one sorted number, and the factor there."""
-    counts = _counts(table)
+    counts = _has_evidence(table)
     cell, sector = (
         np.asarray(table[name].to_numpy(), np.int64)[counts] for name in ("cell", "sector")
     )
-    factor = factors(_column(table, "mu_lower")[counts])
+    factor = cost_factors(_float_column(table, "mu_lower")[counts])
     key = grid.SECTORS * cell + sector
     order = np.argsort(key)
     return key[order], factor[order]
 
 
-def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _sample_road(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return points every STEP_M along a road, with the yaw there; none of a road without
     length.
     """
@@ -171,7 +171,9 @@ def _marks(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.interp(at, run, road.latitude[keep]), np.interp(at, run, road.longitude[keep]), yaw
 
 
-def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> list[CostLine]:
+def _find_cost_runs(
+    cost: FloatArray, latitude: FloatArray, longitude: FloatArray
+) -> list[CostLine]:
     """Return the runs of one factor; a run that is too short joins the dearer neighbour's class
     by its own end.
     """
@@ -194,7 +196,7 @@ def _lines(cost: FloatArray, latitude: FloatArray, longitude: FloatArray) -> lis
     return out
 
 
-def _ribbon(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _ring_around(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return the ring around a line, HALF_WIDTH_M to both sides."""
     longitude, latitude = np.array(points).T
     east = METRES_PER_DEGREE * np.cos(np.radians(latitude.mean()))

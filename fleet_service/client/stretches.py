@@ -66,11 +66,11 @@ class StretchAlert:
     reason: str
     points: tuple[tuple[float, float], ...]
 
-    def values(self) -> dict[str, Any]:
+    def to_json_values(self) -> dict[str, Any]:
         """Return all values for JSON; times as ISO 8601, UTC."""
-        return asdict(self) | {"since": iso(self.since), "time": iso(self.time)}
+        return asdict(self) | {"since": format_time(self.since), "time": format_time(self.time)}
 
-    def line(self) -> str:
+    def to_line(self) -> str:
         """Return the alert as one line of text."""
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
         return (
@@ -78,12 +78,12 @@ class StretchAlert:
             f"{self.direction}, "
             f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, "
             f"{self.mu_upper:.2f}], "
-            f"{self.vehicles} vehicles; since {iso(self.since)}, {iso(self.time)}; {self.reason}; "
+            f"{self.vehicles} vehicles; since {format_time(self.since)}, {format_time(self.time)}; {self.reason}; "
             f"id {self.id}"
         )
 
 
-def iso(ns: int) -> str:
+def format_time(ns: int) -> str:
     """Return a time as text."""
     return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
@@ -97,7 +97,7 @@ class Stretches:
         self._members: dict[str, set[int]] = {}
         self._last: Alert | None = None
 
-    def take(self, alert: Alert) -> None:
+    def apply_alert(self, alert: Alert) -> None:
         """Record that a cell's alert was raised or cleared; repetition has no effect."""
         place = (alert.cell, alert.sector)
         if alert.raised:
@@ -106,7 +106,7 @@ class Stretches:
             self._standing.pop(place, None)
         self._last = alert
 
-    def take_all(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
+    def replace_alerts(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
         """Replace the standing alerts; others end if a service answers for their place."""
         present = {(alert.cell, alert.sector): alert for alert in standing}
         self._standing = {
@@ -115,22 +115,22 @@ class Stretches:
             if place in present or not is_heard(one)
         }
         for alert in present.values():
-            self.take(alert)
+            self.apply_alert(alert)
 
     @property
     def standing(self) -> list[StretchAlert]:
-        """Return all standing stretches, as `changes` returned them last."""
+        """Return all standing stretches, as `take_changes` returned them last."""
         return list(self._known.values())
 
-    def changes(self) -> list[StretchAlert]:
+    def take_changes(self) -> list[StretchAlert]:
         """Return the changes since the last call."""
-        found = self._groups()
+        found = self._group_by_stretch()
         out = []
         for name, group in found.items():
             if name not in self._known:
-                out.append(self._stretch(name, group))
-            elif self._members[name] != _cells(group):
-                out.append(replace(self._stretch(name, group), state="changed"))
+                out.append(self._make_stretch(name, group))
+            elif self._members[name] != _cells_of(group):
+                out.append(replace(self._make_stretch(name, group), state="changed"))
         for name in [name for name in self._known if name not in found]:
             ended = self._known.pop(name)
             last = self._last
@@ -138,11 +138,11 @@ class Stretches:
             if last is not None:
                 out.append(replace(ended, state="cleared", time=last.time, reason=last.reason))
         for name, group in found.items():
-            self._known[name] = self._stretch(name, group)
-            self._members[name] = _cells(group)
+            self._known[name] = self._make_stretch(name, group)
+            self._members[name] = _cells_of(group)
         return out
 
-    def _groups(self) -> dict[str, list[Alert]]:
+    def _group_by_stretch(self) -> dict[str, list[Alert]]:
         """Return the standing alerts by stretch."""
         alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
         label = link_cells(np.array([one.cell for one in alerts], np.int64))
@@ -151,7 +151,7 @@ class Stretches:
             parts[k].append(one)
         out: dict[str, list[Alert]] = {}
         for part in sorted(parts, key=len, reverse=True):
-            cells = _cells(part)
+            cells = _cells_of(part)
             names = [
                 name
                 for name, members in self._members.items()
@@ -160,7 +160,7 @@ class Stretches:
             name = (
                 min(names, key=lambda one: (self._known[one].since, one))
                 if names
-                else _new(part[0])
+                else _new_name(part[0])
             )
             while not names and (
                 name in out or name in self._known
@@ -169,12 +169,14 @@ class Stretches:
             out[name] = part
         return out
 
-    def _stretch(self, name: str, group: list[Alert]) -> StretchAlert:
+    def _make_stretch(self, name: str, group: list[Alert]) -> StretchAlert:
         worst = min(group, key=lambda one: one.mu)
         last = max(group, key=lambda one: one.time)
         known = self._known.get(name)
         headings = tuple(grid.HEADINGS[k] for k in sorted({one.sector for one in group}))
-        length, direction, middle, bbox = _shape(np.array([one.cell for one in group], np.int64))
+        length, direction, middle, bbox = _measure_shape(
+            np.array([one.cell for one in group], np.int64)
+        )
         return StretchAlert(
             id=name,
             state="raised",
@@ -186,14 +188,14 @@ class Stretches:
             latitude=middle[0],
             longitude=middle[1],
             bbox=bbox,
-            cells=len(_cells(group)),
+            cells=len(_cells_of(group)),
             mu=worst.mu,
             mu_lower=worst.mu_lower,
             mu_upper=worst.mu_upper,
             p_slippery=worst.p_slippery,
             vehicles=max(one.vehicles for one in group),
             reason=last.reason,
-            points=_points(np.array(sorted(_cells(group)), np.int64)),
+            points=_centre_line(np.array(sorted(_cells_of(group)), np.int64)),
         )
 
 
@@ -211,15 +213,15 @@ def link_cells(cell: IntArray) -> IntArray:
     return np.asarray(connected_components(near, directed=False)[1], np.int64)
 
 
-def _cells(group: list[Alert]) -> set[int]:
+def _cells_of(group: list[Alert]) -> set[int]:
     return {one.cell for one in group}
 
 
-def _new(first: Alert) -> str:
+def _new_name(first: Alert) -> str:
     return f"{grid.quadkey(first.cell, grid.CELL_ZOOM)}-{first.time // NS:x}"
 
 
-def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
+def _centre_line(cell: IntArray) -> tuple[tuple[float, float], ...]:
     """Return the centres [deg] of distinct cells along the longest path from neighbour to
     neighbour.
     """
@@ -239,7 +241,7 @@ def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
     return tuple(zip(latitude.tolist(), longitude.tolist(), strict=True))
 
 
-def _shape(
+def _measure_shape(
     cell: IntArray,
 ) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
     """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of

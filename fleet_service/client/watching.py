@@ -36,7 +36,7 @@ class WatchOptions(NamedTuple):
     as_json: bool = False
 
 
-def watch(
+def watch_map(
     connection: ZenohSettings,
     wishes: WatchOptions,
     stop: threading.Event,
@@ -55,35 +55,37 @@ def watch(
     lock = threading.Lock()
     away = set[str]()
 
-    def near(key: str) -> int | None:
+    def tile_if_near(key: str) -> int | None:
         tile = keys.parse(key).quadint
         if tile is None or box is None:
             return tile
         return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None
 
-    def changed(sample: zenoh.Sample) -> None:
-        tile = near(str(sample.key_expr))
+    def print_tile(sample: zenoh.Sample) -> None:
+        tile = tile_if_near(str(sample.key_expr))
         if tile is not None:
             say(_tile_line(tile, decode_tile(sample.payload.to_bytes()), wishes.as_json))
 
-    def take(alert: wire.Alert) -> None:
+    def apply_alert(alert: wire.Alert) -> None:
         with lock:
-            stretches.take(alert)
+            stretches.apply_alert(alert)
 
-    def alerted(sample: zenoh.Sample) -> None:
-        if near(str(sample.key_expr)) is not None:
-            take(wire.decode_alert(sample.payload.to_bytes()))
+    def apply_sample(sample: zenoh.Sample) -> None:
+        if tile_if_near(str(sample.key_expr)) is not None:
+            apply_alert(wire.decode_alert(sample.payload.to_bytes()))
 
-    def tell() -> None:
+    def print_changes() -> None:
         with lock:
-            found = stretches.changes()
+            found = stretches.take_changes()
         for alert in found:
             say(
-                json.dumps({"event": "alert", **alert.values()}) if wishes.as_json else alert.line()
+                json.dumps({"event": "alert", **alert.to_json_values()})
+                if wishes.as_json
+                else alert.to_line()
             )
             hear(alert)
 
-    def tell_services() -> None:
+    def print_services() -> None:
         nonlocal away
         here = {token.region for token in services.active}
         left = {token.region for token in services.lost} - here
@@ -97,17 +99,17 @@ def watch(
         return
     with session, tokens.track_tokens(session) as services:
         if not wishes.only_alerts:
-            session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
-        session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
+            session.declare_subscriber(f"{keys.ROOT}/map/**", print_tile)
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", apply_sample)
         for alert in standing_alerts(session):  # after the subscription: none is missed in between
-            if near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
-                take(alert)
+            if tile_if_near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
+                apply_alert(alert)
         say(json.dumps({"event": "watching"}) if wishes.as_json else "watching")
-        tell_services()
+        print_services()
         while not stop.wait(GATHER_S):
-            tell()
-            tell_services()
-        tell()
+            print_changes()
+            print_services()
+        print_changes()
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from fleet_service.client.alert_queue import AlertQueue
-from fleet_service.client.stretches import StretchAlert, iso
+from fleet_service.client.stretches import StretchAlert, format_time
 from schemas.errors import InputError
 from schemas.runtime.metrics import Metric, gauge
 from schemas.thresholds import SLIPPERY_MU
@@ -39,7 +39,7 @@ LOSSES: Final = ("dropped", "refused", "unstored")
 _OPEN: Final = "0001-01-01T00:00:00Z"  # Alertmanager's end of what has not ended
 
 
-def body(alert: StretchAlert) -> dict[str, Any]:
+def alert_message(alert: StretchAlert) -> dict[str, Any]:
     """Return one alert as a webhook message."""
     status = "resolved" if alert.state == "cleared" else "firing"
     labels = {
@@ -51,15 +51,15 @@ def body(alert: StretchAlert) -> dict[str, Any]:
     }
     notes = {
         "summary": f"slippery road: {alert.length_m:.0f} m {alert.direction}, mu {alert.mu:.2f}",
-        "description": alert.line(),
+        "description": alert.to_line(),
         "place": f"{alert.latitude:.6f},{alert.longitude:.6f}",
     }
     one = {
         "status": status,
         "labels": labels,
         "annotations": notes,
-        "startsAt": iso(alert.since),
-        "endsAt": iso(alert.time) if status == "resolved" else _OPEN,
+        "startsAt": format_time(alert.since),
+        "endsAt": format_time(alert.time) if status == "resolved" else _OPEN,
         "generatorURL": f"geo:{alert.latitude:.6f},{alert.longitude:.6f}",
         "fingerprint": alert.id,
     }
@@ -113,23 +113,25 @@ class Webhook:
         self._more = threading.Event()
         self._stop = threading.Event()
         self._more.set()
-        self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
+        self._thread = threading.Thread(target=self._send_until_closed, name="webhook", daemon=True)
         self._thread.start()
 
     @property
-    def lost(self) -> int:
+    def lost_count(self) -> int:
         """Number of alerts that will never be delivered."""
         return sum(self.counts[name] for name in LOSSES)
 
     @property
-    def waiting(self) -> int:
+    def waiting_count(self) -> int:
         """Number of alerts in the queue; after `close`, of those that stayed in it."""
         return self._undelivered if self._is_closed else len(self._queue)
 
     def troubles(self) -> list[str]:
         """Return one message per problem; empty if every alert is delivered or under way."""
-        out = [f"webhook: {self._failure}; {self.waiting} alerts wait"] if self._failure else []
-        return [*out, f"webhook: {self.lost} alerts were lost"] if self.lost else out
+        out = (
+            [f"webhook: {self._failure}; {self.waiting_count} alerts wait"] if self._failure else []
+        )
+        return [*out, f"webhook: {self.lost_count} alerts were lost"] if self.lost_count else out
 
     def metrics(self) -> list[Metric]:
         """Return counters of alerts and the length of the queue."""
@@ -142,18 +144,18 @@ class Webhook:
                 "Failed deliveries",
                 {"": float(self.counts["failures"])},
             ),
-            gauge("webhook_waiting", "Alerts in the queue", float(self.waiting)),
+            gauge("webhook_waiting", "Alerts in the queue", float(self.waiting_count)),
         ]
 
     def send(self, alert: StretchAlert) -> None:
         """Queue an alert."""
         try:
-            dropped = self._queue.append(json.dumps(body(alert)))
+            dropped = self._queue.append(json.dumps(alert_message(alert)))
         except sqlite3.Error as error:
-            self._lose("unstored", 1, f"the queue cannot be written ({error})")
+            self._count_loss("unstored", 1, f"the queue cannot be written ({error})")
             return
         if dropped:
-            self._lose("dropped", dropped, "the queue is full")
+            self._count_loss("dropped", dropped, "the queue is full")
         self._more.set()
 
     def close(self) -> None:
@@ -165,16 +167,16 @@ class Webhook:
         self._is_closed = True
         if self._undelivered:
             self._say(f"webhook: {self._undelivered} alerts wait in the queue for the next watch")
-        if self.lost:
-            self._say(f"webhook: {self.lost} alerts were lost")
+        if self.lost_count:
+            self._say(f"webhook: {self.lost_count} alerts were lost")
         if not self._thread.is_alive():
             self._queue.close()
 
-    def _lose(self, kind: str, number: int, reason: str) -> None:
+    def _count_loss(self, kind: str, number: int, reason: str) -> None:
         self.counts[kind] += number
         self._say(f"webhook: {number} alerts lost, {reason}")
 
-    def _run(self) -> None:
+    def _send_until_closed(self) -> None:
         import httpx
 
         with asyncio.Runner() as runner:
@@ -200,14 +202,14 @@ class Webhook:
         reason of failure.
         """
         try:
-            first = self._queue.first()
+            first = self._queue.read_first()
             if first is None:
                 return None
             number, text = first
-            status = runner.run(self._post(client, text))
+            status = runner.run(self._post_message(client, text))
             failure = _failure_of(status)
             if failure is None:
-                self._settle(number, status)
+                self._record_answer(number, status)
                 return ""
         except Exception as error:  # noqa: BLE001 any answer may come, and the thread must outlive it
             failure = f"{type(error).__name__} {error}".strip()
@@ -217,18 +219,18 @@ class Webhook:
         self._failure = failure
         return failure
 
-    def _settle(self, number: int, status: int) -> None:
+    def _record_answer(self, number: int, status: int) -> None:
         is_delivered = 200 <= status < 300
         self._queue.remove(number)
         if is_delivered:
             self.counts["delivered"] += 1
         else:
-            self._lose("refused", 1, f"{self._name} answered {status}")
+            self._count_loss("refused", 1, f"{self._name} answered {status}")
         if self._failure:
             self._say("webhook: the receiver answers again")
             self._failure = ""
 
-    async def _post(self, client: httpx.AsyncClient, text: str) -> int:
+    async def _post_message(self, client: httpx.AsyncClient, text: str) -> int:
         """Return the status of the answer; its body is not read."""
         async with asyncio.timeout(self._timeout_s):
             headers = {"Content-Type": "application/json"}

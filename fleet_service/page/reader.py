@@ -147,7 +147,7 @@ class Reader:
         session = self._session
         if session is None:
             raise InputError("connect", "no router answers", "see that one runs")
-        for key, payload in map_client.replies(session, selector, parameters):
+        for key, payload in map_client.query_replies(session, selector, parameters):
             tile = keys.parse(key).quadint
             if tile is not None:
                 yield tile, decode_tile(payload)
@@ -241,7 +241,7 @@ class Reader:
             return False
         self._tried = time.monotonic()
         with contextlib.suppress(InputError):
-            return any(True for _ in map_client.replies(session, map_client.EVERYWHERE, {}))
+            return any(True for _ in map_client.query_replies(session, map_client.EVERYWHERE, {}))
         return False
 
 

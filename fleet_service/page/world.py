@@ -68,7 +68,7 @@ class MapMirror:
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
-            self._stretches.take(alert)
+            self._stretches.apply_alert(alert)
 
     def take_standing(
         self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
@@ -77,7 +77,7 @@ class MapMirror:
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
-            self._stretches.take_all(standing, lambda alert: served(alert.cell))
+            self._stretches.replace_alerts(standing, lambda alert: served(alert.cell))
 
     def remember(self, now: float) -> None:
         """Keep the map of this moment for the slider."""
@@ -115,21 +115,22 @@ class MapMirror:
     def alerts_changed(self) -> bool:
         """Return True if stretches changed since the last call."""
         with self._lock:
-            found = bool(self._stretches.changes()) or self._alerts_changed
+            found = bool(self._stretches.take_changes()) or self._alerts_changed
             self._alerts_changed = False
             return found
 
     def stretches(self) -> list[StretchAlert]:
         """Return the standing stretches with everything received until now."""
         with self._lock:
-            self._alerts_changed |= bool(self._stretches.changes())
+            self._alerts_changed |= bool(self._stretches.take_changes())
             return self._stretches.standing
 
     def standing(self) -> list[dict[str, Any]]:
         """Return the standing stretches, newest first."""
         with self._lock:
             return [
-                one.values() for one in sorted(self._stretches.standing, key=lambda one: -one.since)
+                one.to_json_values()
+                for one in sorted(self._stretches.standing, key=lambda one: -one.since)
             ]
 
     def tiles(self) -> list[int]:

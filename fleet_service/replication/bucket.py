@@ -87,7 +87,7 @@ class ObjectBucket:
         except (BaseError, ValueError, TypeError) as error:
             fix = "see `store` in the settings; credentials may come from the environment"
             raise InputError(
-                "archive.store", f"is not as {url} wants it ({reason(error)})", fix
+                "archive.store", f"is not as {url} wants it ({error_summary(error)})", fix
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
@@ -97,7 +97,7 @@ class ObjectBucket:
             CopyError: it is unknown whether the put succeeded.
             FileNotFoundError: the file to upload does not exist any more.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
@@ -107,7 +107,7 @@ class ObjectBucket:
         Raises:
             CopyError: as for `put`, or the object has other content.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             try:
                 self._do.put(self._store, name, content, mode="create")
             except self._known:
@@ -116,26 +116,26 @@ class ObjectBucket:
                         f"{name}: another service has put an object of this name"
                     ) from None
 
-    def make(self, name: str, content: bytes) -> bool:
+    def create(self, name: str, content: bytes) -> bool:
         """Create an object; return True if the existing object is this one.
 
         Raises:
             CopyError: as for `put`.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             try:
                 self._do.put(self._store, name, content, mode="create")
             except self._known:
                 return self.get(name) == content  # a put that timed out had landed
         return True
 
-    def names(self, folder: str) -> list[str]:
+    def list_names(self, folder: str) -> list[str]:
         """Return the names of the objects in a folder and its subfolders.
 
         Raises:
             CopyError: they cannot be listed.
         """
-        with self._telling(f"the list of {folder}"):
+        with self._as_copy_errors(f"the list of {folder}"):
             return [
                 meta["path"] for page in self._do.list(self._store, prefix=folder) for meta in page
             ]
@@ -146,29 +146,29 @@ class ObjectBucket:
         Raises:
             CopyError: it cannot be read.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             try:
                 return bytes(self._do.get(self._store, name).bytes())
             except self._missing:
                 return None
 
-    def parts(self, name: str) -> Iterator[bytes]:
+    def read_parts(self, name: str) -> Iterator[bytes]:
         """Yield the content of an object in pieces.
 
         Raises:
             CopyError: as for `get`, or it does not exist.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             for part in self._do.get(self._store, name).stream():
                 yield bytes(part)
 
-    def sizes(self) -> dict[str, int]:
+    def list_sizes(self) -> dict[str, int]:
         """Return names and sizes [bytes] of all objects.
 
         Raises:
             CopyError: they cannot be listed.
         """
-        with self._telling("the list of objects"):
+        with self._as_copy_errors("the list of objects"):
             return {
                 meta["path"]: meta["size"] for page in self._do.list(self._store) for meta in page
             }
@@ -179,14 +179,14 @@ class ObjectBucket:
         Raises:
             CopyError: it may still exist.
         """
-        with self._telling(name):
+        with self._as_copy_errors(name):
             try:
                 self._do.delete(self._store, name)
             except self._missing:
                 return
 
     @contextmanager
-    def _telling(self, name: str) -> Iterator[None]:
+    def _as_copy_errors(self, name: str) -> Iterator[None]:
         try:
             yield
         except CopyError:
@@ -194,12 +194,12 @@ class ObjectBucket:
         except FileNotFoundError as error:
             if error.filename is not None:
                 raise  # the file to be put
-            raise CopyError(f"{name}: {reason(error)}") from None
+            raise CopyError(f"{name}: {error_summary(error)}") from None
         except self._failed as error:
-            raise CopyError(f"{name}: {reason(error)}") from None
+            raise CopyError(f"{name}: {error_summary(error)}") from None
 
 
-def reason(error: BaseException) -> str:
+def error_summary(error: BaseException) -> str:
     """Return the first words of an error, without headers, response body and duration, so that the
     same problem gives the same line."""
     line = (str(error).splitlines() or [type(error).__name__])[0]

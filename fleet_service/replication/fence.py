@@ -37,7 +37,7 @@ class Fence(NamedTuple):
     epoch: int
     names: frozenset[str]
 
-    def passes(self, name: str) -> bool:
+    def counts_object(self, name: str) -> bool:
         """Return True if an object counts."""
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names
@@ -60,7 +60,7 @@ def fence_of(bucket: ObjectBucket) -> Fence:
     Raises:
         CopyError: it cannot be read.
     """
-    names = bucket.names(FOLDER)
+    names = bucket.list_names(FOLDER)
     content = bucket.get(max(names)) if names else None
     if content is None:
         return Fence(0, frozenset())

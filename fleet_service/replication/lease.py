@@ -121,7 +121,7 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """Lease of one archive's copy; `wait` for it, `keep` it, `release` it.
+    """Lease of one archive's copy; `wait` for it, `start_renewal` it, `release` it.
 
     Args:
         holder: identity of this folder, see `holder_of`; this process has it locked, so no other
@@ -159,7 +159,7 @@ class Lease:
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 
     @property
-    def former(self) -> tuple[str, ...]:
+    def former_holders(self) -> tuple[str, ...]:
         """Return the names of the services that held it earlier."""
         return () if self._mine is None else self._mine.before
 
@@ -175,7 +175,7 @@ class Lease:
         )
 
     @property
-    def fresh(self) -> bool:
+    def may_acknowledge(self) -> bool:
         """Return True if the content of the bucket may be acknowledged now."""
         return self.left_s > 0.0
 
@@ -220,7 +220,7 @@ class Lease:
             if standby is not None:
                 standby.alive()
             try:
-                found = self._newest()
+                found = self._read_newest()
                 if found is not None and found != seen:
                     if standby is None and seen is not None and found.number == seen.number:
                         problem = (
@@ -242,7 +242,7 @@ class Lease:
                 if not free and found is not None:
                     _check_settings(found, self._lease_s)
                 if free or time.monotonic() - since >= stale_s:
-                    if (standby is None or standby.may()) and self._take(found, epoch, stop):
+                    if (standby is None or standby.may()) and self._create_next(found, epoch, stop):
                         return True
                 elif standby is not None and found is not None:
                     line = f"standby: {found.service} is served under lease {found.number}"
@@ -259,10 +259,10 @@ class Lease:
             stop.wait(LOOK_S)
         return False
 
-    def keep(self) -> None:
+    def start_renewal(self) -> None:
         """Renew it from now on in a thread while `serves` is true; otherwise it expires, and
         another service takes it."""
-        self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
+        self._thread = threading.Thread(target=self._renew_until_stopped, name="lease", daemon=True)
         self._thread.start()
 
     def release(self, to: str = "") -> None:
@@ -282,7 +282,7 @@ class Lease:
             except CopyError as error:
                 log.warning("the lease runs out by itself: %s", error)
 
-    def retry(self) -> Lease:
+    def make_new_lease(self) -> Lease:
         """Return a new lease to wait for, after this one was lost."""
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
@@ -300,7 +300,7 @@ class Lease:
         self.assert_not_superseded()
         self._renewed = began
 
-    def _keep(self) -> None:
+    def _renew_until_stopped(self) -> None:
         while not self._stop.wait(self._lease_s / TURNS):
             try:
                 if self.serves():
@@ -314,20 +314,20 @@ class Lease:
         """Return True if an earlier start of this folder held the lease."""
         return found.holder == self._holder
 
-    def _newest(self) -> LeaseRecord | None:
-        names = [name for name in self._bucket.names(FOLDER) if name.endswith(".json")]
+    def _read_newest(self) -> LeaseRecord | None:
+        names = [name for name in self._bucket.list_names(FOLDER) if name.endswith(".json")]
         content = self._bucket.get(max(names)) if names else None
         if content is None:
             return None
-        found = _read(max(names), content)
+        found = _parse_record(max(names), content)
         if found is not None:
             return found
         former = sorted(names)[-2] if len(names) > 1 else ""
         previous = self._bucket.get(former) if former else None
-        last = None if previous is None else _read(former, previous)
+        last = None if previous is None else _parse_record(former, previous)
         return _unknown_holder(max(names), content, last)
 
-    def _take(
+    def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
         """Create the next number; False if another service was faster."""
@@ -345,7 +345,7 @@ class Lease:
             lease_s=self._lease_s,
         )
         began = elapsed_seconds()
-        if not self._bucket.make(mine.name, mine.content):
+        if not self._bucket.create(mine.name, mine.content):
             return False
         self._mine = mine
         self._renewed = began
@@ -407,7 +407,7 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
         )
 
 
-def _read(name: str, content: bytes) -> LeaseRecord | None:
+def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
     """Return the record of an object; None if it is damaged. Unknown fields are ignored."""
     try:
         record: dict[str, Any] = json.loads(content)

@@ -45,14 +45,14 @@ class Ownership:
         self.leaves = False
 
     @property
-    def epoch(self) -> int:
+    def smallest_epoch(self) -> int:
         """Return the smallest epoch that new segment names may use."""
         return 0 if self.lease is None else self.lease.term.epoch
 
     @property
     def may_acknowledge(self) -> bool:
         """Return True if the next service will know everything that is durable now."""
-        return self.lease is None or self.lease.fresh
+        return self.lease is None or self.lease.may_acknowledge
 
     @property
     def left_s(self) -> float:
@@ -62,14 +62,14 @@ class Ownership:
         return math.inf if self.lease is None else self.lease.left_s
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Return True if another service has taken over."""
         return self.lease is not None and self.lease.lost
 
     @property
-    def former(self) -> tuple[str, ...]:
+    def all_holders(self) -> tuple[str, ...]:
         """Return the names of this and earlier holders; empty without a lease."""
-        return () if self.lease is None else (*self.lease.former, self.lease.service)
+        return () if self.lease is None else (*self.lease.former_holders, self.lease.service)
 
     def mark_lost(self) -> None:
         """Record that another service has taken over, as its tokens show."""
@@ -110,7 +110,7 @@ Signs = tuple[
 ]  # as of `serving.standby_signs`
 
 
-def acquire(
+def acquire_archive(
     config: ServiceConfig,
     root: Path,
     stop: threading.Event,
@@ -143,7 +143,7 @@ def acquire(
         return open_exclusive(config, root)
     lock_file = lock_archive(root)
     try:
-        holding = _leased(config, root, stop, say, signs, lock_file)
+        holding = _acquire_under_lease(config, root, stop, say, signs, lock_file)
     except BaseException:
         lock_file.close()
         raise
@@ -152,7 +152,7 @@ def acquire(
     return holding
 
 
-def _leased(
+def _acquire_under_lease(
     config: ServiceConfig,
     root: Path,
     stop: threading.Event,
@@ -170,41 +170,41 @@ def _leased(
     mirrors = empty or known
     standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
     try:
-        while lease.wait(stop, say, copy.epoch, standby):
-            lease.keep()
+        while lease.wait(stop, say, copy.largest_epoch, standby):
+            lease.start_renewal()
             if lease.succeeds and not mirrors:
                 raise InputError(
                     "archive.path",
                     f"{root} is no archive of {url}",
                     "give the service an empty folder",
                 )
-            copy.attach_lease(partial(_fresh, lease), lease.assert_not_superseded)
+            copy.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
             if _sync_folder(config, root, copy, lease, stop, say):
                 layout.write_epoch(root, lease.term.epoch)
                 return Ownership(lock_file, copy, lease)
             lease.release()
             if not lease.lost:
                 break
-            lease = lease.retry()
+            lease = lease.make_new_lease()
     except CopyError as error:
-        _leave(lease, copy)
+        _release_and_close(lease, copy)
         fix = (
             "see that it is reached, and endpoint, region and credentials; start again, nothing "
             "is lost"
         )
         raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
     except BaseException:
-        _leave(lease, copy)
+        _release_and_close(lease, copy)
         raise
-    _leave(lease, copy)
+    _release_and_close(lease, copy)
     return None
 
 
-def _fresh(lease: Lease) -> bool:
-    return lease.fresh
+def _may_acknowledge(lease: Lease) -> bool:
+    return lease.may_acknowledge
 
 
-def _leave(lease: Lease, copy: BucketReplica) -> None:
+def _release_and_close(lease: Lease, copy: BucketReplica) -> None:
     lease.release()
     copy.close()
 
@@ -223,7 +223,7 @@ def _sync_folder(
     while not stop.is_set():
         try:
             with _wait_for_compaction(root) if lease.succeeds else nullcontext():
-                copy.join(
+                copy.sync_under_lease(
                     None if config.standby else config.name, lease.term, succeeds=lease.succeeds
                 )
         except (CopyError, _BusyError) as error:

@@ -2,7 +2,7 @@
 
 Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it
 (`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any
-instant the copy holds every row at least once, like the folder. A start (`begin`) downloads what
+instant the copy holds every row at least once, like the folder. A start (`sync_without_lease`) downloads what
 only the bucket has (everything onto an empty disk), and uploads what only the folder has. Only
 objects recorded in the journal are deleted.
 """
@@ -123,7 +123,7 @@ class BucketReplica:
         waits = f"nothing is acknowledged for {self.away_s:.0f} s"
         return f"the copy at {self._url} does not take segments, {waits}: {self._error}"
 
-    def begin(self, service: str) -> int:
+    def sync_without_lease(self, service: str) -> int:
         """Synchronise folder and bucket in both directions; return the number of downloaded files.
         Nothing else may use the archive.
 
@@ -132,7 +132,7 @@ class BucketReplica:
             OSError: the folder cannot be read or written.
         """
         try:
-            return self.join(service)
+            return self.sync_under_lease(service)
         except CopyError as error:
             fix = (
                 "see that it is reached, and endpoint, region and credentials; start again, "
@@ -142,8 +142,10 @@ class BucketReplica:
                 "archive.copy", f"{self._url} cannot be used ({error})", fix
             ) from error
 
-    def join(self, service: str | None, term: Term | None = None, *, succeeds: bool = False) -> int:
-        """Synchronise like `begin`, under a lease's `term`: later uploads of a former holder do not
+    def sync_under_lease(
+        self, service: str | None, term: Term | None = None, *, succeeds: bool = False
+    ) -> int:
+        """Synchronise like `sync_without_lease`, under a lease's `term`: later uploads of a former holder do not
         count.
 
         Args:
@@ -158,43 +160,47 @@ class BucketReplica:
             OSError: the folder cannot be read or written.
         """
         if service is not None:
-            self._claim(service)
-        got = self._mirror() if succeeds else self._fetch(self._counting(self._slow.sizes()))
-        self._follow(with_log=True)
+            self._claim_bucket(service)
+        got = (
+            self._mirror_bucket()
+            if succeeds
+            else self._download_missing(self._select_counted(self._slow.list_sizes()))
+        )
+        self._upload_changes(with_log=True)
         if term is not None:
             self._raise_fence(term)
         return got
 
-    def epoch(self) -> int:
+    def largest_epoch(self) -> int:
         """Return the largest epoch in a name of the folder or the bucket, or 0.
 
         Raises:
             CopyError: the bucket cannot be listed.
         """
-        return max(largest_epoch(self._slow.sizes()), largest_epoch(self._files(FOLDERS)))
+        return max(largest_epoch(self._slow.list_sizes()), largest_epoch(self._list_files(FOLDERS)))
 
     def prefetch(self) -> None:
-        """Download for a standby, in advance, the files that a later `join` needs, while another
+        """Download for a standby, in advance, the files that a later `sync_under_lease` needs, while another
         service owns the bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete; compaction may remove files meanwhile.
         """
-        self._fetch(self._counting(self._slow.sizes()))
+        self._download_missing(self._select_counted(self._slow.list_sizes()))
 
     def _raise_fence(self, term: Term) -> None:
         """Write a fence for this term: later objects count only if they have its epoch. Remove
         objects that do not count."""
         names = [
             name
-            for name in self._files(FOLDERS)
+            for name in self._list_files(FOLDERS)
             if (layout.term_of(name) or term.epoch) < term.epoch
         ]
         fence = Fence(term.epoch, frozenset(names))
         self._put_fence(term, fence)
-        self._insist()
-        for name in self._slow.sizes():
-            if not fence.passes(name):  # nobody will ever make one of this name again
+        self._require_lease()
+        for name in self._slow.list_sizes():
+            if not fence.counts_object(name):  # nobody will ever make one of this name again
                 self._slow.delete(name)
 
     def _put_fence(self, term: Term, fence: Fence) -> None:
@@ -203,21 +209,21 @@ class BucketReplica:
         self._term = term
         self._fence = fence
 
-    def _mirror(self) -> int:
+    def _mirror_bucket(self) -> int:
         """Make the folder identical to the bucket; return the number of downloaded files."""
-        there = self._counting(self._slow.sizes())
-        for name, stamp in self._files(FOLDERS).items():
+        there = self._select_counted(self._slow.list_sizes())
+        for name, stamp in self._list_files(FOLDERS).items():
             if there.get(name) != stamp.size:
                 (self._root / name).unlink()
-        for name in self._copied.stamps():
+        for name in self._copied.copy_stamps():
             if not (self._root / name).exists():
                 self._copied.remove(name)
-        return self._fetch(there)
+        return self._download_missing(there)
 
-    def _counting(self, there: Mapping[str, int]) -> dict[str, int]:
+    def _select_counted(self, there: Mapping[str, int]) -> dict[str, int]:
         """Return names and sizes of the objects that count."""
         fence = fence_of(self._slow)
-        return {name: size for name, size in there.items() if fence.passes(name)}
+        return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def upload_segments(self, segments: Iterable[Path]) -> None:
         """Upload written segments and the keys; all are in the bucket when this returns.
@@ -229,14 +235,18 @@ class BucketReplica:
         if time.monotonic() < self._not_before:
             raise CopyError(f"is tried again: {self._error}")
         try:
-            missing = [path for path in segments if self._copied.stamp(self._name(path)) is None]
-            own = self._files(("keys",))
+            missing = [
+                path
+                for path in segments
+                if self._copied.find_stamp(self._object_name(path)) is None
+            ]
+            own = self._list_files(("keys",))
             keys = [
                 self._root / name
                 for name, stamp in own.items()
-                if self._copied.stamp(name) != stamp
+                if self._copied.find_stamp(name) != stamp
             ]
-            self._put_soon([*keys, *missing])
+            self._upload_in_time([*keys, *missing])
         except CopyError as error:
             self.failures += 1
             self._error = str(error)
@@ -259,9 +269,9 @@ class BucketReplica:
             CopyError: the work is incomplete; the next call continues.
             OSError: the journal cannot be written.
         """
-        return self._follow(with_log=False)
+        return self._upload_changes(with_log=False)
 
-    def _put_soon(self, paths: Sequence[Path]) -> None:
+    def _upload_in_time(self, paths: Sequence[Path]) -> None:
         deadline = time.monotonic() + TURN_S
         for first in range(0, len(paths), _AT_ONCE):
             if time.monotonic() > deadline:
@@ -269,38 +279,38 @@ class BucketReplica:
             some = paths[first : first + _AT_ONCE]
             try:
                 if len(some) == 1:
-                    self._put(some[0], self._quick)
+                    self._upload_file(some[0], self._quick)
                 else:
-                    list(self._pool.map(lambda path: self._put(path, self._quick), some))
+                    list(self._pool.map(lambda path: self._upload_file(path, self._quick), some))
             except FileNotFoundError:  # compacted meanwhile: the rows are in files that follow
-                self._follow(with_log=True)
+                self._upload_changes(with_log=True)
                 return
 
-    def _follow(self, *, with_log: bool) -> int:
+    def _upload_changes(self, *, with_log: bool) -> int:
         if not self._may():
             raise CopyError("the lease is not held for sure")
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being put")
         try:
             known = (
-                self._copied.stamps()
+                self._copied.copy_stamps()
             )  # before the files: what comes meanwhile is not taken for gone
-            local = self._files(FOLDERS)
+            local = self._list_files(FOLDERS)
             new = [
                 name
                 for name, stamp in local.items()
                 if known.get(name) != stamp and (with_log or not name.startswith(LOG))
             ]
             new.sort(key=lambda name: name.endswith(_LAST))
-            vanished = [name for name in new if not self._put_there(name)]
+            vanished = [name for name in new if not self._upload_if_present(name)]
             removed = [
                 name
                 for name in known
-                if not (vanished or name in local or self._aside(name).exists())
+                if not (vanished or name in local or self._set_aside_path(name).exists())
             ]
             removed.sort(key=lambda name: not name.endswith(_LAST))
             if strays := [
-                name for name in new if not self._fence.passes(name)
+                name for name in new if not self._fence.counts_object(name)
             ]:  # compacted by who began before
                 self._put_fence(
                     self._term, self._fence._replace(names=self._fence.names.union(strays))
@@ -308,7 +318,7 @@ class BucketReplica:
             if removed:
                 # then whoever comes next finds all that was put until now, and misses none of what
                 # goes
-                self._insist()
+                self._require_lease()
             for name in removed:
                 self._slow.delete(name)
                 self._copied.remove(name)
@@ -317,19 +327,21 @@ class BucketReplica:
         finally:
             self._following.release()
 
-    def _put_there(self, name: str) -> bool:
+    def _upload_if_present(self, name: str) -> bool:
         """Upload a file; False if it was removed meanwhile."""
         try:
-            self._put(self._root / name, self._slow)
+            self._upload_file(self._root / name, self._slow)
         except FileNotFoundError:
             return False
         return True
 
-    def _put(self, path: Path, bucket: ObjectBucket) -> None:
-        name = self._name(path)
+    def _upload_file(self, path: Path, bucket: ObjectBucket) -> None:
+        name = self._object_name(path)
         stamp = stamp_of(path)
-        if self._copied.stamp(name) is None and (name.startswith(LOG) or name.endswith(".key")):
-            self._put_new(name, path.read_bytes(), bucket)
+        if self._copied.find_stamp(name) is None and (
+            name.startswith(LOG) or name.endswith(".key")
+        ):
+            self._upload_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
             bucket.put(
                 name, path.read_bytes()
@@ -338,20 +350,20 @@ class BucketReplica:
             bucket.put(name, path)
         self._copied.add(name, stamp)
 
-    def _put_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
+    def _upload_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
         """Upload a file that must be new. A key that a former service uploaded after it lost its
         lease belongs to rows that do not count, and is replaced."""
-        if self._alone is None or name.startswith(LOG) or bucket.make(name, content):
+        if self._alone is None or name.startswith(LOG) or bucket.create(name, content):
             bucket.put_new(name, content)
         else:
             self._alone()
             bucket.put(name, content)
 
-    def _insist(self) -> None:
+    def _require_lease(self) -> None:
         if self._alone is not None:
             self._alone()
 
-    def _claim(self, service: str) -> None:
+    def _claim_bucket(self, service: str) -> None:
         mine = json.dumps({"service": service}).encode()
         there = self._slow.get(OWNER)
         if there is None:
@@ -366,62 +378,62 @@ class BucketReplica:
                 "archive.copy", problem, "give each service a folder of its own in the bucket"
             )
 
-    def _fetch(self, there: Mapping[str, int]) -> int:
+    def _download_missing(self, there: Mapping[str, int]) -> int:
         """Download what only the bucket has, and record which files of the folder it lacks."""
-        local = self._files(FOLDERS)
-        for name in self._copied.stamps():
+        local = self._list_files(FOLDERS)
+        for name in self._copied.copy_stamps():
             if name not in there or (name in local and local[name].size != there[name]):
                 self._copied.remove(name)
-        known = self._copied.stamps()
+        known = self._copied.copy_stamps()
         whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{_LAST}")}
         wanted = [
             name
             for name in there
             if name not in local
-            and _ours(name)
-            and (name not in known or self._aside(name).exists())
+            and _is_copied(name)
+            and (name not in known or self._set_aside_path(name).exists())
             and (not name.startswith(CHECKPOINTS) or name.rpartition("/")[0] in whole)
         ]
-        list(self._pool.map(self._get, wanted))
+        list(self._pool.map(self._download_file, wanted))
         paths = [self._root / name for name in wanted]
         sync_tree(self._root, {path.parent for path in paths})
         for name, path in zip(
             wanted, paths, strict=True
         ):  # only now: power loss would else make them look deleted
             self._copied.add(name, stamp_of(path))
-            self._aside(name).unlink(missing_ok=True)
+            self._set_aside_path(name).unlink(missing_ok=True)
         return len(wanted)
 
-    def _get(self, name: str) -> None:
+    def _download_file(self, name: str) -> None:
         path = self._root / name
         secret = name.startswith(KEYS)
         path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
         with open_durably(path, 0o600 if secret else None, named=False) as file:
-            for part in self._slow.parts(name):
+            for part in self._slow.read_parts(name):
                 file.write(part)
 
-    def _name(self, path: Path) -> str:
+    def _object_name(self, path: Path) -> str:
         return path.relative_to(self._root).as_posix()
 
-    def _aside(self, name: str) -> Path:
+    def _set_aside_path(self, name: str) -> Path:
         return self._root / f"{name}{BAD}"
 
-    def _files(self, folders: Iterable[str]) -> dict[str, Stamp]:
+    def _list_files(self, folders: Iterable[str]) -> dict[str, Stamp]:
         """Return names and stamps of the files that belong into the copy, in the order of the
         folders.
         """
         found: dict[str, Stamp] = {}
         for folder in folders:
             for path in sorted((self._root / folder).rglob("*")):
-                name = self._name(path)
-                if _ours(name):
+                name = self._object_name(path)
+                if _is_copied(name):
                     with suppress(FileNotFoundError):
                         if path.is_file():
                             found[name] = stamp_of(path)
         return found
 
 
-def _ours(name: str) -> bool:
+def _is_copied(name: str) -> bool:
     """Return True for the name of a file that belongs into the copy; drafts and files set aside
     do not.
     """
@@ -440,14 +452,14 @@ def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
     """Return the copy of the settings, synchronised with the folder; None without one.
 
     Raises:
-        InputError, OSError: as for `BucketReplica` and its `begin`.
+        InputError, OSError: as for `BucketReplica` and its `sync_without_lease`.
     """
     wanted = config.archive
     if wanted.second is None:
         return None
     copy = BucketReplica(root, wanted.second, wanted.options)
     try:
-        copy.begin(config.name)
+        copy.sync_without_lease(config.name)
     except BaseException:
         copy.close()
         raise

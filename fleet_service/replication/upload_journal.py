@@ -67,12 +67,12 @@ class UploadJournal:
             file.write("".join(f"{line}\n" for line in [head, *rest]).encode())
         self._file = path.open("ab", buffering=0)
 
-    def stamps(self) -> dict[str, Stamp]:
+    def copy_stamps(self) -> dict[str, Stamp]:
         """Return the names in the copy, each with its stamp at the upload; a snapshot."""
         with self._guard:
             return dict(self._stamps)
 
-    def stamp(self, name: str) -> Stamp | None:
+    def find_stamp(self, name: str) -> Stamp | None:
         """Return the stamp at a file's upload; None if it was not uploaded."""
         return self._stamps.get(name)
 

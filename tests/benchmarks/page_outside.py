@@ -21,7 +21,7 @@ import pyarrow as pa
 
 from deploy.router import open_router
 from fleet_service.client import map_client
-from fleet_service.client.datex import Supplier, publication
+from fleet_service.client.datex import Supplier, make_publication
 from fleet_service.client.datex_feed import DatexFile
 from fleet_service.client.stretches import Stretches
 from fleet_service.client.watching import standing_alerts
@@ -112,7 +112,7 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
             )
             latitude, longitude = (float(v) for v in grid.centre(cell))
             mu = float(rng.uniform(0.1, 0.3))
-            stretches.take(
+            stretches.apply_alert(
                 Alert(
                     cell,
                     sector,
@@ -128,8 +128,8 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
                     "made",
                 )
             )
-        stretches.changes()
-        before = publication(OURS, stretches.standing, now, before)
+        stretches.take_changes()
+        before = make_publication(OURS, stretches.standing, now, before)
         told = records(before)
         ended |= {f"{one.get('id')}" for one in told if is_over(one)}
         unended += abs(sum(not is_over(one) for one in told) - len(stretches.standing))
@@ -172,7 +172,7 @@ def driven() -> dict[str, float]:
                 seq = street.put(session, ("ice", "passed", "wet"), time.time_ns() - ICE_NS)
                 until(lambda: records(pulled(address)), PATIENCE_S)
                 until(lambda: count(address) == street.known("ice", "passed", "wet"), PATIENCE_S)
-                table = map_client.served_table(map_client.ask(settings, {}))
+                table = map_client.served_table(map_client.query_map(settings, {}))
                 leaked = len(cells_of(pulled(address)) - measured_cells(table))
                 failed = sum(not opens(reader, address) for reader in READERS)
                 failed += shutil.which("ogrinfo") is not None and not ogrinfo_opens(address)

@@ -23,7 +23,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from fleet_service.client.map_client import ask
+from fleet_service.client.map_client import query_map
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
 from schemas.runtime.zenoh_session import configuration
@@ -303,7 +303,9 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
             )
 
         def cells() -> int:
-            shown = ask(load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}).table
+            shown = query_map(
+                load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}
+            ).table
             return shown.num_rows if shown else 0
 
         def listening() -> bool:

@@ -22,7 +22,7 @@ FOLLOW_S: Final = 3.0
 
 _run = beside.run_module
 _follow = BucketReplica.sync
-_put_there = BucketReplica._put_there
+_put_there = BucketReplica._upload_if_present
 _copying = threading.local()
 
 
@@ -50,7 +50,7 @@ def follow(copy: BucketReplica) -> int:
 
 
 def put_there(copy: BucketReplica, name: str) -> bool:
-    """As `Copy._put_there`; the first one of a turn says that it begins."""
+    """As `BucketReplica._upload_if_present`; the first one of a turn says that it begins."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
         _say(BEGINS, COPYING)
@@ -58,6 +58,6 @@ def put_there(copy: BucketReplica, name: str) -> bool:
 
 
 if __name__ == "__main__":
-    beside.run_module, BucketReplica.sync, BucketReplica._put_there = run, follow, put_there  # type: ignore[method-assign,assignment]
+    beside.run_module, BucketReplica.sync, BucketReplica._upload_if_present = run, follow, put_there  # type: ignore[method-assign,assignment]
     jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]
     sys.exit(main())

@@ -152,7 +152,7 @@ class Asking:
     def _cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
         """Cells and sectors of the box, and whether something is said to be missing."""
         try:
-            answer = map_client.ask(self._router, {"bbox": self._box})
+            answer = map_client.query_map(self._router, {"bbox": self._box})
         except InputError:
             return frozenset(), True
         table = answer.table
@@ -161,7 +161,7 @@ class Asking:
             np.asarray(table[name].to_numpy(), np.int64).tolist() for name in ("cell", "sector")
         ]
         found = frozenset((cell, sector) for cell, sector in zip(*both, strict=True))
-        return found, answer.gap is not None or not answer.served
+        return found, answer.gap_description is not None or not answer.served
 
     def _ask(self) -> None:
         while not self._stop.wait(self.PAUSE_S):

@@ -54,7 +54,7 @@ def judge_without_comparison(seeds: Iterable[int]) -> Judged:
 def judge_without_expiry(seeds: Iterable[int]) -> Judged:
     """Judge histories in which a holder acknowledges until it notices its successor."""
     fresh = property(lambda lease: not lease.lost)
-    with patch.object(Lease, "fresh", fresh):
+    with patch.object(Lease, "may_acknowledge", fresh):
         return judge_seeds(seeds)
 
 

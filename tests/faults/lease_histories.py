@@ -207,7 +207,7 @@ class VirtualBucket:
         self._random = random_
         self._network = _Process("network", random_, 1.0)
 
-    def names(self, folder: str) -> list[str]:
+    def list_names(self, folder: str) -> list[str]:
         """Return the names in a folder."""
         return list(self._request(lambda: [n for n in self.objects if n.startswith(f"{folder}/")]))
 
@@ -219,7 +219,7 @@ class VirtualBucket:
         """Write an object."""
         self._request(lambda: self.objects.__setitem__(name, content))
 
-    def make(self, name: str, content: bytes) -> bool:
+    def create(self, name: str, content: bytes) -> bool:
         """Create an object; return False if it exists. A repeated request knows its own object."""
         return bool(self._request(lambda: self.objects.setdefault(name, content) == content))
 
@@ -321,7 +321,7 @@ class ServiceHistory:
         try:
             lease.wait(cast(threading.Event, stop), lambda _: None, lambda: 0, standby)
             lease._stop = cast(threading.Event, stop)
-            keeper = self._world.spawn(process, lease._keep)
+            keeper = self._world.spawn(process, lease._renew_until_stopped)
             known = self._join(lease)
         except InputError:
             self.refused += 1
@@ -343,7 +343,7 @@ class ServiceHistory:
         """List the bucket, put the fence, and begin to serve."""
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number
-        names = self._find_counted(self._bucket.names("batches"))
+        names = self._find_counted(self._bucket.list_names("batches"))
         lease.assert_not_superseded()
         self._fences[number] = frozenset(names)
         batches = _batches_of(names)
@@ -368,7 +368,7 @@ class ServiceHistory:
                 except CopyError:
                     if lease.lost:
                         return
-        if lease.fresh:
+        if lease.may_acknowledge:
             self._acknowledged.add(batch)
             self.events.append(Event("acknowledges", number, (batch,)))
 

@@ -162,12 +162,12 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
     for number in range(ALERTS):
         hook.send(stretch(number))
     end = time.monotonic() + (1.0 if kind in FOREVER else PATIENCE_S)
-    while time.monotonic() < end and len(receiver.heard) + hook.lost < ALERTS:
+    while time.monotonic() < end and len(receiver.heard) + hook.lost_count < ALERTS:
         time.sleep(0.02)
     hook.close()
     receiver.close()
     missing = ALERTS - len(receiver.heard)
-    admitted = hook.lost + hook.waiting if said else 0
+    admitted = hook.lost_count + hook.waiting_count if said else 0
     return len(receiver.heard), max(missing - admitted, 0)
 
 

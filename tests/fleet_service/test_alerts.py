@@ -23,7 +23,7 @@ import zenoh
 from fleet_service.cli import main
 from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import LINK_CELLS, Stretches
-from fleet_service.client.webhook import Webhook, body, check_url
+from fleet_service.client.webhook import Webhook, alert_message, check_url
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -63,8 +63,8 @@ def alert(
 
 def told(stretches: Stretches, *alerts: Alert) -> list[Any]:
     for one in alerts:
-        stretches.take(one)
-    return stretches.changes()
+        stretches.apply_alert(one)
+    return stretches.take_changes()
 
 
 def test_an_icy_road_in_both_directions_is_one_alert() -> None:
@@ -75,7 +75,7 @@ def test_an_icy_road_in_both_directions_is_one_alert() -> None:
     assert found.state == "raised"
     assert (
         "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since "
-        "2027-01-15T08:00:00Z" in found.line()
+        "2027-01-15T08:00:00Z" in found.to_line()
     )
     (north,) = told(Stretches(), *(alert(0, y) for y in range(10)))
     assert north.direction == "north-south"
@@ -169,13 +169,13 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
     until(lambda: bool(hook.troubles()))
     hook.close()
     assert said[-1] == "webhook: 1 alerts wait in the queue for the next watch"
-    assert (hook.waiting, hook.lost) == (1, 0)
+    assert (hook.waiting_count, hook.lost_count) == (1, 0)
     with receiver() as (url, heard):
         again = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
         until(lambda: again.counts["delivered"] == 1)
         again.close()
-    assert (len(heard), again.waiting, again.troubles()) == (1, 0, [])
-    assert set(body(told(Stretches(), alert(0))[0])) >= {
+    assert (len(heard), again.waiting_count, again.troubles()) == (1, 0, [])
+    assert set(alert_message(told(Stretches(), alert(0))[0])) >= {
         "receiver",
         "status",
         "alerts",

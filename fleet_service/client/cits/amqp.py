@@ -67,17 +67,17 @@ class _AmqpEvents(MessagingHandler):
         self._link.queue.extendleft(reversed(waiting))
 
     def on_sendable(self, _: Any) -> None:  # noqa: ANN401
-        self._send()
+        self._send_queued()
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
         """Send the messages that another thread queued."""
         self._link.is_waking = False
-        self._send()
+        self._send_queued()
 
     def on_leave(self, _: Any) -> None:  # noqa: ANN401
         self._container.stop()
 
-    def _send(self) -> None:
+    def _send_queued(self) -> None:
         sender = self._sender
         queue = self._link.queue
         while sender is not None and queue and sender.credit > 0:

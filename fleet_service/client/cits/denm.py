@@ -94,7 +94,7 @@ class Denm:
     heading: float | None = None
 
 
-def encode(denm: Denm) -> bytes:
+def encode_denm(denm: Denm) -> bytes:
     """Return the bytes of a DENM, written straight from the record.
 
     The layout is that of `denm.asn`. A general encoder takes three times as long, most of it for the
@@ -116,7 +116,7 @@ def encode(denm: Denm) -> bytes:
     return out.to_bytes()
 
 
-def decode(data: bytes) -> Denm:
+def decode_denm(data: bytes) -> Denm:
     """Return the DENM of bytes.
 
     Raises:
@@ -132,7 +132,7 @@ def decode(data: bytes) -> Denm:
         raise InputError(
             "payload", f"has message id {message['header']['messageID']}", "send a DENM"
         )
-    return _record(message)
+    return _read_message(message)
 
 
 def its_time(ns: int) -> int:
@@ -181,7 +181,7 @@ def _write_management(out: BitWriter, denm: Denm) -> None:
 
 
 def _write_situation(out: BitWriter, denm: Denm) -> None:
-    deltas = _deltas(denm.position, denm.history)[:POINTS]
+    deltas = _encode_deltas(denm.position, denm.history)[:POINTS]
     out.write(bool(deltas), 3)  # extension; linked cause, history
     out.write(denm.quality, 3)
     out.write(0, 1)  # extension of the cause
@@ -202,13 +202,13 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
     traces = denm.traces[:TRACES] or ((),)
     out.write(len(traces) - 1, 3)
     for trace in traces:
-        deltas = _deltas(denm.position, trace)[:TRACE_POINTS]
+        deltas = _encode_deltas(denm.position, trace)[:TRACE_POINTS]
         out.write(len(deltas), 6)
         for delta in deltas:
             out.write(delta, 1 + DELTA_BITS)  # without a time
 
 
-def _deltas(origin: Point, points: Iterable[Point]) -> list[int]:
+def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
     """Return the bits of the points within reach: north, east and unavailable height."""
     found = list[int]()
     height = 12_800 - LEAST["height"]
@@ -220,7 +220,7 @@ def _deltas(origin: Point, points: Iterable[Point]) -> list[int]:
     return found
 
 
-def _record(message: Mapping[str, Any]) -> Denm:
+def _read_message(message: Mapping[str, Any]) -> Denm:
     content = message["denm"]
     management = content["management"]
     situation = content.get("situation", {})
@@ -247,21 +247,22 @@ def _record(message: Mapping[str, Any]) -> Denm:
         cause=event["causeCode"],
         sub_cause=event["subCauseCode"],
         history=tuple(
-            _point(position, one["eventPosition"]) for one in situation.get("eventHistory", ())
+            _decode_delta(position, one["eventPosition"])
+            for one in situation.get("eventHistory", ())
         ),
         traces=tuple(
-            tuple(_point(position, one["pathPosition"]) for one in trace)
+            tuple(_decode_delta(position, one["pathPosition"]) for one in trace)
             for trace in location.get("traces", ())
         ),
         heading=None if heading == UNAVAILABLE["heading"] else heading / 10.0,
     )
 
 
-def _point(origin: Point, delta: Mapping[str, int]) -> Point:
+def _decode_delta(origin: Point, delta: Mapping[str, int]) -> Point:
     return origin[0] + delta["deltaLatitude"] / UNITS, origin[1] + delta["deltaLongitude"] / UNITS
 
 
-def approach(
+def approach_points(
     position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
 ) -> tuple[Point, ...]:
     """Return points of the way to an event along its heading [deg from north], nearest first."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from fleet_service.client.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach
+from fleet_service.client.cits.denm import ICE, UNKNOWN_SLIPPERY, Denm, Termination, approach_points
 from fleet_service.client.stretches import StretchAlert
 from schemas import grid
 from schemas.errors import InputError
@@ -71,7 +71,7 @@ class EventBook:
         self._events: dict[str, OpenEvent] = {}
         self._used: set[int] = set()  # numbers of the events in the book
         if content is not None:
-            self._read(content)
+            self._restore_content(content)
 
     @property
     def open_events(self) -> list[OpenEvent]:
@@ -105,44 +105,49 @@ class EventBook:
         ]:
             self._used.discard(self._events.pop(name).sequence)
         for alert in standing:
-            state = _state(alert)
+            state = _reported_state(alert)
             known = self._events.get(alert.id)
             if known is None or known.ended:
                 if known is not None:
                     self._used.discard(known.sequence)
                 known = OpenEvent(
-                    alert.id, self._number(), alert.since, 0, (), (alert.latitude, alert.longitude)
+                    alert.id,
+                    self._next_number(),
+                    alert.since,
+                    0,
+                    (),
+                    (alert.latitude, alert.longitude),
                 )
             if known.state != state or now - known.sent >= RENEW_NS:
                 self._events[alert.id] = OpenEvent(
                     known.name, known.sequence, known.detected, now, state, known.position
                 )
-                out.append(self._message(self._events[alert.id], alert, now))
+                out.append(self._event_message(self._events[alert.id], alert, now))
         present = {alert.id for alert in standing}
         for name, event in list(self._events.items()):
             if name not in present and not event.ended and is_heard(*event.position):
-                out.append(self._end(event, now))
+                out.append(self._end_event(event, now))
         return out
 
-    def _end(self, event: OpenEvent, now: int) -> Denm:
+    def _end_event(self, event: OpenEvent, now: int) -> Denm:
         self._events[event.name] = OpenEvent(
             event.name, event.sequence, event.detected, now, event.state, event.position, now
         )
-        return self._head(event, now, "isCancellation")
+        return self._common_fields(event, now, "isCancellation")
 
-    def _message(self, event: OpenEvent, alert: StretchAlert, now: int) -> Denm:
+    def _event_message(self, event: OpenEvent, alert: StretchAlert, now: int) -> Denm:
         one_way = len(alert.headings) == 1
         bearings = [90.0 - 90.0 * grid.HEADINGS.index(heading) for heading in alert.headings]
         return replace(
-            self._head(event, now, None),
+            self._common_fields(event, now, None),
             quality=min(7, 1 + alert.vehicles + int(alert.p_slippery > SURE)),
             sub_cause=ICE if alert.mu < ICE_MU else UNKNOWN_SLIPPERY,
             history=tuple(point for point in alert.points if point != event.position),
-            traces=tuple(approach(event.position, bearing) for bearing in bearings),
+            traces=tuple(approach_points(event.position, bearing) for bearing in bearings),
             heading=bearings[0] % 360.0 if one_way else None,
         )
 
-    def _head(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
+    def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
         """Return what all messages of an event have; an update and the end are detected now."""
         return Denm(
             self.station,
@@ -156,7 +161,7 @@ class EventBook:
             VALID_NS // NS,
         )
 
-    def _number(self) -> int:
+    def _next_number(self) -> int:
         for _ in range(SEQUENCES):
             number = self._next
             self._next = (self._next + 1) % SEQUENCES
@@ -169,7 +174,7 @@ class EventBook:
             "use a second station for a part",
         )
 
-    def _read(self, content: dict[str, Any]) -> None:
+    def _restore_content(self, content: dict[str, Any]) -> None:
         try:
             if content["station"] != self.station:
                 problem = f"the file is of station {content['station']}"
@@ -186,7 +191,7 @@ class EventBook:
             raise InputError("state", "the file of events is damaged", fix) from error
 
 
-def _state(alert: StretchAlert) -> tuple[float, ...]:
+def _reported_state(alert: StretchAlert) -> tuple[float, ...]:
     """Return the properties whose change is sent to receivers: extent, sub-cause, and witnesses."""
     return (
         float(alert.cells),

@@ -31,7 +31,9 @@ MOST_CELLS: Final = 24
 POSITION_STD: Final = 10.0  # [m] where a message does not say
 
 
-def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[tuple[str, bytes]]:
+def encode_reports(
+    denm: Denm, name: str, boot: int, first_seq: int, now: int
+) -> list[tuple[str, bytes]]:
     """Return key and JSON of a batch for each region of an event; none if it says nothing about
     grip here and now.
 
@@ -42,11 +44,11 @@ def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[
         first_seq: next number of the batches.
         now: [ns UTC].
     """
-    if not _counts(denm, now):
+    if not _is_grip_report(denm, now):
         return []
     mu, lower, upper = GRIP.get(denm.sub_cause, UNKNOWN)
     by_region: dict[int, list[tuple[float, float]]] = {}
-    for point in _places(denm):
+    for point in _event_places(denm):
         by_region.setdefault(int(grid.region_of(int(grid.cell_of(*point)))), []).append(point)
     out: list[tuple[str, bytes]] = []
     for seq, (region, points) in enumerate(by_region.items(), first_seq):
@@ -69,7 +71,7 @@ def reports(denm: Denm, name: str, boot: int, first_seq: int, now: int) -> list[
     return out
 
 
-def _counts(denm: Denm, now: int) -> bool:
+def _is_grip_report(denm: Denm, now: int) -> bool:
     over = now > denm.detected + denm.validity_s * NS
     vague = denm.position_std > WORST_STD or not math.isfinite(denm.position[0])
     return (
@@ -81,7 +83,7 @@ def _counts(denm: Denm, now: int) -> bool:
     )
 
 
-def _places(denm: Denm) -> Iterable[tuple[float, float]]:
+def _event_places(denm: Denm) -> Iterable[tuple[float, float]]:
     seen: dict[int, tuple[float, float]] = {}
     for point in (denm.position, *denm.history):
         seen.setdefault(int(grid.cell_of(*point)), point)

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import zenoh
 
 from fleet_service.client.cits.amqp import AmqpLink
-from fleet_service.client.cits.denm import decode
-from fleet_service.client.cits.foreign import reports
+from fleet_service.client.cits.denm import decode_denm
+from fleet_service.client.cits.foreign import encode_reports
 from fleet_service.client.cits.output import DenmOutput
 from fleet_service.client.cits.properties import Originator
-from fleet_service.client.datex_feed import DatexFeed, publish
+from fleet_service.client.datex_feed import DatexFeed, publish_alerts
 from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -66,10 +66,12 @@ class Witness:
         """Close the session."""
         self._session.close()
 
-    def take(self, body: bytes, _: Mapping[str, Any]) -> None:
+    def publish_report(self, body: bytes, _: Mapping[str, Any]) -> None:
         """Publish the report of grip in a message."""
         try:
-            batches = reports(decode(body), self._name, self._boot, self._seq, self._clock())
+            batches = encode_reports(
+                decode_denm(body), self._name, self._boot, self._seq, self._clock()
+            )
         except InputError as error:
             self.refused += 1
             log.warning("a foreign message is ignored: %s", error)
@@ -80,7 +82,7 @@ class Witness:
         self._seq += len(batches)
 
 
-def run(
+def run_gateway(
     connection: ZenohSettings,
     url: str,
     sending: Sending | None,
@@ -105,18 +107,18 @@ def run(
         "" if receiving is None else receiving.source,
         selector="" if receiving is None else receiving.selector,
         on_accepted=lambda name: settled[0](name),
-        on_message=(lambda *_: None) if witness is None else witness.take,
+        on_message=(lambda *_: None) if witness is None else witness.publish_report,
     )
     output = None
     if sending is not None:
         output = DenmOutput(sending.station, sending.originator, sending.state, link.send)
-        settled.append(output.settle)
+        settled.append(output.mark_accepted)
     link.open()
     try:
         if output is None:
             stop.wait()
         else:
-            publish(connection, DatexFeed(output), stop)
+            publish_alerts(connection, DatexFeed(output), stop)
     finally:
         link.close()
         if witness is not None:

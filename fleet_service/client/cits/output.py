@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet_service.client.cits.amqp import Parcel
-from fleet_service.client.cits.denm import Denm, decode, encode
+from fleet_service.client.cits.denm import Denm, decode_denm, encode_denm
 from fleet_service.client.cits.events import EventBook
-from fleet_service.client.cits.properties import Originator, properties
+from fleet_service.client.cits.properties import Originator, message_properties
 from fleet_service.client.stretches import StretchAlert
 from schemas.errors import InputError
 from schemas.runtime import commandline
@@ -30,7 +30,7 @@ class DenmOutput:
         station: identifier of the originating station.
         originator: for the properties.
         path: file of events and of messages that are not yet accepted; it is continued.
-        send: takes a message; `settle` is called with its name once it is accepted.
+        send: takes a message; `mark_accepted` is called with its name once it is accepted.
         clock: [ns UTC].
 
     Raises:
@@ -51,12 +51,14 @@ class DenmOutput:
         self._clock = clock
         self._lock = threading.Lock()
         self._checked = -float("inf")
-        before = _read(path)
+        before = _read_state(path)
         self._book = EventBook(station, None if before is None else before["book"])
         self._pending: dict[str, bytes] = {}
         for name, body in ({} if before is None else before["pending"]).items():
             self._pending[name] = bytes.fromhex(body)
-            self._send(self._parcel(name, self._pending[name], decode(self._pending[name])))
+            self._send(
+                self._make_parcel(name, self._pending[name], decode_denm(self._pending[name]))
+            )
 
     @property
     def is_due(self) -> bool:
@@ -64,16 +66,16 @@ class DenmOutput:
         return time.monotonic() >= self._checked + CHECK_S
 
     @property
-    def unsettled(self) -> int:
+    def unaccepted_count(self) -> int:
         """Number of messages that the interchange has not accepted yet."""
         return len(self._pending)
 
     @property
-    def events(self) -> int:
+    def open_event_count(self) -> int:
         """Number of events that last."""
         return len(self._book.open_events)
 
-    def settle(self, name: str) -> None:
+    def mark_accepted(self, name: str) -> None:
         """Record that a message was accepted."""
         with self._lock:
             self._pending.pop(name, None)
@@ -93,7 +95,7 @@ class DenmOutput:
         self._checked = time.monotonic()
         due = self._book.update(standing, self._clock(), is_heard)
         with self._lock:
-            fresh = {f"{one.sequence}-{one.referenced}": (encode(one), one) for one in due}
+            fresh = {f"{one.sequence}-{one.referenced}": (encode_denm(one), one) for one in due}
             self._pending |= {name: body for name, (body, _) in fresh.items()}
             content = {
                 "book": self._book.content,
@@ -102,13 +104,13 @@ class DenmOutput:
         with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(json.dumps(content).encode())
         for name, (body, denm) in fresh.items():
-            self._send(self._parcel(name, body, denm))
+            self._send(self._make_parcel(name, body, denm))
 
-    def _parcel(self, name: str, body: bytes, denm: Denm) -> Parcel:
-        return Parcel(name, body, properties(denm, self._originator))
+    def _make_parcel(self, name: str, body: bytes, denm: Denm) -> Parcel:
+        return Parcel(name, body, message_properties(denm, self._originator))
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read_state(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:

@@ -43,7 +43,7 @@ class Originator:
             )
 
 
-def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
+def message_properties(denm: Denm, originator: Originator) -> dict[str, Any]:
     """Return the properties by which subscribers select.
 
     The quadtree has the keys of all points of the event, each between commas, so that `quadTree
@@ -56,7 +56,7 @@ def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
         "publisherId": originator.publisher,
         "publicationId": f"{originator.publisher}:{originator.publication}",
         "originatingCountry": originator.country,
-        "quadTree": quadtree(denm),
+        "quadTree": quadtree_keys(denm),
         "latitude": denm.position[0],
         "longitude": denm.position[1],
         "timestamp": its_time(denm.referenced),
@@ -69,7 +69,7 @@ def properties(denm: Denm, originator: Originator) -> dict[str, Any]:
     }
 
 
-def quadtree(denm: Denm) -> str:
+def quadtree_keys(denm: Denm) -> str:
     """Return the keys of all squares of an event."""
     latitude, longitude = zip(denm.position, *denm.history, strict=True)
     squares = set(grid.cell_of(latitude, longitude, zoom=QUAD_ZOOM).tolist())

@@ -39,7 +39,7 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
     icy = [town.streets[k] for k in chosen.tolist()]
     middles = np.array([town.crossings[list(street)].mean(axis=0) for street in icy])
     table = routes.icy_map(town, icy)
-    costs = routing.valhalla(
+    costs = routing.valhalla_request(
         routing.cost_lines(
             table,
             [

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.client.cits.amqp import AmqpLink
-from fleet_service.client.cits.denm import compiled_denm, decode, encode
+from fleet_service.client.cits.denm import compiled_denm, decode_denm, encode_denm
 from fleet_service.client.cits.output import DenmOutput
 from fleet_service.client.cits.properties import Originator
 from fleet_service.client.stretches import StretchAlert
@@ -82,11 +82,11 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
             before = len(received)
             began = time.perf_counter()
             output.keep_up(standing, lambda *_: True)
-            sent = output.unsettled
+            sent = output.unaccepted_count
             until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
             seconds.append((sent, time.perf_counter() - began))
             for name in settled:
-                output.settle(name)
+                output.mark_accepted(name)
             output.keep_up(standing, lambda *_: True)
             link.close()
             there.send(True)
@@ -100,7 +100,7 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     for body, _ in received:
         oracle.from_uper(body)
         invalid += oracle.to_uper() != body
-        denm = decode(body)
+        denm = decode_denm(body)
         doubled += first.setdefault(denm.sequence, denm.position) != denm.position
         last[denm.sequence] = denm.termination
     rate = max(count / took for count, took in seconds if count > events // 4)
@@ -142,11 +142,11 @@ def _encode_speedup(bodies: list[bytes]) -> float:
     """Return the processor time of asn1tools over ours, of the same messages."""
     general = compiled_denm()
     contents = [general.decode("DENM", body) for body in bodies]
-    records = [decode(body) for body in bodies]
+    records = [decode_denm(body) for body in bodies]
     began = time.process_time()
     theirs = [general.encode("DENM", content, check_types=False) for content in contents]
     between = time.process_time()
-    ours = [encode(record) for record in records]
+    ours = [encode_denm(record) for record in records]
     ended = time.process_time()
     assert [bytes(one) for one in theirs] == ours == bodies
     return (between - began) / (ended - between)
@@ -156,7 +156,7 @@ def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
     """Return how often `quadTree LIKE '%,DIGITS%'` and the place of an event disagree."""
     wrong = 0
     squares = set[tuple[int, int]]()
-    denms = [(decode(body), given) for body, given in received]
+    denms = [(decode_denm(body), given) for body, given in received]
     lasting = [(denm, given) for denm, given in denms if denm.termination is None]
     for denm, _ in lasting[:10]:
         for zoom in (8, 11, 14):

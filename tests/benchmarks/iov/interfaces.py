@@ -22,7 +22,7 @@ from edge_agent.app.kuksa_provider import CONDITION, FRICTION, KuksaProvider, su
 from edge_agent.publish.vss import road_friction
 from fleet_service.app.engine import Engine
 from fleet_service.client.cits.denm import ICE, Denm
-from fleet_service.client.cits.foreign import reports
+from fleet_service.client.cits.foreign import encode_reports
 from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
@@ -52,7 +52,7 @@ def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
                 for k, (latitude, longitude) in enumerate(places):
                     denm = Denm(99, k, 99, START, now, None, (latitude, longitude), 5.0, 3600)
                     said = replace(denm, sub_cause=ICE, heading=0.0)
-                    batches = reports(said, "cits-se", 5, 1 + k + len(places) * turn, now)
+                    batches = encode_reports(said, "cits-se", 5, 1 + k + len(places) * turn, now)
                     engine.intake.ingest(
                         [Message(Kind.OBSERVATION, key, body, JSON) for key, body in batches], now
                     )

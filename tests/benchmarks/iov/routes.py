@@ -80,7 +80,7 @@ def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
     for street in sorted(town.streets, key=lambda one: one in icy, reverse=True):
         line = town.line(street)
         for road in (line, routing.RoadLine(line.latitude[::-1], line.longitude[::-1])):
-            latitude, longitude, yaw = routing._marks(road)
+            latitude, longitude, yaw = routing._sample_road(road)
             inner = slice(4, -4)  # crossings belong to several streets
             for cell, sector in zip(
                 grid.cell_of(latitude[inner], longitude[inner]).tolist(),

@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 from fleet_service.cli import main
-from fleet_service.client.datex import KEPT_S, Supplier, publication, same_but_for_time
+from fleet_service.client.datex import KEPT_S, Supplier, make_publication, same_but_for_time
 from fleet_service.client.stretches import StretchAlert, Stretches
 from schemas import grid
 from schemas.config import ZenohSettings
@@ -53,8 +53,8 @@ def schema() -> Any:  # noqa: ANN401 the validator is its library's own
 def stretches(*alerts: Alert) -> list[StretchAlert]:
     heard = Stretches()
     for one in alerts:
-        heard.take(one)
-    heard.changes()
+        heard.apply_alert(one)
+    heard.take_changes()
     return heard.standing
 
 
@@ -75,13 +75,13 @@ ICE = [alert(x, sector=s, at=x) for x in range(20) for s in (0, 2)]
     ids=["road", "cell", "southward", "two", "none"],
 )
 def test_every_publication_is_valid_also_when_it_ended(alerts: list[Alert]) -> None:
-    begun = publication(OURS, stretches(*alerts), NOW)
-    for document in (begun, publication(OURS, [], NOW + NS, begun)):
+    begun = make_publication(OURS, stretches(*alerts), NOW)
+    for document in (begun, make_publication(OURS, [], NOW + NS, begun)):
         schema().validate(document.decode())
 
 
 def test_value_spread_count_and_probability_travel() -> None:
-    (record,) = records(publication(OURS, stretches(*ICE), NOW))
+    (record,) = records(make_publication(OURS, stretches(*ICE), NOW))
     friction = record.find(".//com:friction", SPACES)
     assert friction is not None
     assert friction.get("numberOfInputValuesUsed") == "2"
@@ -93,8 +93,12 @@ def test_value_spread_count_and_probability_travel() -> None:
 
 
 def test_the_line_runs_along_the_cells_the_way_that_vehicles_head() -> None:
-    (east,) = records(publication(OURS, stretches(*(alert(x, sector=0) for x in range(9))), NOW))
-    (west,) = records(publication(OURS, stretches(*(alert(x, sector=2) for x in range(9))), NOW))
+    (east,) = records(
+        make_publication(OURS, stretches(*(alert(x, sector=0) for x in range(9))), NOW)
+    )
+    (west,) = records(
+        make_publication(OURS, stretches(*(alert(x, sector=2) for x in range(9))), NOW)
+    )
     one, other = (
         np.array(text(record, ".//loc:posList").split(), float).reshape(-1, 2)
         for record in (east, west)
@@ -102,13 +106,13 @@ def test_the_line_runs_along_the_cells_the_way_that_vehicles_head() -> None:
     assert len(one) == 9
     assert (np.diff(one[:, 1]) > 0).all()
     assert np.array_equal(one, other[::-1])
-    (north,) = records(publication(OURS, stretches(alert(0, sector=1)), NOW))
+    (north,) = records(make_publication(OURS, stretches(alert(0, sector=1)), NOW))
     assert text(north, ".//loc:bearing") == "0", "clockwise from north"
 
 
 def test_a_stretch_around_a_corner_is_one_line_without_leaps() -> None:
     corner = [alert(x) for x in range(12)] + [alert(11, y) for y in range(12)]
-    (record,) = records(publication(OURS, stretches(*corner), NOW))
+    (record,) = records(make_publication(OURS, stretches(*corner), NOW))
     line = np.array(text(record, ".//loc:posList").split(), float).reshape(-1, 2)
     steps = np.hypot(np.diff(line[:, 0]), np.diff(line[:, 1]) * np.cos(np.radians(line[0, 0])))
     _, south, _, north = (float(v) for v in grid.bounds(corner[0].cell))
@@ -117,11 +121,11 @@ def test_a_stretch_around_a_corner_is_one_line_without_leaps() -> None:
 
 
 def test_a_situation_keeps_its_id_and_counts_its_versions() -> None:
-    first = publication(OURS, stretches(*ICE[:10]), NOW)
-    again = publication(OURS, stretches(*ICE[:10]), NOW + 5 * NS, first)
+    first = make_publication(OURS, stretches(*ICE[:10]), NOW)
+    again = make_publication(OURS, stretches(*ICE[:10]), NOW + 5 * NS, first)
     assert same_but_for_time(again, first)
-    grown = publication(OURS, stretches(*ICE), NOW + 9 * NS, again)
-    over = publication(OURS, [], NOW + 12 * NS, grown)
+    grown = make_publication(OURS, stretches(*ICE), NOW + 9 * NS, again)
+    over = make_publication(OURS, [], NOW + 12 * NS, grown)
     (a,), (b,), (c,) = (records(document) for document in (first, grown, over))
     assert {a.get("id"), b.get("id"), c.get("id")} == {a.get("id")}
     assert [one.get("version") for one in (a, b, c)] == ["1", "2", "3"]
@@ -132,36 +136,36 @@ def test_a_situation_keeps_its_id_and_counts_its_versions() -> None:
 
 
 def test_an_end_is_told_for_an_hour_and_then_no_more() -> None:
-    over = publication(OURS, [], NOW + NS, publication(OURS, stretches(*ICE), NOW))
-    assert same_but_for_time(publication(OURS, [], NOW + (KEPT_S - 1) * NS, over), over)
-    assert not records(publication(OURS, [], NOW + (KEPT_S + 2) * NS, over))
+    over = make_publication(OURS, [], NOW + NS, make_publication(OURS, stretches(*ICE), NOW))
+    assert same_but_for_time(make_publication(OURS, [], NOW + (KEPT_S - 1) * NS, over), over)
+    assert not records(make_publication(OURS, [], NOW + (KEPT_S + 2) * NS, over))
 
 
 def test_a_reader_that_begins_anew_goes_on_with_the_same_situation() -> None:
-    first = publication(OURS, stretches(*ICE), NOW)
-    without_its_first = publication(OURS, stretches(*ICE[6:]), NOW + NS, first)
+    first = make_publication(OURS, stretches(*ICE), NOW)
+    without_its_first = make_publication(OURS, stretches(*ICE[6:]), NOW + NS, first)
     (a,) = records(first)
     (b,) = records(without_its_first)
     assert (a.get("id"), b.get("version")) == (b.get("id"), "2")
 
 
 def test_ice_that_comes_back_is_a_new_situation() -> None:
-    over = publication(OURS, [], NOW + NS, publication(OURS, stretches(*ICE), NOW))
-    later = publication(
+    over = make_publication(OURS, [], NOW + NS, make_publication(OURS, stretches(*ICE), NOW))
+    later = make_publication(
         OURS, stretches(*(alert(x, at=100) for x in range(20))), NOW + 200 * NS, over
     )
     assert len({record.get("id") for record in records(later)}) == 2
 
 
 def test_where_no_service_speaks_silence_ends_nothing() -> None:
-    first = publication(OURS, stretches(*ICE), NOW)
-    assert same_but_for_time(publication(OURS, [], NOW + NS, first, lambda *_: False), first)
+    first = make_publication(OURS, stretches(*ICE), NOW)
+    assert same_but_for_time(make_publication(OURS, [], NOW + NS, first, lambda *_: False), first)
 
 
 @pytest.mark.parametrize("foreign", [b"", b"<a/>", b"not xml", b"\x00\xff"])
 def test_a_file_of_others_is_not_written_over(foreign: bytes) -> None:
     with pytest.raises(InputError, match="out"):
-        publication(OURS, [], NOW, foreign)
+        make_publication(OURS, [], NOW, foreign)
 
 
 @pytest.mark.parametrize(("country", "name"), [("SE", "x"), ("sweden", "x"), ("se", " ")])
@@ -234,7 +238,9 @@ def test_who_only_rolled_is_in_no_publication(
     assert [
         root.findtext(f".//com:{name}", "", SPACES) for name in ("country", "nationalIdentifier")
     ] == ["no", "who"]
-    real = publication(Supplier("no", "who", "real"), stretches(alert(0)), NOW, out.read_bytes())
+    real = make_publication(
+        Supplier("no", "who", "real"), stretches(alert(0)), NOW, out.read_bytes()
+    )
     assert b"<com:informationStatus>real</com:informationStatus>" in real
 
 

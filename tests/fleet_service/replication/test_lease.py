@@ -22,7 +22,7 @@ from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.lease import Lease, holder_of
-from fleet_service.replication.ownership import Ownership, acquire, open_exclusive
+from fleet_service.replication.ownership import Ownership, acquire_archive, open_exclusive
 from fleet_service.replication.replica import BucketReplica
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
@@ -163,11 +163,11 @@ class Machine:
             lambda: None,
         )  # it reaches a router, and no token stands
         signs = there if standby else None
-        held = acquire(self.config, root, threading.Event(), say, signs)
+        held = acquire_archive(self.config, root, threading.Event(), say, signs)
         assert held is not None
         self.holding: Ownership = held
         upload = None if held.copy is None else held.copy.upload_segments
-        self.log: SegmentLog[int] = SegmentLog(root, self.config.name, upload, held.epoch)
+        self.log: SegmentLog[int] = SegmentLog(root, self.config.name, upload, held.smallest_epoch)
 
     @property
     def copy(self) -> BucketReplica:
@@ -368,7 +368,7 @@ def test_a_copy_of_a_folder_is_somebody_else(tmp_path: Path) -> None:
 def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
     stores = ObjectBucket(bucket.url, bucket.store, 5.0)
     leases = [Lease(f"holder-{n}", stores, "shard-0", 5.0) for n in range(3)]
-    taken = [lease._take(None, lambda: 0, threading.Event()) for lease in leases]
+    taken = [lease._create_next(None, lambda: 0, threading.Event()) for lease in leases]
     assert taken == [True, False, False]
 
 
@@ -384,12 +384,12 @@ def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     clock = SimpleNamespace(monotonic=lambda: 0.0, clock_gettime=lambda _: now[0], time=time.time)
     monkeypatch.setattr("fleet_service.replication.lease.time", clock)
     lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)
-    fresh = [lease.fresh]
+    fresh = [lease.may_acknowledge]
     assert lease.wait(threading.Event(), print, lambda: 0, None)
     for _ in range(2):
         for share in (0.49, 0.02):
             now[0] += share * lease_s
-            fresh.append(lease.fresh)
+            fresh.append(lease.may_acknowledge)
         lease.renew()
     assert fresh == [False, True, False, True, False]
-    assert lease.fresh
+    assert lease.may_acknowledge

@@ -24,7 +24,7 @@ class MemoryBucket:
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
 
-    def names(self, folder: str) -> list[str]:
+    def list_names(self, folder: str) -> list[str]:
         return [name for name in self.objects if name.startswith(f"{folder}/")]
 
     def get(self, name: str) -> bytes | None:
@@ -33,7 +33,7 @@ class MemoryBucket:
     def put(self, name: str, content: bytes) -> None:
         self.objects[name] = content
 
-    def make(self, name: str, content: bytes) -> bool:
+    def create(self, name: str, content: bytes) -> bool:
         return self.objects.setdefault(name, content) is content
 
 
@@ -55,14 +55,14 @@ def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 def test_service_with_another_lease_time_does_not_start(holder_s: float, standby_s: float) -> None:
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", holder_s)
-    assert holder._take(None, lambda: 0, threading.Event())
+    assert holder._create_next(None, lambda: 0, threading.Event())
     with pytest.raises(
         InputError, match=rf"archive.lease_s: is {standby_s:g}, and one, .* uses {holder_s:g}"
     ):
         standby_of(bucket, "two", standby_s)
-    assert holder.fresh
+    assert holder.may_acknowledge
     holder.release()
-    assert standby_of(bucket, "two", standby_s).former == ("one",)
+    assert standby_of(bucket, "two", standby_s).former_holders == ("one",)
 
 
 @pytest.mark.parametrize("lease_s", [None, 0.5])
@@ -81,7 +81,7 @@ def test_lease_of_another_version_is_read(lease_s: float | None) -> None:
         json.dumps(record | ({} if lease_s is None else {"lease_s": lease_s})).encode(),
     )
     standby = standby_of(bucket, "two", 0.5)
-    assert (standby.term.number, standby.former) == (3, ("one",))
+    assert (standby.term.number, standby.former_holders) == (3, ("one",))
 
 
 @pytest.mark.parametrize(
@@ -96,20 +96,20 @@ def test_lease_of_another_version_is_read(lease_s: float | None) -> None:
 )
 def test_damaged_lease_is_waited_for_and_then_taken(content: bytes) -> None:
     bucket = MemoryBucket()
-    assert lease_on(bucket, "one", 0.5)._take(None, lambda: 0, threading.Event())
+    assert lease_on(bucket, "one", 0.5)._create_next(None, lambda: 0, threading.Event())
     bucket.put("lease/0000000002.json", content)
     standby = standby_of(bucket, "two", 0.5)
-    assert (standby.term.number, standby.former) == (3, ("one", UNKNOWN))
+    assert (standby.term.number, standby.former_holders) == (3, ("one", UNKNOWN))
 
 
 def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
-    assert holder._take(None, lambda: 0, threading.Event())
+    assert holder._create_next(None, lambda: 0, threading.Event())
     name = "lease/0000000001.json"
     bucket.put(name, bucket.objects[name][:20])
     holder.renew()
-    assert holder.fresh
+    assert holder.may_acknowledge
     assert json.loads(bucket.objects[name])["service"] == "one"
 
 
@@ -117,7 +117,7 @@ def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> Non
     """The write may take effect late, and the next renewal must differ from it."""
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
-    assert holder._take(None, lambda: 0, threading.Event())
+    assert holder._create_next(None, lambda: 0, threading.Event())
     written: list[bytes] = []
 
     def fail(_: str, content: bytes) -> None:

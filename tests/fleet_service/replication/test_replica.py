@@ -42,7 +42,7 @@ def make(bucket: BucketServer) -> Iterator[Make]:
     def begun(root: Path) -> BucketReplica:
         root.mkdir(exist_ok=True)
         made.append(BucketReplica(root, bucket.url, bucket.store))
-        made[-1].begin(NAME)
+        made[-1].sync_without_lease(NAME)
         return made[-1]
 
     yield begun
@@ -205,7 +205,7 @@ def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: 
         closing(BucketReplica(tmp_path / "other", bucket.url, bucket.store)) as copy,
         pytest.raises(InputError, match="another service, shard-0"),
     ):
-        copy.begin("shard-1")
+        copy.sync_without_lease("shard-1")
 
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
@@ -218,7 +218,7 @@ def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
         closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy,
         pytest.raises(InputError) as told,
     ):
-        copy.begin(NAME)
+        copy.sync_without_lease(NAME)
     assert told.value.field == "archive.copy"
     assert SECRET not in str(told.value)
 
@@ -253,7 +253,7 @@ def test_bucket_works_by_environment_alone_and_errors_are_stable_lines(
     lines = set()
     for _ in range(3):
         with pytest.raises(CopyError) as raised:
-            there.names("some")
+            there.list_names("some")
         lines.add(str(raised.value))
     assert len(lines) == 1
 

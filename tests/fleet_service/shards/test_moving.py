@@ -15,7 +15,7 @@ from fleet_service.app.service import Service
 from fleet_service.cli import main
 from fleet_service.replication.bucket import ObjectBucket
 from fleet_service.replication.lease import Lease
-from fleet_service.replication.ownership import acquire
+from fleet_service.replication.ownership import acquire_archive
 from fleet_service.shards.serving import standby_signs
 from schemas.config import ServiceConfig, ZenohSettings
 from tests.buckets import BucketServer
@@ -63,7 +63,7 @@ class Machine:
 
     def _run(self) -> None:
         with standby_signs(self._config, self.stop) as signs:
-            holding = acquire(self._config, self._root, self.stop, self.lines.append, signs)
+            holding = acquire_archive(self._config, self._root, self.stop, self.lines.append, signs)
         if holding is not None:
             self.service = Service(self._config, self._root, self.lines.append, holding)
             self.service.run(self.stop)
@@ -143,13 +143,13 @@ def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
     store = ObjectBucket(bucket.url, bucket.store, 5.0)
     lease_s = 3.0
     one, two, three = (Lease(name, store, name, lease_s) for name in ("one", "two", "three"))
-    assert one._take(None, lambda: 0, threading.Event())
+    assert one._create_next(None, lambda: 0, threading.Event())
     one.release("two")
     stop = threading.Event()
     threading.Timer(lease_s / 3, stop.set).start()
     assert not three.wait(stop, print, lambda: 0, None)
     assert two.wait(threading.Event(), print, lambda: 0, None)
-    assert two.former == ("one",)
+    assert two.former_holders == ("one",)
     two.release("one")
     assert three.wait(threading.Event(), print, lambda: 0, None)  # in the end anybody may
-    assert three.former == ("one", "two")
+    assert three.former_holders == ("one", "two")

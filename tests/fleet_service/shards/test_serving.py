@@ -95,7 +95,7 @@ def drive(session: zenoh.Session, services: list[Running]) -> None:
 
 
 def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
-    return map_client.ask(router, parameters)
+    return map_client.query_map(router, parameters)
 
 
 def test_answers_over_three_services_are_ordered_and_name_gaps(
@@ -109,7 +109,7 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
     lines: list[str] = []
     stop = threading.Event()
     wishes = watching.WatchOptions(box, as_json=True)
-    watcher = threading.Thread(target=watching.watch, args=(router, wishes, stop, lines.append))
+    watcher = threading.Thread(target=watching.watch_map, args=(router, wishes, stop, lines.append))
     try:
         with three(router, tmp_path) as services:
             drive(session, services)
@@ -125,7 +125,7 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
                 cells = [cell for tile in document.get("tiles", []) for cell in tile["cells"]]  # type: ignore[attr-defined]
                 cells += [one["properties"] for one in document.get("features", [])]  # type: ignore[attr-defined]
                 assert [cell["longitude"] for cell in cells] == passed.tolist()
-            assert ask(router, bbox=box).gap is None
+            assert ask(router, bbox=box).gap_description is None
             watcher.start()
             until(lambda: any(json.loads(line)["event"] == "watching" for line in lines))
             services[1].end()
@@ -152,7 +152,7 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
             assert f"nobody serves {NAMES[1]}" in capsys.readouterr().err
             until(lambda: {"event": "away", "regions": [NAMES[1]]} in map(json.loads, lines))
             with running(router, tmp_path / "shard-1", name="shard-1", regions=[NAMES[1]]):
-                assert ask(router, bbox=box).gap is None
+                assert ask(router, bbox=box).gap_description is None
                 until(lambda: {"event": "back", "regions": [NAMES[1]]} in map(json.loads, lines))
     finally:
         stop.set()
@@ -237,10 +237,12 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
             return True
 
         with monkeypatch.context() as meanwhile:
-            meanwhile.setattr(map_client, "replies", lambda *_: iter([] if late else [come()][1:]))
+            meanwhile.setattr(
+                map_client, "query_replies", lambda *_: iter([] if late else [come()][1:])
+            )
             meanwhile.setattr(map_client, "is_served", come)
             answer = ask(router, bbox=inside)
-        assert (answer.gap is None, answer.served) == (False, False)
+        assert (answer.gap_description is None, answer.served) == (False, False)
         coming.__exit__(None, None, None)
 
 
@@ -251,7 +253,7 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
         drive_one(session, service)
-        asked = map_client.replies
+        asked = map_client.query_replies
         first = [True]
 
         def replies(*given: Any) -> Iterator[tuple[str, bytes]]:  # noqa: ANN401
@@ -259,7 +261,7 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
             first.append(False)
             return iter(found)
 
-        monkeypatch.setattr(map_client, "replies", replies)
+        monkeypatch.setattr(map_client, "query_replies", replies)
         answer = ask(router, bbox=f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}")
         assert answer.table is not None
         assert answer.table.num_rows > 0
@@ -300,9 +302,9 @@ def test_a_leaving_service_may_be_asked_instead_of_its_successor(
             return iter(())
 
         with monkeypatch.context() as meanwhile:
-            meanwhile.setattr(map_client, "replies", replies)
-            assert ask(router, bbox=inside).gap is not None
-        assert ask(router, bbox=inside).gap is None
+            meanwhile.setattr(map_client, "query_replies", replies)
+            assert ask(router, bbox=inside).gap_description is not None
+        assert ask(router, bbox=inside).gap_description is None
         if comes_back:
             again.__exit__(None, None, None)
 
@@ -320,9 +322,9 @@ def test_token_of_a_killed_service_may_fall_after_the_answer(
             held.__exit__(None, None, None)
             until(lambda: not tokens.active_tokens(third))
 
-        monkeypatch.setattr(map_client, "replies", lambda *_: iter(()))
+        monkeypatch.setattr(map_client, "query_replies", lambda *_: iter(()))
         monkeypatch.setattr(map_client, "time", SimpleNamespace(sleep=falls))
-        assert ask(router, bbox=inside).gap is not None
+        assert ask(router, bbox=inside).gap_description is not None
 
 
 @contextmanager

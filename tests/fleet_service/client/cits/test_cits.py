@@ -25,15 +25,15 @@ from fleet_service.client.cits.denm import (
     TERMINATIONS,
     Denm,
     Termination,
-    approach,
+    approach_points,
     compiled_denm,
-    decode,
-    encode,
+    decode_denm,
+    encode_denm,
 )
 from fleet_service.client.cits.events import RENEW_NS, VALID_NS
-from fleet_service.client.cits.foreign import reports
+from fleet_service.client.cits.foreign import encode_reports
 from fleet_service.client.cits.output import DenmOutput
-from fleet_service.client.cits.properties import Originator, properties
+from fleet_service.client.cits.properties import Originator, message_properties
 from fleet_service.client.stretches import StretchAlert
 from fleet_service.ingest.inbox import Message
 from schemas import grid
@@ -72,7 +72,7 @@ def random_denm(draw: np.random.Generator) -> Denm:
         quality=int(draw.integers(0, 8)),
         sub_cause=int(draw.integers(0, 11)),
         history=tuple(near[: int(draw.integers(0, 30))]),
-        traces=(approach(position, heading or 0.0), *(((),) if draw.random() < 0.5 else ())),
+        traces=(approach_points(position, heading or 0.0), *(((),) if draw.random() < 0.5 else ())),
         heading=heading,
     )
 
@@ -122,7 +122,7 @@ def any_denm(draw: strategies.DrawFn) -> Denm:
 @settings(max_examples=300, deadline=None)
 @given(any_denm())
 def test_two_other_encoders_write_the_same_bytes(sent: Denm) -> None:
-    data = encode(sent)
+    data = encode_denm(sent)
     oracle = DENM_PDU_Descriptions.DENM
     oracle.from_uper(data)
     assert oracle.to_uper() == data
@@ -137,7 +137,7 @@ def test_two_other_encoders_write_the_same_bytes(sent: Denm) -> None:
 @settings(max_examples=300, deadline=None)
 @given(any_denm())
 def test_an_encoded_denm_is_read_as_it_was(sent: Denm) -> None:
-    read = decode(encode(sent))
+    read = decode_denm(encode_denm(sent))
     for name in ("station", "sequence", "sender", "termination", "validity_s"):
         assert getattr(read, name) == getattr(sent, name), name
     assert read.detected == sent.detected // 10**6 * 10**6
@@ -176,16 +176,16 @@ def test_an_encoded_denm_is_read_as_it_was(sent: Denm) -> None:
 def test_a_number_too_large_for_its_field_is_not_encoded(wrong: dict[str, Any]) -> None:
     denm = random_denm(np.random.default_rng(5))
     with pytest.raises(OverflowError):
-        encode(replace(denm, **{"termination": None, **wrong}))
+        encode_denm(replace(denm, **{"termination": None, **wrong}))
 
 
 def test_a_foreign_denm_with_further_containers_is_read() -> None:
     oracle = DENM_PDU_Descriptions.DENM
-    oracle.from_uper(encode(replace(random_denm(np.random.default_rng(1)), termination=None)))
+    oracle.from_uper(encode_denm(replace(random_denm(np.random.default_rng(1)), termination=None)))
     content = oracle.get_val()
     content["denm"]["alacarte"] = {"externalTemperature": -3}
     oracle.set_val(content)
-    read = decode(oracle.to_uper())
+    read = decode_denm(oracle.to_uper())
     assert read.sequence == content["denm"]["management"]["actionID"]["sequenceNumber"]
     assert read.history or "eventHistory" not in content["denm"]["situation"]
 
@@ -193,7 +193,7 @@ def test_a_foreign_denm_with_further_containers_is_read() -> None:
 @pytest.mark.parametrize("data", [b"", b"\x02", bytes(40), b"no DENM at all"])
 def test_bytes_that_are_no_denm_are_refused(data: bytes) -> None:
     with pytest.raises(InputError, match="^payload: "):
-        decode(data)
+        decode_denm(data)
 
 
 def stretch(
@@ -241,8 +241,8 @@ class Run:
         self.output.keep_up(standing, lambda *_: heard)
         fresh = self.sent[before:]
         for parcel in fresh if self.settles else ():
-            self.output.settle(parcel.name)
-        return [decode(parcel.body) for parcel in fresh]
+            self.output.mark_accepted(parcel.name)
+        return [decode_denm(parcel.body) for parcel in fresh]
 
 
 def test_an_event_keeps_its_number_over_restarts_until_it_is_cancelled(tmp_path: Path) -> None:
@@ -284,7 +284,7 @@ def test_what_the_interchange_has_not_accepted_is_sent_after_a_restart(tmp_path:
     run.start()
     assert [(one.name, one.body) for one in run.sent] == [(one.name, one.body) for one in first]
     for parcel in first:
-        run.output.settle(parcel.name)
+        run.output.mark_accepted(parcel.name)
     run.step()
     run.sent.clear()
     run.start()
@@ -302,7 +302,7 @@ def test_a_quadtree_selector_finds_all_events_of_a_square_and_no_other() -> None
             selector = f",{grid.quadkey(square, zoom)}"
             for one in denms:
                 within = int(grid.parent(int(grid.cell_of(*one.position)), zoom)) == square
-                assert (selector in properties(one, OURS)["quadTree"]) == within
+                assert (selector in message_properties(one, OURS)["quadTree"]) == within
                 found += within
     assert found > 300
 
@@ -311,7 +311,7 @@ def test_denm_reach_a_late_interchange_and_foreign_ones_are_received(tmp_path: P
     url = free_url()
     settled = list[str]()
     came = list[bytes]()
-    foreign = encode(replace(random_denm(np.random.default_rng(3)), termination=None))
+    foreign = encode_denm(replace(random_denm(np.random.default_rng(3)), termination=None))
 
     def keep(body: bytes, _: Mapping[str, Any]) -> None:
         came.append(body)
@@ -341,7 +341,7 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
     try:
         for turn in range(10):
             now = START + 30 * turn * NS
-            batches = reports(
+            batches = encode_reports(
                 replace(denm, referenced=now, sequence=turn), "cits-se", 5, 1 + turn, now
             )
             engine.intake.ingest(
@@ -355,7 +355,7 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
 
 def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
     denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE)
-    said = json.loads(reports(denm, "cits-se", 5, 1, START)[0][1])
+    said = json.loads(encode_reports(denm, "cits-se", 5, 1, START)[0][1])
     assert said["mu"] == [0.2]
     for other in (
         replace(denm, termination="isCancellation"),
@@ -363,5 +363,5 @@ def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
         replace(denm, sub_cause=SALTED),
         replace(denm, position_std=40.9),
     ):
-        assert reports(other, "cits-se", 5, 1, START) == []
-    assert reports(denm, "cits-se", 5, 1, START + 601 * NS) == []
+        assert encode_reports(other, "cits-se", 5, 1, START) == []
+    assert encode_reports(denm, "cits-se", 5, 1, START + 601 * NS) == []
