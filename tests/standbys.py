@@ -107,13 +107,13 @@ class Host:
 
     def said(self, start: str) -> bool:
         """Return True if a line of the present start begins with this text."""
-        return any(line.startswith(start) for line in self.part.lines())
+        return any(line.startswith(start) for line in self.part.read_lines())
 
     def close(self) -> None:
         """End whatever is left of it."""
         self.to_router.close()
         self.to_bucket.close()
-        self.part.send(signal.SIGCONT)
+        self.part.send_signal(signal.SIGCONT)
         self.part.kill()
 
 

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.census import take, told
-from tests.faults.processes import Stage, stage
+from tests.faults.census import compare_with_archive, read_journals
+from tests.faults.processes import Stage, open_stage
 from tests.waiting import until
 
 
 @pytest.fixture
 def there(tmp_path: Path) -> Iterator[Stage]:
     """A router, a service and two vehicles that have had something acknowledged."""
-    with stage(tmp_path, segment_s=0.2) as there:
-        there.load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
-        until(lambda: told(there.journals).settled)
+    with open_stage(tmp_path, segment_s=0.2) as there:
+        there.make_load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
+        until(lambda: read_journals(there.journals).settled)
         yield there
 
 
@@ -30,28 +30,28 @@ def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals
     (load,) = there.loads
     for part in (load, there.service):
         assert part.stop(number) == 0
-    end = json.loads(load.lines()[-1])
+    end = json.loads(load.read_lines()[-1])
     assert end["unsettled"] == 0
-    census = take(there.journals, there.archive)
+    census = compare_with_archive(there.journals, there.archive)
     assert (census.lost, census.doubled) == (0, 0)
     # on a busy machine the last of it may be cut off; that nothing is lost by that stands above
     assert any(
-        line.startswith(("status: ", "shutdown incomplete")) for line in there.service.lines()
+        line.startswith(("status: ", "shutdown incomplete")) for line in there.service.read_lines()
     )
 
 
 @pytest.mark.campaign
 def test_agent_and_service_leave_a_frozen_router_behind_and_lose_nothing(there: Stage) -> None:
     (load,) = there.loads
-    there.router.send(signal.SIGSTOP)
-    stored = len(told(there.journals).stored)
-    until(lambda: len(told(there.journals).stored) > stored + 4)
+    there.router.send_signal(signal.SIGSTOP)
+    stored = len(read_journals(there.journals).stored)
+    until(lambda: len(read_journals(there.journals).stored) > stored + 4)
     for part in (load, there.service):
         assert part.stop() == 0
-    there.router.send(signal.SIGCONT)
+    there.router.send_signal(signal.SIGCONT)
     there.service.start()
     there.service.line_with("ready: ")
     load.start()
     there.drain(60.0)
-    census = take(there.journals, there.archive)
+    census = compare_with_archive(there.journals, there.archive)
     assert (census.lost, census.acknowledged_lost, census.doubled) == (0, 0, 0)

@@ -23,13 +23,13 @@ from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch
-from tests.faults.bars import BARS, figure
+from tests.faults.bars import BARS, make_figure
 from tests.faults.campaigns import CAMPAIGNS
-from tests.faults.census import take, told
-from tests.faults.crash_model import history
+from tests.faults.census import compare_with_archive, read_journals
+from tests.faults.crash_model import run_log_history
 from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
-from tests.faults.frame import RAISED, Campaign, Site, conduct
+from tests.faults.frame import RAISED, Campaign, Site, run_campaigns
 from tests.faults.link_relay import UDP, Direction, LinkTerms
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
@@ -49,10 +49,10 @@ def test_every_campaign_owes_a_figure_of_what_it_did() -> None:
 
 def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
     def forgetful(site: Site) -> list[Figure]:
-        return [figure("faults.kill.doubled", 0)]
+        return [make_figure("faults.kill.doubled", 0)]
 
     campaign = Campaign("forgetful", forgetful, ("faults.kill.doubled", "faults.frozen.lost"))
-    found = conduct([campaign], tmp_path, "test", quick=True, seed=0)
+    found = run_campaigns([campaign], tmp_path, "test", quick=True, seed=0)
     assert {one.name: one.holds for one in found} == {
         "faults.kill.doubled": True,
         "faults.frozen.lost": False,
@@ -65,7 +65,7 @@ def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> No
 RAISES = """
 import subprocess, threading
 from pathlib import Path
-from tests.faults.frame import Campaign, conduct, leave
+from tests.faults.frame import Campaign, run_and_exit, run_campaigns
 
 def run(site):
     child = subprocess.Popen(["sleep", "600"])
@@ -73,7 +73,8 @@ def run(site):
     threading.Thread(target=threading.Event().wait).start()  # as a session that nobody closed
     raise TimeoutError("not within 60 s")
 
-leave(lambda: len(conduct([Campaign("raises", run, ())], Path("out"), "test", True, 0)))
+CAMPAIGNS = [Campaign("raises", run, ())]
+run_and_exit(lambda: len(run_campaigns(CAMPAIGNS, Path("out"), "test", True, 0)))
 """
 
 
@@ -118,12 +119,12 @@ def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_pa
     lines = [f"+ {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} {b.rows} 1.0" for b in kept]
     lines += [f"- {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} 0 3.5" for b in kept[1:]]
     journal.write_text("\n".join(lines) + "\n")
-    census = take([journal], tmp_path / "archive")
+    census = compare_with_archive([journal], tmp_path / "archive")
     assert (census.stored, census.settled, census.rows, census.observations) == (3, 2, 6, 6)
     assert (census.lost, census.acknowledged_lost, census.doubled) == (1, 1, 2)
-    assert told([journal]).longest_wait(since=2.0) == float("inf")
+    assert read_journals([journal]).longest_wait(since=2.0) == float("inf")
     journal.write_text("\n".join(lines[1:]) + "\n")
-    assert told([journal]).longest_wait(since=2.0) == 1.5
+    assert read_journals([journal]).longest_wait(since=2.0) == 1.5
 
 
 def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
@@ -131,7 +132,9 @@ def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
         1064,
         1938,
     )  # files that an interrupted compaction had renamed and not synced, then taken for safe
-    assert [problem for number in (*range(12), *found_bugs) for problem in history(number)] == []
+    assert [
+        problem for number in (*range(12), *found_bugs) for problem in run_log_history(number)
+    ] == []
     assert [problem for number in range(3) for problem in spool_history(number)] == []
 
 
@@ -139,12 +142,12 @@ def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Writer, "sync", lambda self: None)
-    assert any("is lost" in problem for number in range(12) for problem in history(number))
+    assert any("is lost" in problem for number in range(12) for problem in run_log_history(number))
 
 
 def served(number: int, folder: Path) -> list[str]:
     (folder / str(number)).mkdir()
-    return ServiceHistory(number, folder / str(number)).violations()
+    return ServiceHistory(number, folder / str(number)).find_violations()
 
 
 @pytest.mark.campaign
@@ -174,16 +177,16 @@ def test_link_relay_follows_loss_delay_rate_and_blocking() -> None:
     slow = LinkTerms(delay_s=1.0, bytes_per_s=100.0, queue_bytes=200)
     read, write = os.pipe()
     way = Direction(write)
-    way.take(packet[:9] + bytes([UDP]) + packet[10:], 0.0, blocked, draw)
+    way.accept_packet(packet[:9] + bytes([UDP]) + packet[10:], 0.0, blocked, draw)
     assert not way.flying
     for _ in range(5):
-        way.take(packet, 0.0, slow, draw)
+        way.accept_packet(packet, 0.0, slow, draw)
     assert [at for at, _, _ in way.flying] == [2.0, 3.0, 4.0], (
         "two wait, a third is on its way, others find no room"
     )
-    way.deliver(3.0)
+    way.deliver_packets(3.0)
     assert os.read(read, 1000) == 2 * packet
     lossy = Direction(write)
     for _ in range(1000):
-        lossy.take(packet, 0.0, LinkTerms(loss=0.1), draw)
+        lossy.accept_packet(packet, 0.0, LinkTerms(loss=0.1), draw)
     assert 860 < len(lossy.flying) < 940

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.protocol_model import BROKEN, Rules, check
+from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("lease", [(4, 4), (6, 2)])
 def test_no_state_breaks_a_promise(lease: tuple[int, int]) -> None:
-    found = check(Rules(lease=lease), most_turn=1)
+    found = explore_states(Rules(lease=lease), most_turn=1)
     assert found.violation is None
     assert found.states > 100
 
@@ -18,6 +18,6 @@ def test_no_state_breaks_a_promise(lease: tuple[int, int]) -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("rules", BROKEN.values(), ids=BROKEN)
 def test_each_rule_is_needed(rules: Rules) -> None:
-    found = check(rules, most_turn=1)
+    found = explore_states(rules, most_turn=1)
     assert found.violation is not None
     assert found.violation.steps

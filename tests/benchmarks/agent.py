@@ -20,7 +20,7 @@ from edge_agent.inputs.signal_log import read_log
 from schemas.runtime.figures import Figure
 from schemas.vehicle import load_vehicle
 from tests.benchmarks.measure import median_s
-from tests.faults.processes import stage
+from tests.faults.processes import open_stage
 
 EDGE = (sys.executable, "-m", "edge_agent.cli")
 FIRST = """import sys
@@ -49,7 +49,7 @@ def agent() -> list[Figure]:
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with stage(folder / "stage") as there:
+        with open_stage(folder / "stage") as there:
             found = [*live(folder, there.endpoint), *fleet(folder, there.endpoint)]
         return [*start(folder), *found, *replay(folder)]
 

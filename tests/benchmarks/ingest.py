@@ -30,7 +30,7 @@ from schemas.runtime.batch_decoder import decode_many
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.benchmarks.measure import SEED
-from tests.faults.load import visits
+from tests.faults.load import make_visits
 
 VEHICLES: Final = 1000
 CELLS_ACROSS: Final = 200
@@ -118,7 +118,7 @@ def messages(
     `begin` messages were made before: vehicles and their sequence numbers go on.
     """
     rng = np.random.default_rng([SEED, begin])
-    columns = visits(rng, np.zeros(2 * count * records, np.int64), now, CELLS_ACROSS).columns
+    columns = make_visits(rng, np.zeros(2 * count * records, np.int64), now, CELLS_ACROSS).columns
     columns["longitude"] = columns["longitude"] + east * 360.0 / (1 << grid.REGION_ZOOM)
     columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
     home = grid.region_of(columns["cell"])

@@ -180,7 +180,7 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
     router.start()
     try:
         settings = {"zenoh": {"connect": [router.line_with("router: ").split()[1]]}}
-        router.send(signal.SIGSTOP)
+        router.send_signal(signal.SIGSTOP)
         (tmp_path / "agent.json").write_text(
             json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")})
         )
@@ -201,7 +201,7 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
             [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=150
         )
     finally:
-        router.send(signal.SIGCONT)
+        router.send_signal(signal.SIGCONT)
         router.kill()
     late = ("a session did not close", "no session at tcp/127.0.0.1")  # when Zenoh gave up
     assert any(words in done.stderr for words in late)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from schemas.runtime import figures
 from tests.faults.campaigns import CAMPAIGNS
-from tests.faults.frame import conduct, leave
+from tests.faults.frame import run_and_exit, run_campaigns
 
 
 def main() -> int:
@@ -28,7 +28,7 @@ def main() -> int:
     chosen = [
         c for c in CAMPAIGNS if (c.name in args.only if args.only else c.in_quick or not args.quick)
     ]
-    found = conduct(
+    found = run_campaigns(
         chosen, args.out, "faults-quick" if args.quick else "faults", args.quick, args.seed
     )
     print(figures.markdown(found))
@@ -36,4 +36,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    leave(main)
+    run_and_exit(main)

@@ -32,7 +32,7 @@ from fleet_service.replay.rebuild import rows_near
 from schemas import query
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 
 DAYS: Final = 6
@@ -46,38 +46,38 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 def run(site: Site) -> list[Figure]:
     """Twenty million observations and twice as many states, and a tenth and a third of them; in a
     quick run, eighty thousand."""
-    millions = site.of(2000, 8) / 100
+    millions = site.choose_amount(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)
-    smaller = [_smaller(site, millions * share) for share in shares]
-    root = _made(
+    smaller = [_measure_smaller(site, millions * share) for share in shares]
+    root = _ensure_archive(
         site,
         (site.folder if site.quick else site.folder.parent) / "age-archive",
         round(millions * 1e6),
     )
     shutil.rmtree(root / CHECKPOINTS, ignore_errors=True)
-    cold = _measured("ready", root)
+    cold = _measure_process("ready", root)
     site.say(f"from Parquet alone: {cold}")
-    warm, then = _asked_of(root)
+    warm, then = _measure_archive(root)
     site.say(f"from a checkpoint: {warm}; a question about the past: {then}")
     young, old = (
         _last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2))
     )
-    tries = [(_measured("ready", young), _measured("ready", old)) for _ in range(2)]
+    tries = [(_measure_process("ready", young), _measure_process("ready", old)) for _ in range(2)]
     # the least of two: what else the machine does only adds
     alone, aged = (
         {name: min(one[name] for one in side) for name in OWN} for side in zip(*tries, strict=True)
     )
     site.say(f"one day alone: {alone}; after {DAYS - 1} days of months ago: {aged}")
     return [
-        figure("faults.age.ready_s", warm["seconds"]),
-        figure("faults.age.ready_mb", warm["mb"]),
-        figure("faults.age.at_mb", then["mb"]),
-        figure("faults.age.cold_s", cold["seconds"]),
-        figure("faults.age.cold_mb", cold["mb"]),
-        figure("faults.age.cells", min(cold["cells"], warm["cells"])),
-        figure("faults.age.at_bytes", then["bytes"]),
-        figure("faults.age.old_days", max(aged[name] / alone[name] for name in OWN)),
-        figure(
+        make_figure("faults.age.ready_s", warm["seconds"]),
+        make_figure("faults.age.ready_mb", warm["mb"]),
+        make_figure("faults.age.at_mb", then["mb"]),
+        make_figure("faults.age.cold_s", cold["seconds"]),
+        make_figure("faults.age.cold_mb", cold["mb"]),
+        make_figure("faults.age.cells", min(cold["cells"], warm["cells"])),
+        make_figure("faults.age.at_bytes", then["bytes"]),
+        make_figure("faults.age.old_days", max(aged[name] / alone[name] for name in OWN)),
+        make_figure(
             "faults.age.tenfold",
             max(
                 now["mb"] / before["mb"]
@@ -90,30 +90,30 @@ def run(site: Site) -> list[Figure]:
     ]
 
 
-def _smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
-    """`_asked_of` an archive of so many million observations."""
-    root = _made(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
-    ready, past = _asked_of(root)
+def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Measure an archive of so many million observations."""
+    root = _ensure_archive(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
+    ready, past = _measure_archive(root)
     site.say(f"{millions:g} million: from a checkpoint {ready}; a question about the past {past}")
     shutil.rmtree(root)
     return ready, past
 
 
-def _asked_of(root: Path) -> tuple[dict[str, float], dict[str, float]]:
+def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Measure a start from a checkpoint, and a query about the past."""
-    _measured("checkpoint", root)
+    _measure_process("checkpoint", root)
     synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
-    return _measured("ready", root), _measured("past", root, _asked(root))
+    return _measure_process("ready", root), _measure_process("past", root, _encode_past_query(root))
 
 
-def _made(site: Site, root: Path, observations: int) -> Path:
+def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
     """Return an archive; make it if it is not there in this size."""
     said = root / "size"
     if said.exists() and said.read_text() == str(observations):
         return root
     shutil.rmtree(root, ignore_errors=True)
     synthetic.write(root, SyntheticFleet(observations, DAYS, vehicles=1000), SEGMENT)
-    _states(root, 2 * observations)
+    _write_states(root, 2 * observations)
     site.say("written; being compacted")
     words = ["compact", "--archive", str(root), "--round-rows", "1000000"]
     subprocess.run(
@@ -138,7 +138,7 @@ def _last_day(root: Path, to: Path, old: int) -> Path:
     return to
 
 
-def _states(root: Path, rows: int) -> None:
+def _write_states(root: Path, rows: int) -> None:
     """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the
     observations.
     """
@@ -167,14 +167,14 @@ def _states(root: Path, rows: int) -> None:
         at += n
 
 
-def _asked(root: Path) -> bytes:
+def _encode_past_query(root: Path) -> bytes:
     """The question about the past, which the service would let through."""
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
     return encode_question(question)
 
 
-def _measured(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
+def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
     """Return the output of a process; see `age_process`."""
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)

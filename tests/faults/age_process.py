@@ -29,11 +29,11 @@ def main() -> None:
     root = Path(sys.argv[2])
     began = time.perf_counter()
     limit_memory(*UNUSED)
-    found = _past(root) if what == "past" else _begun(root, what == "checkpoint")
+    found = _answer_past(root) if what == "past" else _start_engine(root, what == "checkpoint")
     print(json.dumps({"seconds": time.perf_counter() - began, "mb": _most_mb(), **found}))
 
 
-def _past(root: Path) -> dict[str, float]:
+def _answer_past(root: Path) -> dict[str, float]:
     from fleet_service.app.past import answer_line
 
     out = BytesIO()
@@ -41,13 +41,13 @@ def _past(root: Path) -> dict[str, float]:
     return {"bytes": len(out.getvalue())}
 
 
-def _begun(root: Path, and_checkpoint: bool) -> dict[str, float]:
+def _start_engine(root: Path, and_checkpoint: bool) -> dict[str, float]:
     from fleet_service.app.engine import Engine
     from schemas.config import ServiceConfig
 
     with closing(Engine(ServiceConfig(), root)) as engine:
         if and_checkpoint:
-            _checkpoint(engine, root)
+            _write_checkpoint(engine, root)
         return {"cells": engine.state.fusion.size, "processor_s": time.process_time()}
 
 
@@ -57,7 +57,7 @@ def _most_mb() -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
 
 
-def _checkpoint(engine: Engine, root: Path) -> None:
+def _write_checkpoint(engine: Engine, root: Path) -> None:
     from fleet_service.replay import checkpoints
 
     taken: list[checkpoints.Taken | None] = []

@@ -23,9 +23,9 @@ from schemas.config import ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Batch
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.faults.processes import Part, Stage, stage
+from tests.faults.processes import Part, Stage, open_stage
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, batch
 from tests.waiting import until
@@ -39,24 +39,24 @@ Place = tuple[int, int]  # cell and sector
 
 def run(site: Site) -> list[Figure]:
     """Eight restarts of twenty alerts; one of ten in a quick run."""
-    each = site.of(20, 10)
+    each = site.choose_amount(20, 10)
     missing = 0
     waits = []
-    with stage(site.folder) as there:
-        beside = _beside(there)
-        with _opened(there.endpoint) as driver, _opened(beside.command[-1]) as watcher:
+    with open_stage(site.folder) as there:
+        beside = _make_second_router(there)
+        with _open_session(there.endpoint) as driver, _open_session(beside.command[-1]) as watcher:
             fleet = Fleet(driver).meet()
             heard = dict[Place, float]()
             watched = watcher.declare_subscriber(
-                f"{keys.ROOT}/alert/**", lambda sample: _note(heard, sample)
+                f"{keys.ROOT}/alert/**", lambda sample: _record_alert(heard, sample)
             )
-            for turn in range(site.of(8, 1)):
+            for turn in range(site.choose_amount(8, 1)):
                 beside.kill()
                 until(lambda: not list(watcher.info.routers_zid()))
                 heard.clear()
-                fleet.settle(*_ice(turn, each))
-                until(partial(_stand, driver, each * (turn + 1)))
-                standing = _standing(driver)
+                fleet.settle(*_make_ice_batches(turn, each))
+                until(partial(_has_alerts, driver, each * (turn + 1)))
+                standing = _list_alerts(driver)
                 assert not heard, "the watcher was not away"
                 beside.start()
                 until(lambda: list(watcher.info.routers_zid()))
@@ -72,13 +72,13 @@ def run(site: Site) -> list[Figure]:
         f"{missing} missing"
     )
     return [
-        figure("faults.alerts.missing_after_reconnect", missing),
-        figure("faults.alerts.standing", len(waits) + missing),
+        make_figure("faults.alerts.missing_after_reconnect", missing),
+        make_figure("faults.alerts.standing", len(waits) + missing),
         Figure("faults.alerts.longest_s", max(waits, default=float("nan")), "s"),
     ]
 
 
-def _beside(there: Stage) -> Part:
+def _make_second_router(there: Stage) -> Part:
     """A second router, which the first one's clients are not connected to; its port stays over
     restarts.
     """
@@ -93,19 +93,19 @@ def _beside(there: Stage) -> Part:
     return part
 
 
-def _opened(endpoint: str) -> zenoh.Session:
+def _open_session(endpoint: str) -> zenoh.Session:
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     return session
 
 
-def _note(heard: dict[Place, float], sample: zenoh.Sample) -> None:
+def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
     alert = wire.decode_alert(sample.payload.to_bytes())
     if alert.raised:
         heard.setdefault((alert.cell, alert.sector), time.monotonic())
 
 
-def _ice(turn: int, places: int) -> list[Batch]:
+def _make_ice_batches(turn: int, places: int) -> list[Batch]:
     """Ice in so many places that nobody knew, by each of the witnesses."""
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]
@@ -126,12 +126,12 @@ def _ice(turn: int, places: int) -> list[Batch]:
     ]
 
 
-def _stand(session: zenoh.Session, least: int) -> bool:
+def _has_alerts(session: zenoh.Session, least: int) -> bool:
     """Return True if so many alerts stand."""
-    return len(_standing(session)) >= least
+    return len(_list_alerts(session)) >= least
 
 
-def _standing(session: zenoh.Session) -> set[Place]:
+def _list_alerts(session: zenoh.Session) -> set[Place]:
     """Return the standing alerts of the service."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
     return {

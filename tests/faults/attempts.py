@@ -32,13 +32,13 @@ SECRET = b"what only the service may hear"
 ALL_OBSERVATIONS = f"{keys.ROOT}/obs/**"
 
 
-def attempt(function: Attempt) -> Attempt:
+def register_attempt(function: Attempt) -> Attempt:
     """Enter an attack in the table under its name."""
     ATTEMPTS[function.__name__] = function
     return function
 
 
-def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
+def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
     """Return True if a session opens."""
     try:
         with ground.network.session(name, router, **changed):
@@ -47,7 +47,7 @@ def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object
         return False
 
 
-def issued(
+def issue_certificate(
     ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
 ) -> dict[str, Any]:
     """TLS entries with a certificate that the fleet's own authority issued at some time."""
@@ -63,44 +63,48 @@ def issued(
     }
 
 
-def stranger(ground: Ground) -> Path:
+def make_stranger(ground: Ground) -> Path:
     """Folder of another authority that knows the same names."""
     folder = ground.folder / "stranger"
     registry(folder).enrol(enrolment())
     return folder
 
 
-@attempt
+@register_attempt
 def certificate_of_another_authority(ground: Ground) -> bool:
-    folder = stranger(ground)
+    folder = make_stranger(ground)
     certificate = str(folder / "shard-0.pem")
     private = str(folder / "shard-0.key")
-    return opens(ground, SERVICE, connect_certificate=certificate, connect_private_key=private)
+    return can_open(ground, SERVICE, connect_certificate=certificate, connect_private_key=private)
 
 
-@attempt
+@register_attempt
 def no_certificate(ground: Ground) -> bool:
-    return opens(
+    return can_open(
         ground, ROGUE, connect_certificate=None, connect_private_key=None, enable_mtls=False
     )
 
 
-@attempt
+@register_attempt
 def expired_certificate(ground: Ground) -> bool:
-    return opens(ground, ROGUE, **issued(ground, ROGUE, ground.folder / "expired", days_ago=10.0))
+    return can_open(
+        ground, ROGUE, **issue_certificate(ground, ROGUE, ground.folder / "expired", days_ago=10.0)
+    )
 
 
-@attempt
+@register_attempt
 def certificate_that_is_not_good_yet(ground: Ground) -> bool:
-    return opens(ground, ROGUE, **issued(ground, ROGUE, ground.folder / "early", days_ago=-1.0))
+    return can_open(
+        ground, ROGUE, **issue_certificate(ground, ROGUE, ground.folder / "early", days_ago=-1.0)
+    )
 
 
-@attempt
+@register_attempt
 def certificate_without_its_key(ground: Ground) -> bool:
-    return opens(ground, ROGUE, connect_certificate=str(ground.folder / f"{HONEST}.pem"))
+    return can_open(ground, ROGUE, connect_certificate=str(ground.folder / f"{HONEST}.pem"))
 
 
-@attempt
+@register_attempt
 def plain_tcp(ground: Ground) -> bool:
     address = ground.network.endpoints[ROUTERS[0]].partition("/")[2]
     try:
@@ -110,7 +114,7 @@ def plain_tcp(ground: Ground) -> bool:
         return False
 
 
-def lures(ground: Ground, folder: Path, name: str) -> bool:
+def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
     """Return True if an honest vehicle opens a session at a router with this certificate."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
@@ -136,25 +140,27 @@ def lures(ground: Ground, folder: Path, name: str) -> bool:
             return False
 
 
-@attempt
+@register_attempt
 def false_router_of_another_authority(ground: Ground) -> bool:
-    return lures(ground, stranger(ground), ROUTERS[0])
+    return can_lure_vehicle(ground, make_stranger(ground), ROUTERS[0])
 
 
-@attempt
+@register_attempt
 def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
-    return lures(ground, ground.folder, ROGUE)
+    return can_lure_vehicle(ground, ground.folder, ROGUE)
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
     """Return True if any listener receives a message that is published there."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
-    ground.passed(session)
-    return any(listener.has(SECRET) for listener in (ground.monitor, ground.reader, ground.honest))
+    ground.await_effects(session)
+    return any(
+        listener.has_payload(SECRET) for listener in (ground.monitor, ground.reader, ground.honest)
+    )
 
 
-def spoofed(name: str) -> list[str]:
+def list_foreign_keys(name: str) -> list[str]:
     """Keys that do not belong to a vehicle of this name."""
     other = HONEST if name != HONEST else ROGUE
     return [
@@ -179,41 +185,45 @@ def spoofed(name: str) -> list[str]:
     ]
 
 
-@attempt
+@register_attempt
 def vehicle_puts_where_it_may_not(ground: Ground) -> bool:
-    return put_by(ground, ground.open(ROGUE, ROUTERS[1]), *spoofed(ROGUE))
+    return put_by(ground, ground.open_session(ROGUE, ROUTERS[1]), *list_foreign_keys(ROGUE))
 
 
-@attempt
+@register_attempt
 def reader_puts(ground: Ground) -> bool:
     return put_by(
-        ground, ground.open(READER, ROUTERS[1]), *spoofed(HONEST), key(READER), keys.ack_key(READER)
+        ground,
+        ground.open_session(READER, ROUTERS[1]),
+        *list_foreign_keys(HONEST),
+        key(READER),
+        keys.ack_key(READER),
     )
 
 
-@attempt
+@register_attempt
 def sender_of_weather_puts_something_else(ground: Ground) -> bool:
-    session = ground.open(WEATHER, ROUTERS[1])
+    session = ground.open_session(WEATHER, ROUTERS[1])
     session.put(keys.weather_key(REGION), b"rain")
-    others = [place for place in spoofed(HONEST) if place != keys.weather_key(REGION)]
+    others = [place for place in list_foreign_keys(HONEST) if place != keys.weather_key(REGION)]
     through = put_by(ground, session, *others, key(HONEST))
-    return through or not ground.monitor.has(b"rain")
+    return through or not ground.monitor.has_payload(b"rain")
 
 
-@attempt
+@register_attempt
 def declared_publisher_on_another_key(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     for place in (key(HONEST), keys.map_key(TILE), f"{keys.ROOT}/obs/**"):
         session.declare_publisher(place).put(SECRET)
-    ground.passed(session)
-    return ground.monitor.has(SECRET)
+    ground.await_effects(session)
+    return ground.monitor.has_payload(SECRET)
 
 
-@attempt
+@register_attempt
 def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
-    ground.judged()  # else the refusals of attacks before it are counted as its own
-    before = ground.admitted
+    session = ground.open_session(ROGUE, ROUTERS[1])
+    ground.await_judgement()  # else the refusals of attacks before it are counted as its own
+    before = ground.admitted_count
     refused = ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
     session.put(
@@ -221,24 +231,25 @@ def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     )
     ground.drive(session, ROGUE)
     return (
-        ground.admitted != before + 1 or ground.service.engine.counts["refused.key"] != refused + 1
+        ground.admitted_count != before + 1
+        or ground.service.engine.counts["refused.key"] != refused + 1
     )
 
 
-@attempt
+@register_attempt
 def another_name_within_ones_own_key(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
-    ground.judged()
-    before = ground.admitted
+    session = ground.open_session(ROGUE, ROUTERS[1])
+    ground.await_judgement()
+    before = ground.admitted_count
     payload = wire.encode(batch(HONEST, 10**6, 0, [0.1]))
     session.put(key(ROGUE), payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])
     ground.drive(session, ROGUE)
-    return ground.admitted != before + 1
+    return ground.admitted_count != before + 1
 
 
-@attempt
+@register_attempt
 def delete(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     for place in (
         key(HONEST),
         key(ROGUE),
@@ -247,7 +258,7 @@ def delete(ground: Ground) -> bool:
         keys.ack_key(HONEST),
     ):
         session.delete(place)
-    ground.passed(session)
+    ground.await_effects(session)
     return not all(
         put
         for one in (ground.monitor, ground.reader, ground.honest)
@@ -255,17 +266,17 @@ def delete(ground: Ground) -> bool:
     )
 
 
-@attempt
+@register_attempt
 def spoofed_reply(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
 
-    def lie(query: zenoh.Query) -> None:
+    def reply_falsely(query: zenoh.Query) -> None:
         with query:
             query.reply(keys.map_key(TILE), SECRET)
 
     places = (f"{keys.ROOT}/map/**", keys.map_key(TILE))
-    lying = [session.declare_queryable(place, lie, complete=True) for place in places]
-    ground.passed(session)
+    lying = [session.declare_queryable(place, reply_falsely, complete=True) for place in places]
+    ground.await_effects(session)
     asked: Any = ground.reader.session.get(
         f"{keys.ROOT}/map/**",
         target=zenoh.QueryTarget.ALL,
@@ -277,7 +288,7 @@ def spoofed_reply(ground: Ground) -> bool:
     return through
 
 
-def overhears(ground: Ground, session: zenoh.Session) -> bool:
+def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
     """Return True if a session receives another vehicle's observations or acknowledgements."""
     listener = Listener(
         session,
@@ -293,25 +304,25 @@ def overhears(ground: Ground, session: zenoh.Session) -> bool:
             f"{keys.ROOT}/*/**",
         ),
     )
-    ground.passed(session)
+    ground.await_effects(session)
     ground.drive()
-    ground.passed(session, listener)
+    ground.await_effects(session, listener)
     return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in listener.heard)
 
 
-@attempt
+@register_attempt
 def vehicle_overhears(ground: Ground) -> bool:
-    return overhears(ground, ground.open(ROGUE, ROUTERS[1]))
+    return can_overhear(ground, ground.open_session(ROGUE, ROUTERS[1]))
 
 
-@attempt
+@register_attempt
 def reader_overhears(ground: Ground) -> bool:
-    return overhears(ground, ground.open(READER, ROUTERS[1]))
+    return can_overhear(ground, ground.open_session(READER, ROUTERS[1]))
 
 
-@attempt
+@register_attempt
 def foreign_liveliness_token(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     false = keys.ServiceToken("1202/310/*", ROGUE, "1f").key
     foreign = (
         keys.alive_key(HONEST),
@@ -322,24 +333,24 @@ def foreign_liveliness_token(ground: Ground) -> bool:
     places = (*foreign, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]
 
-    def found() -> list[str]:
+    def list_tokens() -> list[str]:
         replies = ground.monitor.session.liveliness().get(f"{keys.ROOT}/**")
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
 
-    until(lambda: keys.alive_key(ROGUE) in found())  # its own comes last
-    through = found()
+    until(lambda: keys.alive_key(ROGUE) in list_tokens())  # its own comes last
+    through = list_tokens()
     for token in tokens:
         token.undeclare()
     own = {keys.alive_key(ROGUE), keys.shard_key(SERVICE)}
     return {key for key in through if f"/{SERVICE}/" not in key} != own
 
 
-@attempt
+@register_attempt
 def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
     token = ground.honest.session.liveliness().declare_token(keys.alive_key(HONEST))
     asked = f"{keys.ROOT}/alive/*"
     until(lambda: any(reply.ok for reply in ground.monitor.session.liveliness().get(asked)))
-    told = any(reply.ok for reply in ground.open(ROGUE, ROUTERS[1]).liveliness().get(asked))
+    told = any(reply.ok for reply in ground.open_session(ROGUE, ROUTERS[1]).liveliness().get(asked))
     token.undeclare()
     return told
 
@@ -354,7 +365,7 @@ def as_router(ground: Ground, mode: str) -> bool:
         "settings": given.model_dump(),
         "name": ROGUE,
         "hear": [f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/ack/**"],
-        "put": spoofed(ROGUE),
+        "put": list_foreign_keys(ROGUE),
         "payload": SECRET.decode(),
     }
     command = [sys.executable, "-m", "tests.faults.rogue"]
@@ -368,7 +379,7 @@ def as_router(ground: Ground, mode: str) -> bool:
         ground.drive()
         print("look", file=process.stdin, flush=True)
         heard = json.loads(process.stdout.readline())
-    ground.passed(ground.honest.session)
+    ground.await_effects(ground.honest.session)
     own = set(told["put"])  # what it puts itself, it hears
     overheard = [
         name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own
@@ -376,27 +387,27 @@ def as_router(ground: Ground, mode: str) -> bool:
     return (
         bool(overheard)
         or heard.count(key(HONEST)) > 1
-        or ground.monitor.has(SECRET)
-        or ground.reader.has(SECRET)
+        or ground.monitor.has_payload(SECRET)
+        or ground.reader.has_payload(SECRET)
     )
 
 
-@attempt
+@register_attempt
 def vehicle_that_plays_router(ground: Ground) -> bool:
     return as_router(ground, "router")
 
 
-@attempt
+@register_attempt
 def vehicle_that_plays_peer(ground: Ground) -> bool:
     return as_router(ground, "peer")
 
 
-@attempt
+@register_attempt
 def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
     through = False
     for name in ("*", "**", "0123", "sim-*", "role/services"):
         with ground.network.session(
-            name, ROUTERS[1], **issued(ground, name, ground.folder / "odd")
+            name, ROUTERS[1], **issue_certificate(ground, name, ground.folder / "odd")
         ) as session:
             places = (
                 key(HONEST),
@@ -410,11 +421,11 @@ def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
             list(session.get(f"{keys.ROOT}/map/**"))
             ground.drive()
             through |= bool(listener.heard)
-    ground.passed(ground.reader.session)
-    return through or ground.monitor.has(SECRET)
+    ground.await_effects(ground.reader.session)
+    return through or ground.monitor.has_payload(SECRET)
 
 
-@attempt
+@register_attempt
 def names_that_look_like_a_tile_or_a_path_are_enrolled(ground: Ground) -> bool:
     through = False
     for name in (
@@ -437,40 +448,40 @@ def names_that_look_like_a_tile_or_a_path_are_enrolled(ground: Ground) -> bool:
     return through
 
 
-@attempt
+@register_attempt
 def one_name_with_two_roles(ground: Ground) -> bool:
     with suppress(ValueError):
         return bool(enrolment(vehicles=[SERVICE]))
     return False
 
 
-@attempt
+@register_attempt
 def batch_that_is_too_large_travels(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     session.put(key(ROGUE), SECRET + bytes(wire.MAX_BYTES))
-    ground.passed(session)
-    return ground.monitor.has(SECRET)
+    ground.await_effects(session)
+    return ground.monitor.has_payload(SECRET)
 
 
-@attempt
+@register_attempt
 def question_with_a_payload_travels(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     answered = ground.service.engine.counts["queries"]
     asked: Any = session.get(keys.map_key(TILE), payload=SECRET + bytes(wire.MAX_BYTES))
     through = any(reply.ok is not None for reply in asked)
     return through or ground.service.engine.counts["queries"] > answered
 
 
-@attempt
+@register_attempt
 def administration_of_the_routers(ground: Ground) -> bool:
-    session = ground.open(ROGUE, ROUTERS[1])
+    session = ground.open_session(ROGUE, ROUTERS[1])
     for router in session.info.routers_zid():
         session.put(f"@/{router}/router/config/access_control/enabled", "false")
     replies = session.get("@/*/router/**")
     return any(reply.ok for reply in replies) or put_by(ground, session, keys.ack_key(HONEST))
 
 
-@attempt
+@register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
     """After the routers were started with a list without it."""
     network = ground.network
@@ -487,7 +498,7 @@ def revoked_vehicle(ground: Ground) -> bool:
     for router in ROUTERS[::-1]:
         network.stop(router)
         network.start(router)
-    session = ground.open(ROGUE, ROUTERS[1], **lost)
+    session = ground.open_session(ROGUE, ROUTERS[1], **lost)
     session.put(key(ROGUE), SECRET)
     listener = Listener(session, (f"{keys.ROOT}/**",))
     list(session.get(f"{keys.ROOT}/map/**"))
@@ -495,4 +506,4 @@ def revoked_vehicle(ground: Ground) -> bool:
     ground.drive()
     with suppress(InputError):
         return bool(again.enrol(enrolment()))
-    return ground.monitor.has(SECRET) or bool(listener.heard)
+    return ground.monitor.has_payload(SECRET) or bool(listener.heard)

@@ -24,7 +24,7 @@ from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import START, batch
 
@@ -54,7 +54,7 @@ class Made:
         if self.up and len(self.queue) < QUEUED * self.cars:
             self.queue.append(batch)
 
-    def work(self, now: float) -> list[tuple[str, bytes]]:
+    def store_queued(self, now: float) -> list[tuple[str, bytes]]:
         """Take as much as a step allows, and put it on disk; returns acknowledgements."""
         if not self.up:
             return []
@@ -62,16 +62,16 @@ class Made:
             self.queue.popleft()
             for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)))
         ]
-        self.engine.intake.ingest([_message(one) for one in taken], START + round(now * NS))
+        self.engine.intake.ingest([_make_message(one) for one in taken], START + round(now * NS))
         return self.engine.settlement.flush()
 
 
-def _message(one: StoredBatch) -> Message:
+def _make_message(one: StoredBatch) -> Message:
     key = keys.observation_key(one.stream.region, one.stream.vehicle)
     return Message(one.stream.kind, key, one.payload, wire.ENCODING[one.stream.kind])
 
 
-def _draft(car: int, now: float) -> tuple[Draft, int]:
+def _make_draft(car: int, now: float) -> tuple[Draft, int]:
     """Return the reports of a car for half a second, and their cell; each car has a road of its
     own.
     """
@@ -91,23 +91,23 @@ def _draft(car: int, now: float) -> tuple[Draft, int]:
         position_std=[0.1],
     )
 
-    def encoded(seq: int, first_held: int) -> bytes:
+    def encode_batch(seq: int, first_held: int) -> bytes:
         return wire.encode(
             replace(told, boot=car + 1, region=region, seq=seq, first_held=first_held)
         )
 
-    return Draft(told.vehicle, Kind.OBSERVATION, region, 1, encoded), cell
+    return Draft(told.vehicle, Kind.OBSERVATION, region, 1, encode_batch), cell
 
 
 def run(site: Site) -> list[Figure]:
     """An hour, or ten minutes in a quick run."""
     with closing(Engine(ServiceConfig(), site.folder / "archive")) as engine:
-        return _run(site, engine)
+        return _run_outage(site, engine)
 
 
-def _run(site: Site, engine: Engine) -> list[Figure]:
-    cars = site.of(20, 2)
-    away_s = site.of(3600, 600)
+def _run_outage(site: Site, engine: Engine) -> list[Figure]:
+    cars = site.choose_amount(20, 2)
+    away_s = site.choose_amount(3600, 600)
     outboxes = [Outbox(site.folder / f"{n}.sqlite", boot=n + 1) for n in range(cars)]
     service = Made(cars, engine)
     made = 0
@@ -115,12 +115,12 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
     cells = set[int]()
     stored = 0
 
-    def step(driving: bool) -> int:
+    def advance_step(driving: bool) -> int:
         nonlocal made, now, stored
         for n, outbox in enumerate(outboxes):
             fresh = []
             if driving:
-                draft, cell = _draft(n, now)
+                draft, cell = _make_draft(n, now)
                 cells.add(cell)
                 fresh = outbox.store([draft], now)
             made += sum(len(batch.payload) for batch in fresh)
@@ -129,26 +129,26 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
                 service.put(one)
         now += STEP_S
         before = engine.counts[Kind.OBSERVATION]
-        for vehicle, ack in service.work(now):
+        for vehicle, ack in service.store_queued(now):
             for stream in wire.decode_ack(ack)[1]:
                 found = Stream(vehicle, stream.boot, stream.kind, stream.region)
                 outboxes[int(vehicle.removeprefix("car-"))].settle(found, stream.durable)
         return engine.counts[Kind.OBSERVATION] - before
 
-    def steps(seconds: float, driving: bool = True) -> list[int]:
-        return [step(driving) for _ in range(math.ceil(seconds / STEP_S))]
+    def advance_seconds(seconds: float, driving: bool = True) -> list[int]:
+        return [advance_step(driving) for _ in range(math.ceil(seconds / STEP_S))]
 
-    steps(60)
+    advance_seconds(60)
     before = service.messages
     service.up = False
-    steps(away_s)
+    advance_seconds(away_s)
     while_away = service.messages - before
     backlog = sum(outbox.batches for outbox in outboxes)
     service.up = True
     taken: list[int] = []
     while sum(outbox.batches for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
-        taken.append(step(driving=True))
-    steps(30, driving=False)
+        taken.append(advance_step(driving=True))
+    advance_seconds(30, driving=False)
     lost = abs(stored - engine.counts[Kind.OBSERVATION])
     left = sum(outbox.batches for outbox in outboxes)
     for outbox in outboxes:
@@ -160,18 +160,18 @@ def _run(site: Site, engine: Engine) -> list[Figure]:
         f"{len(taken) * STEP_S:.0f} s"
     )
     return [
-        figure("faults.away.bytes_ratio", service.sent / made),
-        figure("faults.away.lost", lost + left),
-        figure("faults.away.drain_share", drain),
-        figure("faults.away.backlog", backlog / cars),
-        figure("faults.away.map_missing", len(cells - _shown(engine))),
-        figure("faults.away.late", engine.counts["late"]),
+        make_figure("faults.away.bytes_ratio", service.sent / made),
+        make_figure("faults.away.lost", lost + left),
+        make_figure("faults.away.drain_share", drain),
+        make_figure("faults.away.backlog", backlog / cars),
+        make_figure("faults.away.map_missing", len(cells - _list_shown_cells(engine))),
+        make_figure("faults.away.late", engine.counts["late"]),
         Figure("faults.away.messages_while_away", while_away / cars, "messages a car"),
         Figure("faults.away.noticed_s", begun * STEP_S, "s until cars go fast again"),
     ]
 
 
-def _shown(engine: Engine) -> set[int]:
+def _list_shown_cells(engine: Engine) -> set[int]:
     """Cells that are on the map, by a visit that counted."""
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

@@ -180,7 +180,7 @@ BARS: Final = {
 }
 
 
-def figure(name: str, value: float) -> Figure:
+def make_figure(name: str, value: float) -> Figure:
     """A figure of the table above; KeyError if it is not in it."""
     unit, bar, better = BARS[name]
     return Figure(name, value, unit, bar, better)

@@ -25,7 +25,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.archive.kept import ROUNDS, make, map_of, messages, now_of
 
@@ -48,10 +48,10 @@ def run(site: Site) -> list[Figure]:
     logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
     random_ = random.Random(site.seed)
-    each = site.of(40, 1)
+    each = site.choose_amount(40, 1)
     whole = site.folder / "whole"
     make(whole)
-    right = _found(whole, whole)
+    right = _reload_service(whole, whole)
     unnoticed = []
     loops = []
     tried = 0
@@ -61,10 +61,10 @@ def run(site: Site) -> list[Figure]:
             shutil.rmtree(copy, ignore_errors=True)
             shutil.copytree(whole, copy)
             path = random_.choice(sorted(copy.glob(pattern)))
-            bit = _flip(path, random_)
+            bit = _flip_bit(path, random_)
             tried += 1
             try:
-                found = _found(copy, whole)
+                found = _reload_service(copy, whole)
             except InputError:
                 if (
                     kind != "key"
@@ -73,19 +73,19 @@ def run(site: Site) -> list[Figure]:
             except Exception as error:  # noqa: BLE001 whatever ends a service at its start ends it at each
                 loops.append(f"{kind}: {path.name} bit {bit}: {error!r}")
             else:
-                if not found["counted"] and not _same(found, right):
+                if not found["counted"] and not _is_same(found, right):
                     unnoticed.append(f"{kind}: {path.name} bit {bit}")
-    spools, wrong = _spools(site, random_, site.of(200, 15))
+    spools, wrong = _damage_spool(site, random_, site.choose_amount(200, 15))
     for line in (*unnoticed, *loops, *wrong):
         site.say(line)
     return [
-        figure("faults.bitrot.unnoticed", len(unnoticed) + len(wrong)),
-        figure("faults.bitrot.crash_loops", len(loops)),
-        figure("faults.bitrot.tried", tried + spools),
+        make_figure("faults.bitrot.unnoticed", len(unnoticed) + len(wrong)),
+        make_figure("faults.bitrot.crash_loops", len(loops)),
+        make_figure("faults.bitrot.tried", tried + spools),
     ]
 
 
-def _flip(path: Path, random_: random.Random) -> int:
+def _flip_bit(path: Path, random_: random.Random) -> int:
     data = bytearray(path.read_bytes())
     bit = random_.randrange(8 * len(data))
     data[bit // 8] ^= 1 << bit % 8
@@ -93,7 +93,7 @@ def _flip(path: Path, random_: random.Random) -> int:
     return bit
 
 
-def _found(root: Path, whole: Path) -> dict[str, Any]:
+def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
     """Return map, rows and counters of a service that begins here and receives every batch again."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
@@ -102,13 +102,13 @@ def _found(root: Path, whole: Path) -> dict[str, Any]:
         engine.settlement.flush()
         counts = engine.counts
         told: list[Path] = []
-        rows = {kind: _rows(root, kind, told) for kind in Kind}
+        rows = {kind: _read_rows(root, kind, told) for kind in Kind}
         counted = counts["files_set_aside"] + counts["checkpoints_refused"] + counts["key_failures"]
         counted += counts["witnesses_damaged"] + len(told)
         return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
 
 
-def _rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]]:
+def _read_rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]]:
     columns = ("vehicle", "seq", "row")
     return sorted(
         row
@@ -117,7 +117,7 @@ def _rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]
     )
 
 
-def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
+def _is_same(found: dict[str, Any], right: dict[str, Any]) -> bool:
     now, then = (np.asarray(one["map"]["beliefs"]) for one in (found, right))
     return bool(
         found["rows"] == right["rows"]
@@ -126,7 +126,7 @@ def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
     )
 
 
-def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
+def _damage_spool(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
     """Change bits of a spool; return how often, and the errors that were not noticed."""
     path = site.folder / "whole.sqlite"
     wrong = []
@@ -139,7 +139,7 @@ def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[s
     for number in range(times):
         copy = site.folder / f"spool-{number}.sqlite"
         shutil.copyfile(path, copy)
-        bit = _flip(copy, random_)
+        bit = _flip_bit(copy, random_)
         outbox = Outbox(copy, boot=6)
         held = {
             batch.seq: batch.payload

@@ -109,7 +109,7 @@ CAMPAIGNS: Final = (
     ),
     Campaign(
         "frozen",
-        outages.frozen,
+        outages.freeze_parts,
         ("faults.frozen.lost", "faults.frozen.agent_deadline_misses", "faults.frozen.batches"),
     ),
     Campaign(
@@ -130,7 +130,7 @@ CAMPAIGNS: Final = (
     ),
     Campaign(
         "leaving",
-        outages.leaving,
+        outages.stop_parts,
         (
             "faults.leaving.longest_s",
             "faults.leaving.acknowledged_lost",

@@ -67,7 +67,7 @@ class Told(NamedTuple):
         return sum(begin <= at <= end for _, at in self.stored.values())
 
 
-def told(journals: Iterable[Path]) -> Told:
+def read_journals(journals: Iterable[Path]) -> Told:
     """Read the journals of all generators."""
     out = Told({}, {})
     for journal in journals:
@@ -83,10 +83,10 @@ def told(journals: Iterable[Path]) -> Told:
     return out
 
 
-def take(journals: Iterable[Path], archive: Path) -> Census:
+def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
     """Compare the journals with the whole archive."""
-    stored, settled = told(journals)
-    held, doubled, rows = _archived(archive, {name[:2] for name in stored})
+    stored, settled = read_journals(journals)
+    held, doubled, rows = _count_archived(archive, {name[:2] for name in stored})
     doubled = max(doubled, _doubled_outside(archive))
     missing = {name for name, (records, _) in stored.items() if held.get(name, 0) < records}
     return Census(
@@ -111,7 +111,9 @@ def _doubled_outside(archive: Path) -> int:
     )
 
 
-def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, int], int, int]:
+def _count_archived(
+    archive: Path, starts: set[tuple[str, int]]
+) -> tuple[dict[Name, int], int, int]:
     """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there
     again; all rows.
     """

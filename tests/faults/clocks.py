@@ -31,7 +31,7 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import batch, key
 from tests.fleet_service.replay.test_checkpoints import keep
@@ -59,7 +59,7 @@ class Machine:
         """A service's clock on it."""
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
-    def jumped(self, clock: SteadyClock) -> bool:
+    def has_jumped(self, clock: SteadyClock) -> bool:
         """Return True if a service's clock is far from the true time, or reports that the system
         clock is.
         """
@@ -86,19 +86,19 @@ def run(site: Site) -> list[Figure]:
     ]
     found = Found()
     for number, case in enumerate(cases):
-        _one(site.folder / str(number), case, found, site.of(60, 20))
+        _run_case(site.folder / str(number), case, found, site.choose_amount(60, 20))
         site.say(f"{case}: {found}")
     return [
-        figure("faults.clocks.rejected", found.rejected),
-        figure("faults.clocks.doubled", found.doubled),
-        figure("faults.clocks.retired", found.retired + found.lost),
-        figure("faults.clocks.alerts_lost", found.alerts_lost),
-        figure("faults.clocks.sent", found.sent),
-        figure("faults.clocks.jumps", found.jumps),
+        make_figure("faults.clocks.rejected", found.rejected),
+        make_figure("faults.clocks.doubled", found.doubled),
+        make_figure("faults.clocks.retired", found.retired + found.lost),
+        make_figure("faults.clocks.alerts_lost", found.alerts_lost),
+        make_figure("faults.clocks.sent", found.sent),
+        make_figure("faults.clocks.jumps", found.jumps),
     ]
 
 
-def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
+def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
     machine = Machine(time.time_ns())
     seq = 0
 
@@ -116,7 +116,7 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
                     engine,
                     clock,
                     [
-                        _message(v, again, machine.true - (seq - again) * NS)
+                        _make_message(v, again, machine.true - (seq - again) * NS)
                         for v in range(VEHICLES)
                     ],
                 )
@@ -124,7 +124,7 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             if clock.moment().sure:
                 engine.alerts.expire(clock.now())
 
-    def live(off: int, steps: int, check: Callable[[Engine], None] | None = None) -> None:
+    def run_service(off: int, steps: int, check: Callable[[Engine], None] | None = None) -> None:
         machine.off = off
         with closing(Engine(CONFIG, root)) as engine:
             clock = machine.clock(engine.seen)
@@ -134,13 +134,13 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             if not case.at_start:
                 machine.off = case.jump
                 drive(engine, clock, seconds)
-                found.jumps += machine.jumped(clock)
-                _retire(root, engine, clock)
+                found.jumps += machine.has_jumped(clock)
+                _apply_retention(root, engine, clock)
                 machine.off = 0
                 drive(engine, clock, seconds)
             if case.at_start and off:
-                found.jumps += machine.jumped(clock)
-                _retire(root, engine, clock)
+                found.jumps += machine.has_jumped(clock)
+                _apply_retention(root, engine, clock)
                 machine.off = 0
                 drive(engine, clock, seconds)
             keep(engine, root)
@@ -151,31 +151,31 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             )
             found.alerts_lost += engine.alerts.count == 0
 
-    def stands(engine: Engine) -> None:
+    def check_alert(engine: Engine) -> None:
         found.alerts_lost += engine.alerts.count == 0
 
-    live(0, seconds)
-    live(case.jump if case.at_start else 0, seconds, stands)
-    live(0, 3, stands)
-    rows = _rows(root)
+    run_service(0, seconds)
+    run_service(case.jump if case.at_start else 0, seconds, check_alert)
+    run_service(0, 3, check_alert)
+    rows = _count_rows(root)
     found.doubled += sum(n - 1 for n in rows.values())
     found.lost += VEHICLES * seq - len(rows)
 
 
-def _retire(root: Path, engine: Engine, clock: SteadyClock) -> None:
+def _apply_retention(root: Path, engine: Engine, clock: SteadyClock) -> None:
     """Retention as the service does it."""
     jobs = archive_jobs(engine, CONFIG, root, clock.moment)
     next(job for job in jobs if job.name == "retention").work(threading.Event())
 
 
-def _message(vehicle: int, seq: int, at: int) -> Message:
+def _make_message(vehicle: int, seq: int, at: int) -> Message:
     one = batch(f"sim-{vehicle:03}", seq, at, [0.15])
     return Message(
         Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
     )
 
 
-def _rows(root: Path) -> Counter[tuple[int, int]]:
+def _count_rows(root: Path) -> Counter[tuple[int, int]]:
     """Return how often each batch's row is in the archive; a vehicle has another pseudonym in
     another month.
     """

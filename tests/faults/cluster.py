@@ -26,8 +26,8 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.cluster import cluster as ack_p50_s
 from tests.buckets import bucket_server
-from tests.faults.bars import figure
-from tests.faults.census import Census, take
+from tests.faults.bars import make_figure
+from tests.faults.census import Census, compare_with_archive
 from tests.faults.cluster_service import COMPACTING, COPYING
 from tests.faults.cluster_stage import (
     PATIENCE_S,
@@ -38,11 +38,11 @@ from tests.faults.cluster_stage import (
     Failover,
     Journals,
     Machines,
-    drained,
-    loads,
-    populate,
+    drain_loads,
+    start_loads,
+    write_town_archive,
 )
-from tests.faults.frame import Campaign, Site, conduct, leave
+from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
 from tests.standbys import hosts, restored
 from tests.waiting import until
 
@@ -110,12 +110,12 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
                 **PERIODS,
             )
         )
-        box = populate(there[0].root)
+        box = write_town_archive(there[0].root)
         there[0].part.start()
         until(lambda: there[0].said("ready: "), PATIENCE_S)
         cells = int(there[0].part.line_with("ready: ").split(", ")[1].split()[0])
         site.say(f"{cells} cells")
-        parts = loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
+        parts = start_loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
         for part in parts:
             stack.callback(part.kill)
         machines = Machines(
@@ -126,9 +126,9 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         router_of = ZenohSettings(connect=[endpoint])
         for number in range(failovers):
             way = ways[number % len(ways)]
-            machines.ready(2 if way == TWO else 1)
+            machines.start_standbys(2 if way == TWO else 1)
             time.sleep(random_.uniform(*HOLD_S))
-            found = machines.fail(way)
+            found = machines.fail_over(way)
             happened += [found] if found else []
             told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
             site.say(
@@ -136,34 +136,34 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
                 "nobody serves"
             )
             if number % EVERY == EVERY // 2 - 1:
-                machines.ready(1)
+                machines.start_standbys(1)
                 pauses.append(machines.pause_s(router_of))
                 site.say(f"handed over, a pause of {pauses[-1]:.1f} s")
             if number % EVERY == EVERY - 1:
-                machines.ready(1)
+                machines.start_standbys(1)
                 differences.append(machines.map_difference(router_of, parts))
                 site.say(f"handed over, the map differs by {differences[-1]:g}")
         asking.end()
-        drained(parts)
-        seen = machines.leave()
+        drain_loads(parts)
+        seen = machines.stop_all()
         rows = [rows_of(host.root) for host in seen]
-        census = [take([part.log for part in parts], host.root) for host in seen]
+        census = [compare_with_archive([part.log for part in parts], host.root) for host in seen]
         empty = restored(site.folder / "empty", bucket)
         rows.append(rows_of(empty))
-        census.append(take([part.log for part in parts], empty))
+        census.append(compare_with_archive([part.log for part in parts], empty))
     site.say(f"rows {rows}; {census}")
     return [
-        *_counted(failovers, happened, census),
-        *_told(happened),
+        *_make_figures(failovers, happened, census),
+        *_make_median_figures(happened),
         *ack_p50_s(),
-        figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
-        figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
-        _shown(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
-        figure("cluster.cells", cells),
-        figure("cluster.silent_regions", asking.silent),
-        figure("cluster.unserved_answers", asking.unserved),
-        figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
-        figure("cluster.empty_disk.rows", rows[-1]),
+        make_figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
+        make_figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
+        _make_figure(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
+        make_figure("cluster.cells", cells),
+        make_figure("cluster.silent_regions", asking.silent),
+        make_figure("cluster.unserved_answers", asking.unserved),
+        make_figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
+        make_figure("cluster.empty_disk.rows", rows[-1]),
     ]
 
 
@@ -172,35 +172,35 @@ def rows_of(root: Path) -> int:
     return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
 
 
-def _counted(failovers: int, happened: list[Failover], census: list[Census]) -> list[Figure]:
+def _make_figures(failovers: int, happened: list[Failover], census: list[Census]) -> list[Figure]:
     ways = defaultdict(list)
     for one in happened:
         ways[one.way].append(one.seconds)
 
-    def longest(kinds: tuple[str, ...]) -> float:
+    def find_longest(kinds: tuple[str, ...]) -> float:
         return max((seconds for kind in kinds for seconds in ways[kind]), default=float("nan"))
 
     return [
-        figure("cluster.lost", sum(one.acknowledged_lost for one in census)),
-        figure("cluster.doubled", sum(one.doubled for one in census)),
-        figure("cluster.unacknowledged_lost", sum(one.lost for one in census)),
-        figure("cluster.takeover_s.kill", longest(KILLED)),
-        figure("cluster.takeover_s.freeze", longest(FROZEN)),
-        _shown(failovers, "cluster.failovers", len(happened), "failovers"),
-        _shown(failovers, "cluster.acknowledged", census[0].settled, "batches"),
+        make_figure("cluster.lost", sum(one.acknowledged_lost for one in census)),
+        make_figure("cluster.doubled", sum(one.doubled for one in census)),
+        make_figure("cluster.unacknowledged_lost", sum(one.lost for one in census)),
+        make_figure("cluster.takeover_s.kill", find_longest(KILLED)),
+        make_figure("cluster.takeover_s.freeze", find_longest(FROZEN)),
+        _make_figure(failovers, "cluster.failovers", len(happened), "failovers"),
+        _make_figure(failovers, "cluster.acknowledged", census[0].settled, "batches"),
         *(
-            _shown(failovers, f"cluster.failovers.{name}", len(ways[way]), "failovers")
+            _make_figure(failovers, f"cluster.failovers.{name}", len(ways[way]), "failovers")
             for way, name in NAMED.items()
         ),
     ]
 
 
-def _shown(failovers: int, name: str, value: float, unit: str) -> Figure:
+def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
     """With its bar where the whole campaign ran."""
-    return figure(name, value) if failovers >= FULL else Figure(name, value, unit)
+    return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 
 
-def _told(happened: list[Failover]) -> list[Figure]:
+def _make_median_figures(happened: list[Failover]) -> list[Figure]:
     """Without bars: the half of it."""
     found = []
     for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
@@ -235,10 +235,12 @@ def main() -> int:
     campaign = Campaign(
         "cluster", partial(run, failovers=args.failovers, lease_s=args.lease_s), OWES
     )
-    found = conduct([campaign], args.out, "cluster", quick=args.failovers < FULL, seed=args.seed)
+    found = run_campaigns(
+        [campaign], args.out, "cluster", quick=args.failovers < FULL, seed=args.seed
+    )
     print(figures.markdown(found))
     return 0 if all(one.holds for one in found) else 1
 
 
 if __name__ == "__main__":
-    leave(main)
+    run_and_exit(main)

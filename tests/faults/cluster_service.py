@@ -26,7 +26,7 @@ _put_there = BucketReplica._upload_if_present
 _copying = threading.local()
 
 
-def _say(sign: str, what: str) -> None:
+def _print_mark(sign: str, what: str) -> None:
     print(f"{what} {sign}", flush=True)
 
 
@@ -34,18 +34,18 @@ def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
 ) -> str | None:
     """Run a module as the service does, and print when it begins and ends."""
-    _say(BEGINS, COMPACTING)
+    _print_mark(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)
-    _say(ENDS, COMPACTING)
+    _print_mark(ENDS, COMPACTING)
     return output
 
 
-def follow(copy: BucketReplica) -> int:
+def sync_and_report(copy: BucketReplica) -> int:
     """Sync like `BucketReplica.sync`."""
     _copying.at = False
     changed = _follow(copy)
     if _copying.at:
-        _say(ENDS, COPYING)
+        _print_mark(ENDS, COPYING)
     return changed
 
 
@@ -53,11 +53,13 @@ def put_there(copy: BucketReplica, name: str) -> bool:
     """As `BucketReplica._upload_if_present`; the first one of a turn says that it begins."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
-        _say(BEGINS, COPYING)
+        _print_mark(BEGINS, COPYING)
     return _put_there(copy, name)
 
 
 if __name__ == "__main__":
-    beside.run_module, BucketReplica.sync, BucketReplica._upload_if_present = run, follow, put_there  # type: ignore[method-assign,assignment]
+    beside.run_module = run  # type: ignore[assignment]
+    BucketReplica.sync = sync_and_report  # type: ignore[method-assign,assignment]
+    BucketReplica._upload_if_present = put_there  # type: ignore[method-assign,assignment]
     jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]
     sys.exit(main())

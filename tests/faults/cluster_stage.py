@@ -48,7 +48,7 @@ SETTLED_S: Final = 2.0  # after which all that was sent is in a segment
 PATIENCE_S: Final = 600.0  # a takeover that takes long is a figure, no hang
 
 
-def populate(root: Path) -> str:
+def write_town_archive(root: Path) -> str:
     """An archive with the map of a town, as of today; returns a box of it."""
     writer = Writer(root, "shard-0")
     since = time.time_ns() - START_NS - DAY_S * NS - 60 * NS
@@ -71,7 +71,7 @@ class Journals:
         self._read = Counter[Path]()
         self._times: list[float] = []
 
-    def news(self) -> list[float]:
+    def read_new_times(self) -> list[float]:
         """Times [s] of the acknowledgements since the last call."""
         found: list[float] = []
         for path in self._paths:
@@ -83,7 +83,7 @@ class Journals:
         self._times += found
         return found
 
-    def pause(self, since: float) -> float:
+    def longest_pause(self, since: float) -> float:
         """Longest time without an acknowledgement since then [s], as far as was read."""
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
@@ -91,15 +91,17 @@ class Journals:
         """Time of the first acknowledgement after a moment; waits for it."""
         later: list[float] = []
 
-        def there() -> bool:
-            later.extend(at for at in self.news() if at > moment)
+        def has_arrived() -> bool:
+            later.extend(at for at in self.read_new_times() if at > moment)
             return bool(later)
 
-        until(there, PATIENCE_S)
+        until(has_arrived, PATIENCE_S)
         return min(later)
 
 
-def loads(folder: Path, endpoint: str, processes: int, vehicles: int, rate: float) -> list[Part]:
+def start_loads(
+    folder: Path, endpoint: str, processes: int, vehicles: int, rate: float
+) -> list[Part]:
     """Generators, started; `rate` observations per second and vehicle."""
     made = []
     for number in range(processes):
@@ -139,9 +141,9 @@ class Asking:
         self._box = box
         self.whole = self.unserved = self.silent = 0
         self._stop = threading.Event()
-        self._known = self._cells()[0]
+        self._known = self._read_cells()[0]
         assert len(self._known) > 100, "the box is empty"
-        self._thread = threading.Thread(target=self._ask, daemon=True)
+        self._thread = threading.Thread(target=self._ask_repeatedly, daemon=True)
         self._thread.start()
 
     def end(self) -> None:
@@ -149,7 +151,7 @@ class Asking:
         self._stop.set()
         self._thread.join(PATIENCE_S)
 
-    def _cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
+    def _read_cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
         """Cells and sectors of the box, and whether something is said to be missing."""
         try:
             answer = map_client.query_map(self._router, {"bbox": self._box})
@@ -163,9 +165,9 @@ class Asking:
         found = frozenset((cell, sector) for cell, sector in zip(*both, strict=True))
         return found, answer.gap_description is not None or not answer.served
 
-    def _ask(self) -> None:
+    def _ask_repeatedly(self) -> None:
         while not self._stop.wait(self.PAUSE_S):
-            found, missing = self._cells()
+            found, missing = self._read_cells()
             whole = self._known <= found
             self.whole += whole
             self.unserved += missing
@@ -187,35 +189,35 @@ class Way(NamedTuple):
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
 
 
-def _kill(host: Host, *_: object) -> None:
+def _kill_host(host: Host, *_: object) -> None:
     host.part.kill()
 
 
-def _freeze(host: Host, *_: object) -> None:
-    host.part.send(signal.SIGSTOP)
+def _freeze_host(host: Host, *_: object) -> None:
+    host.part.send_signal(signal.SIGSTOP)
 
 
-def _doze(host: Host, random_: random.Random, lease_s: float) -> None:
-    host.part.send(signal.SIGSTOP)
+def _pause_host(host: Host, random_: random.Random, lease_s: float) -> None:
+    host.part.send_signal(signal.SIGSTOP)
     timer = threading.Timer(
-        lease_s * random_.uniform(*FROZEN), lambda: host.part.send(signal.SIGCONT)
+        lease_s * random_.uniform(*FROZEN), lambda: host.part.send_signal(signal.SIGCONT)
     )
     timer.daemon = True
     timer.start()
 
 
-def _amid(what: str) -> Go:
+def _kill_during(what: str) -> Go:
     def go(host: Host, random_: random.Random, _: float) -> None:
         line = f"{what} {BEGINS}"
-        before = host.part.lines().count(line)
-        until(lambda: host.part.lines().count(line) > before, PATIENCE_S)
+        before = host.part.read_lines().count(line)
+        until(lambda: host.part.read_lines().count(line) > before, PATIENCE_S)
         time.sleep(random_.uniform(0.0, AMID_S))
         host.part.kill()
 
     return go
 
 
-def _mended(host: Host, random_: random.Random) -> None:
+def _restore_link(host: Host, random_: random.Random) -> None:
     """A link comes back at some time, or not before the service has seen by itself that it was
     followed.
     """
@@ -223,11 +225,11 @@ def _mended(host: Host, random_: random.Random) -> None:
         time.sleep(random_.uniform(0.0, 3.0))
         host.to_bucket.mend()
         host.to_router.mend()
-    _followed(host, random_)
+    _check_superseded(host, random_)
     host.to_bucket.mend()
 
 
-def _followed(host: Host, _: random.Random) -> None:
+def _check_superseded(host: Host, _: random.Random) -> None:
     assert host.part.wait(PATIENCE_S) == 1
     assert host.said("lease lost to another service")
 
@@ -235,14 +237,14 @@ def _followed(host: Host, _: random.Random) -> None:
 TWO: Final = "two standbys"
 WAKES: Final = "wakes"
 WAYS: Final = {
-    "kill": Way(_kill),
-    "freeze": Way(_freeze),
-    "bucket": Way(lambda host, *_: host.to_bucket.cut(), _mended),
-    "routers": Way(lambda host, *_: host.to_router.cut(), _mended),
-    TWO: Way(_kill),
-    WAKES: Way(_doze, _followed),
-    COMPACTING: Way(_amid(COMPACTING)),
-    COPYING: Way(_amid(COPYING)),
+    "kill": Way(_kill_host),
+    "freeze": Way(_freeze_host),
+    "bucket": Way(lambda host, *_: host.to_bucket.cut(), _restore_link),
+    "routers": Way(lambda host, *_: host.to_router.cut(), _restore_link),
+    TWO: Way(_kill_host),
+    WAKES: Way(_pause_host, _check_superseded),
+    COMPACTING: Way(_kill_during(COMPACTING)),
+    COPYING: Way(_kill_during(COPYING)),
 }
 
 
@@ -274,47 +276,49 @@ class Machines:
         self._journals = journals
         self._random = random_
 
-    def ready(self, standbys: int) -> None:
+    def start_standbys(self, standbys: int) -> None:
         """So many wait."""
         while len(self.waiting) < standbys:
             host = self._idle.pop(0)
             host.part.start()
             self.waiting.append(host)
-        until(lambda: all(_lives(host).said("standby: ") for host in self.waiting), PATIENCE_S)
+        until(
+            lambda: all(_require_alive(host).said("standby: ") for host in self.waiting), PATIENCE_S
+        )
 
-    def fail(self, name: str) -> Failover | None:
+    def fail_over(self, name: str) -> Failover | None:
         """Let the service go; None if nobody had to follow it."""
         gone = self.serving
         way = WAYS[name]
-        terms = self._terms()
+        terms = self._count_leases()
         way.go(gone, self._random, self._lease_s)
         began = time.time()
         if name == WAKES:
             end = time.monotonic() + WOKE * self._lease_s
-            until(lambda: self._terms() > terms or time.monotonic() > end, PATIENCE_S)
-            if self._terms() == terms:
+            until(lambda: self._count_leases() > terms or time.monotonic() > end, PATIENCE_S)
+            if self._count_leases() == terms:
                 return None
-        self._taken()
+        self._await_takeover()
         seconds = self._journals.first_after(time.time()) - began
         way.end(gone, self._random)
         self._idle.append(gone)
         hit = name not in (COMPACTING, COPYING) or _was_amid(gone, name)
         return Failover(name if hit else "kill", seconds)
 
-    def _terms(self) -> int:
+    def _count_leases(self) -> int:
         """Return the number of leases taken so far."""
         return sum(1 for _ in self._leases.glob("*.json"))
 
-    def _taken(self) -> None:
+    def _await_takeover(self) -> None:
         """One that waited serves; waits for it."""
-        until(self._next, PATIENCE_S)
-        taker = self._next()
+        until(self._find_ready, PATIENCE_S)
+        taker = self._find_ready()
         assert taker is not None
         self.waiting.remove(taker)
         self.serving = taker
 
-    def _next(self) -> Host | None:
-        return next((host for host in self.waiting if _lives(host).said("ready: ")), None)
+    def _find_ready(self) -> Host | None:
+        return next((host for host in self.waiting if _require_alive(host).said("ready: ")), None)
 
     def hand_over(self, router: ZenohSettings) -> Host:
         """The service gives its region to the one that waits, and has left then; returns it."""
@@ -322,7 +326,7 @@ class Machines:
         to = self.waiting[0].root.parent.name
         with map_client.open_connected(router) as session:
             assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
-        self._taken()
+        self._await_takeover()
         assert former.part.wait(PATIENCE_S) == 0
         self._idle.append(former)
         return former
@@ -332,14 +336,14 @@ class Machines:
         began = self._journals.first_after(time.time())
         self.hand_over(router)
         self._journals.first_after(time.time())
-        return self._journals.pause(began)
+        return self._journals.longest_pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
         """Measure a hand-over without load: the largest difference between both states, as in
         their checkpoints.
         """
         for part in parts:
-            part.send(signal.SIGSTOP)
+            part.send_signal(signal.SIGSTOP)
         time.sleep(SETTLED_S)
         former = self.hand_over(router)
         mine = self.serving.root / CHECKPOINTS
@@ -349,33 +353,35 @@ class Machines:
             checkpoints.load(checkpoints.newest(host.root)[0]) for host in (former, self.serving)
         ]
         for part in parts:
-            part.send(signal.SIGCONT)
-        return difference(both[0].tables, both[1].tables)
+            part.send_signal(signal.SIGCONT)
+        return find_difference(both[0].tables, both[1].tables)
 
-    def leave(self) -> list[Host]:
+    def stop_all(self) -> list[Host]:
         """One after the other takes over, and stops; each machine has then seen all of it."""
         seen = []
         everybody = len(self.waiting) + len(self._idle)
         for left in range(everybody, -1, -1):
-            self.ready(1 if left else 0)
+            self.start_standbys(1 if left else 0)
             assert self.serving.part.stop() == 0
             seen.append(self.serving)
             if left:
-                self._taken()
+                self._await_takeover()
         return seen
 
 
-def _lives(host: Host) -> Host:
-    assert host.part.alive, f"it ended; see {host.part.log}"
+def _require_alive(host: Host) -> Host:
+    assert host.part.is_alive, f"it ended; see {host.part.log}"
     return host
 
 
 def _was_amid(host: Host, what: str) -> bool:
-    said = [line for line in host.part.lines() if line in (f"{what} {BEGINS}", f"{what} {ENDS}")]
+    said = [
+        line for line in host.part.read_lines() if line in (f"{what} {BEGINS}", f"{what} {ENDS}")
+    ]
     return bool(said) and said[-1].endswith(BEGINS)
 
 
-def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
+def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
     """Return the largest difference of numbers with a fraction; infinite if anything else
     differs.
     """
@@ -394,9 +400,9 @@ def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
     return worst
 
 
-def drained(parts: list[Part]) -> None:
+def drain_loads(parts: list[Part]) -> None:
     """No new observations; wait until all are acknowledged, or nothing comes any more."""
     for part in parts:
-        part.send(signal.SIGUSR1)
+        part.send_signal(signal.SIGUSR1)
     with suppress(TimeoutError):
-        until(lambda: not any(part.alive for part in parts), PATIENCE_S)
+        until(lambda: not any(part.is_alive for part in parts), PATIENCE_S)

@@ -24,7 +24,7 @@ from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.segment_log import SegmentLog
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.crash_model import ROWS, Batch, rows_of
 from tests.faults.frame import Site
 from tests.faults.processes import Part
@@ -42,10 +42,10 @@ class Writing:
         self.acknowledged = 0
         self._log: SegmentLog[Batch] = SegmentLog(root, "shard")
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._write)
+        self._thread = threading.Thread(target=self._write_batches)
         self._thread.start()
 
-    def _write(self) -> None:
+    def _write_batches(self) -> None:
         while not self._stop.wait(PAUSE_S):
             first = self.acknowledged + 1
             batches = [Batch(Kind.OBSERVATION, seq) for seq in range(first, first + BATCHES)]
@@ -66,15 +66,15 @@ class Reading:
         self._root = root
         self._writing = writing
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._read)
+        self._thread = threading.Thread(target=self._read_rows)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read_rows(self) -> None:
         while not self._stop.is_set():
             owed = self._writing.acknowledged
             whole = reading.read(self._root, Kind.OBSERVATION, ["seq", "row"])
-            self.incomplete += not complete(whole, owed)
-            self.incomplete += not complete(outside(self._root), 0)
+            self.incomplete += not is_complete(whole, owed)
+            self.incomplete += not is_complete(read_compacted(self._root), 0)
             self.reads += 2
 
     def close(self) -> None:
@@ -83,7 +83,7 @@ class Reading:
         self._thread.join()
 
 
-def outside(root: Path) -> Iterable[pa.Table]:
+def read_compacted(root: Path) -> Iterable[pa.Table]:
     """Return the rows that a foreign tool reads: the compacted files alone, as listed at one
     moment.
     """
@@ -91,7 +91,7 @@ def outside(root: Path) -> Iterable[pa.Table]:
         yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
 
 
-def complete(tables: Iterable[pa.Table], owed: int) -> bool:
+def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
     """Return True if the rows of batches 1 … `owed` are there, and none twice."""
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
@@ -108,19 +108,19 @@ def run(site: Site) -> list[Figure]:
         "compaction", [sys.executable, "-m", "tests.faults.compaction", str(root)], site.folder
     )
     with closing(Writing(root)) as writing, closing(Reading(root, writing)) as reader:
-        for _ in range(site.of(50, 5)):
+        for _ in range(site.choose_amount(50, 5)):
             part.start()
             part.line_with("compacting")
             time.sleep(random_.uniform(*UNTIL_KILL_S))
             part.kill()
     compact(root)
-    incomplete = reader.incomplete + (not complete(outside(root), writing.acknowledged))
+    incomplete = reader.incomplete + (not is_complete(read_compacted(root), writing.acknowledged))
     site.say(f"{part.starts} kills, {reader.reads} reads, {writing.acknowledged} batches")
     return [
-        figure("faults.compaction.incomplete_reads", incomplete),
-        figure("faults.compaction.kills", part.starts),
-        figure("faults.compaction.reads", reader.reads),
-        figure("faults.compaction.batches", writing.acknowledged),
+        make_figure("faults.compaction.incomplete_reads", incomplete),
+        make_figure("faults.compaction.kills", part.starts),
+        make_figure("faults.compaction.reads", reader.reads),
+        make_figure("faults.compaction.batches", writing.acknowledged),
     ]
 
 

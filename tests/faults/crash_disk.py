@@ -33,7 +33,7 @@ class CrashDisk:
     """Durable content of a folder.
 
     Args:
-        live: the folder; empty, or an image that `image` made.
+        live: the folder; empty, or an image that `write_image` made.
         random_: chooses what survives.
         power: operations until power is lost; None: it stays.
         full: operations that find the disk full, by number.
@@ -56,47 +56,47 @@ class CrashDisk:
         for folder, folders, files in os.walk(live):
             self._names[folder] = dict.fromkeys(folders, FOLDER)
             for name in files:
-                self._names[folder][name] = number = self._new(Path(folder) / name)
+                self._names[folder][name] = number = self._number_file(Path(folder) / name)
                 self._synced[number] = (Path(folder) / name).read_bytes()
 
-    def _operate(self, *, needs_room: bool) -> None:
+    def _count_operation(self, *, needs_room: bool) -> None:
         self.operations += 1
         if self._power is not None and self.operations > self._power:
             raise PowerLoss
         if needs_room and self.operations in self._full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def _new(self, path: Path) -> int:
+    def _number_file(self, path: Path) -> int:
         """Number of a file that has just been made."""
         self._numbers += 1
         self._number[path.stat().st_ino] = self._numbers
         return self._numbers
 
-    def _gone(self, path: Path) -> None:
+    def _keep_content(self, path: Path) -> None:
         """The file is about to lose its name."""
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 
-    def _ours(self, path: object) -> bool:
+    def _is_ours(self, path: object) -> bool:
         return isinstance(path, (str, os.PathLike)) and Path(path).is_relative_to(self.live)
 
-    def _changed(self, path: str | os.PathLike[str], number: int | None) -> None:
+    def _record_change(self, path: str | os.PathLike[str], number: int | None) -> None:
         self._later[str(Path(path).parent)].append((Path(path).name, number))
 
     @contextmanager
-    def mounted(self) -> Iterator[None]:
+    def intercept_calls(self) -> Iterator[None]:
         """All operations on the folder go through here inside the block."""
         calls: dict[str, Callable[..., Callable[..., object]]] = {
-            "fsync": self._fsync,
-            "rename": self._rename,
-            "replace": self._rename,
-            "open": self._open,
+            "fsync": self._wrap_fsync,
+            "rename": self._wrap_rename,
+            "replace": self._wrap_rename,
+            "open": self._wrap_open,
         }
         calls |= {
-            "unlink": self._unlink,
-            "remove": self._unlink,
-            "mkdir": self._mkdir,
-            "rmdir": self._unlink,
+            "unlink": self._wrap_unlink,
+            "remove": self._wrap_unlink,
+            "mkdir": self._wrap_mkdir,
+            "rmdir": self._wrap_unlink,
         }
         patches = [
             mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()
@@ -111,36 +111,36 @@ class CrashDisk:
             for patch in patches:
                 patch.stop()
 
-    def _fsync(self, real: Callable[[int], None]) -> Callable[[int], None]:
+    def _wrap_fsync(self, real: Callable[[int], None]) -> Callable[[int], None]:
         def fsync(handle: int) -> None:
             path = Path(f"/proc/self/fd/{handle}").resolve()
             found = os.fstat(handle)
-            if self._ours(path):
-                self._operate(needs_room=not stat.S_ISDIR(found.st_mode))
+            if self._is_ours(path):
+                self._count_operation(needs_room=not stat.S_ISDIR(found.st_mode))
                 if stat.S_ISDIR(found.st_mode):
                     for name, number in self._later.pop(str(path), []):
-                        _apply(self._names.setdefault(str(path), {}), name, number)
+                        _apply_change(self._names.setdefault(str(path), {}), name, number)
                 else:
                     self._synced[self._number[found.st_ino]] = path.read_bytes()
 
         return fsync
 
-    def _rename(self, real: Callable[..., None]) -> Callable[..., None]:
+    def _wrap_rename(self, real: Callable[..., None]) -> Callable[..., None]:
         def rename(source: Path, target: Path) -> None:
-            if self._ours(source):
-                self._operate(needs_room=False)
-                self._gone(Path(target))
-                self._changed(source, None)
+            if self._is_ours(source):
+                self._count_operation(needs_room=False)
+                self._keep_content(Path(target))
+                self._record_change(source, None)
                 if Path(source).is_dir():
-                    self._moved(str(source), str(target))
-                    self._changed(target, FOLDER)
+                    self._move_names(str(source), str(target))
+                    self._record_change(target, FOLDER)
                 else:
-                    self._changed(target, self._number[Path(source).stat().st_ino])
+                    self._record_change(target, self._number[Path(source).stat().st_ino])
             real(source, target)
 
         return rename
 
-    def _moved(self, source: str, target: str) -> None:
+    def _move_names(self, source: str, target: str) -> None:
         """Rename a folder: its durable content stays durable under whichever of the two names
         survives.
         """
@@ -149,39 +149,39 @@ class CrashDisk:
         for path in [path for path in self._later if f"{path}/".startswith(f"{source}/")]:
             self._later[target + path.removeprefix(source)] = self._later[path].copy()
 
-    def _unlink(self, real: Callable[..., None]) -> Callable[..., None]:
+    def _wrap_unlink(self, real: Callable[..., None]) -> Callable[..., None]:
         def unlink(path: Path, **more: object) -> None:
-            if self._ours(path):
-                self._operate(needs_room=False)
-                self._gone(Path(path))
+            if self._is_ours(path):
+                self._count_operation(needs_room=False)
+                self._keep_content(Path(path))
                 real(path, **more)
-                self._changed(path, None)
+                self._record_change(path, None)
             else:
                 real(path, **more)
 
         return unlink
 
-    def _mkdir(self, real: Callable[..., None]) -> Callable[..., None]:
+    def _wrap_mkdir(self, real: Callable[..., None]) -> Callable[..., None]:
         def mkdir(path: Path, *more: object, **named: object) -> None:
-            if self._ours(path):
-                self._operate(needs_room=True)
+            if self._is_ours(path):
+                self._count_operation(needs_room=True)
                 real(path, *more, **named)
                 self._names.pop(str(path), None)  # of one that had this name before
                 self._later.pop(str(path), None)
-                self._changed(path, FOLDER)
+                self._record_change(path, FOLDER)
             else:
                 real(path, *more, **named)
 
         return mkdir
 
-    def _open(self, real: Callable[..., int]) -> Callable[..., int]:
+    def _wrap_open(self, real: Callable[..., int]) -> Callable[..., int]:
         def open_(path: Path, flags: int, *more: object, **named: object) -> int:
-            new = bool(flags & os.O_CREAT) and self._ours(path) and not Path(path).exists()
+            new = bool(flags & os.O_CREAT) and self._is_ours(path) and not Path(path).exists()
             if new:
-                self._operate(needs_room=True)
+                self._count_operation(needs_room=True)
             handle = real(path, flags, *more, **named)
             if new:
-                self._changed(path, self._new(Path(path)))
+                self._record_change(path, self._number_file(Path(path)))
             return handle
 
         return open_
@@ -191,51 +191,51 @@ class CrashDisk:
 
         class Raw(io.FileIO):
             def write(self, data: bytes) -> int:  # type: ignore[override]  # nobody hands it anything else
-                disk._operate(needs_room=True)
+                disk._count_operation(needs_room=True)
                 return super().write(data)
 
         def open_(path: Path, mode: str = "r", *more: object, **named: object) -> object:
-            if disk._ours(path) and "+" in mode:
-                disk._operate(needs_room=True)
-            if not disk._ours(path) or "w" not in mode:
+            if disk._is_ours(path) and "+" in mode:
+                disk._count_operation(needs_room=True)
+            if not disk._is_ours(path) or "w" not in mode:
                 return real(path, mode, *more, **named)
             new = not path.exists()
-            disk._operate(needs_room=new)
+            disk._count_operation(needs_room=new)
             raw = Raw(path, "w")
             if new:
-                disk._changed(path, disk._new(path))
+                disk._record_change(path, disk._number_file(path))
             file = io.BufferedWriter(raw)  # type: ignore[type-var]  # for that reason
             return file if "b" in mode else io.TextIOWrapper(file, encoding="utf-8")
 
         return open_
 
-    def image(self, target: Path) -> None:
+    def write_image(self, target: Path) -> None:
         """Create the folder that a machine finds after power loss at this moment."""
         there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
         numbered = {self._number.get(path.stat().st_ino): path for path in there}
         written = {
             number: path.read_bytes() for number, path in numbered.items() if number is not None
         }
-        self._image(str(self.live), target, {**self._written, **written})
+        self._write_folder_image(str(self.live), target, {**self._written, **written})
 
-    def _image(self, folder: str, target: Path, written: dict[int, bytes]) -> None:
+    def _write_folder_image(self, folder: str, target: Path, written: dict[int, bytes]) -> None:
         target.mkdir()
         names = dict(self._names.get(folder, {}))
         dropped: set[str] = set()
         for name, number in self._later.get(folder, []):
             if name not in dropped and self._random.random() < 0.5:
-                _apply(names, name, number)
+                _apply_change(names, name, number)
             else:
                 dropped.add(name)  # a later change of the same name cannot overtake this one
         for name, number in names.items():
             if number == FOLDER:
-                self._image(f"{folder}/{name}", target / name, written)
+                self._write_folder_image(f"{folder}/{name}", target / name, written)
             else:
                 (target / name).write_bytes(
-                    self._survives(self._synced.get(number), written[number])
+                    self._draw_surviving(self._synced.get(number), written[number])
                 )
 
-    def _survives(self, synced: bytes | None, written: bytes) -> bytes:
+    def _draw_surviving(self, synced: bytes | None, written: bytes) -> bytes:
         """Return the bytes of a file after power loss: the synced ones, or a prefix of those
         written since, and rubbish.
         """
@@ -259,7 +259,7 @@ def _rmtree(path: Path, ignore_errors: bool = False) -> None:
             raise
 
 
-def _apply(names: dict[str, int], name: str, number: int | None) -> None:
+def _apply_change(names: dict[str, int], name: str, number: int | None) -> None:
     if number is None:
         names.pop(name, None)
     else:

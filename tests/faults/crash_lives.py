@@ -36,7 +36,7 @@ class Lives(ABC, Generic[BatchType]):
         self.acknowledged: set[BatchType] = set()
         self.at_stake = 0
 
-    def violations(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return the errors found in it."""
         live = self.folder / "life-0"
         live.mkdir()
@@ -47,22 +47,22 @@ class Lives(ABC, Generic[BatchType]):
             full = range(start, start + self.random.choice((0, 0, 3, 10)))
             power = None if last else self.random.randint(0, self.operations)
             disk = CrashDisk(live, self.random, power, range(0) if last else full)
-            with disk.mounted(), suppress(PowerLoss):
-                self._live(live, last)
+            with disk.intercept_calls(), suppress(PowerLoss):
+                self._run_life(live, last)
             if not last:
                 self.at_stake = len(self.acknowledged)
                 live = self.folder / f"life-{life + 1}"
-                disk.image(live)
-            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
+                disk.write_image(live)
+            found += [f"life {life}: {problem}" for problem in self._find_problems(live, last)]
             self._pass_time()
         return found
 
     @abstractmethod
-    def _live(self, root: Path, last: bool) -> None:
+    def _run_life(self, root: Path, last: bool) -> None:
         """One life, on the disk."""
 
     @abstractmethod
-    def _problems(self, root: Path, last: bool) -> list[str]:
+    def _find_problems(self, root: Path, last: bool) -> list[str]:
         """Read the archive as the next life finds it."""
 
     def _pass_time(self) -> None:

@@ -35,7 +35,7 @@ from fleet_service.replay.rebuild import restore_streams
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.crash_lives import Lives
 from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
@@ -91,21 +91,21 @@ class History(Lives[Batch]):
         super().__init__(number, folder)
         self.sent: list[Batch] = []
 
-    def _live(self, root: Path, last: bool) -> None:
+    def _run_life(self, root: Path, last: bool) -> None:
         with suppress(OSError):  # a service that finds the disk full at its start says so and ends
             log: SegmentLog[Batch] = SegmentLog(root, "shard")
             streams = SequenceTrackers()
             restore_streams(root, streams)
             for _ in range(STEPS):
-                self._step(root, log, streams)
+                self._run_step(root, log, streams)
             if last:
                 self._let_in(log, streams, self.sent)
                 self.acknowledged.update(log.flush())
 
-    def _step(self, root: Path, log: SegmentLog[Batch], streams: SequenceTrackers) -> None:
+    def _run_step(self, root: Path, log: SegmentLog[Batch], streams: SequenceTrackers) -> None:
         chance = self.random.random()
         if chance < 0.45:
-            new = [self._batch() for _ in range(self.random.randint(1, 3))]
+            new = [self._make_batch() for _ in range(self.random.randint(1, 3))]
             again = self.random.sample(self.sent, min(2, len(self.sent)))
             self._let_in(log, streams, new + again)
         elif chance < 0.8:
@@ -115,7 +115,7 @@ class History(Lives[Batch]):
             with suppress(OSError):
                 compact(root, round_rows=self.random.choice((1, 5, 1000)))
 
-    def _batch(self) -> Batch:
+    def _make_batch(self) -> Batch:
         kind = Kind.STATE if self.random.random() < 0.2 else Kind.OBSERVATION
         self.sent.append(Batch(kind, 1 + sum(batch.kind is kind for batch in self.sent)))
         return self.sent[-1]
@@ -133,7 +133,7 @@ class History(Lives[Batch]):
                     stream.accept(batch.seq)
                 log.add(kind, rows_of(new), new)
 
-    def _problems(self, root: Path, last: bool) -> list[str]:
+    def _find_problems(self, root: Path, last: bool) -> list[str]:
         streams = SequenceTrackers()
         with suppress(FileNotFoundError):
             restore_streams(root, streams)
@@ -165,34 +165,34 @@ class History(Lives[Batch]):
         return found
 
 
-def history(number: int) -> list[str]:
+def run_log_history(number: int) -> list[str]:
     """Violations of one history of the log."""
-    return _lived(number)[0]
+    return _run_log(number)[0]
 
 
-def _lived(number: int) -> tuple[list[str], int]:
-    """As `history`, and how many batches were acknowledged before a power loss."""
-    folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_memory()))
+def _run_log(number: int) -> tuple[list[str], int]:
+    """As `run_log_history`, and how many batches were acknowledged before a power loss."""
+    folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_find_memory_folder()))
     one = History(number, folder)
     try:
-        return one.violations(), one.at_stake
+        return one.find_violations(), one.at_stake
     finally:
         shutil.rmtree(folder)
 
 
-def _stored(number: int) -> tuple[list[str], int]:
+def _run_outbox(number: int) -> tuple[list[str], int]:
     """The same of the outbox, where nothing is acknowledged."""
     return spool_history(number), 0
 
 
-def _served(number: int) -> tuple[list[str], int]:
+def _run_service(number: int) -> tuple[list[str], int]:
     """The same of a whole service."""
-    with tempfile.TemporaryDirectory(prefix="crash-", dir=_memory()) as folder:
+    with tempfile.TemporaryDirectory(prefix="crash-", dir=_find_memory_folder()) as folder:
         one = ServiceHistory(number, Path(folder))
-        return one.violations(), one.at_stake
+        return one.find_violations(), one.at_stake
 
 
-def _memory() -> str | None:
+def _find_memory_folder() -> str | None:
     """A folder in memory, where there is one: the disk that forgets is ours, not the machine's."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
@@ -201,14 +201,18 @@ def run(site: Site) -> list[Figure]:
     """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of
     all.
     """
-    logs = site.of(5000, 100)
-    outboxes = site.of(500, 10)
-    services = site.of(600, 10)
+    logs = site.choose_amount(5000, 100)
+    outboxes = site.choose_amount(500, 10)
+    services = site.choose_amount(600, 10)
     first = site.seed * 1_000_000
     bad = 0
     acknowledged = Counter[str]()
-    kinds = (("log", _lived, logs), ("spool", _stored, outboxes), ("service", _served, services))
-    with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
+    kinds = (
+        ("log", _run_log, logs),
+        ("spool", _run_outbox, outboxes),
+        ("service", _run_service, services),
+    )
+    with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_silence_logs) as pool:
         for kind, one, count in kinds:
             for number, (found, safe) in enumerate(
                 pool.map(one, range(first, first + count), chunksize=10)
@@ -220,14 +224,14 @@ def run(site: Site) -> list[Figure]:
                 if (number + 1) % 200 == 0:
                     site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
     return [
-        figure("faults.crash_model.violations", bad),
-        figure("faults.crash_model.acknowledged", acknowledged.total()),
-        figure("faults.crash_model.service_acknowledged", acknowledged["service"]),
+        make_figure("faults.crash_model.violations", bad),
+        make_figure("faults.crash_model.acknowledged", acknowledged.total()),
+        make_figure("faults.crash_model.service_acknowledged", acknowledged["service"]),
         Figure("faults.crash_model.histories", logs + outboxes + services, "histories"),
     ]
 
 
-def _quiet() -> None:
+def _silence_logs() -> None:
     for module in (
         load,
         restart,

@@ -101,9 +101,9 @@ class ServiceHistory(Lives[Sent]):
         self.done: Counter[str] = Counter()
         self._now = START
 
-    def _live(self, root: Path, last: bool) -> None:
+    def _run_life(self, root: Path, last: bool) -> None:
         if self.sent and self.random.random() < 0.4:
-            self._forget(root)
+            self._forget_month(root)
         with (
             suppress(OSError),
             ExitStack() as held,
@@ -111,15 +111,15 @@ class ServiceHistory(Lives[Sent]):
             engine = Engine(CONFIG, root)
             held.callback(engine.holding.close)
             for _ in range(STEPS):
-                self._step(engine, root)
+                self._run_step(engine, root)
             if last:
-                self._take(engine, self.sent)
-                self._flush(engine)
+                self._ingest_batches(engine, self.sent)
+                self._flush_acks(engine)
 
     def _pass_time(self) -> None:
         self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
 
-    def _forget(self, root: Path) -> None:
+    def _forget_month(self, root: Path) -> None:
         """Nobody serves: a vehicle's month, or the whole month, is forgotten."""
         one = self.random.choice(self.sent)
         whole = self.random.random() < 0.3
@@ -143,7 +143,7 @@ class ServiceHistory(Lives[Sent]):
                 self.gone |= theirs - self._nobodys
             self.done["forgetting"] += 1
 
-    def _step(self, engine: Engine, root: Path) -> None:
+    def _run_step(self, engine: Engine, root: Path) -> None:
         self._now += self.random.randint(5, 3000) * SECOND
         jobs = {
             "batches": 8,
@@ -156,29 +156,31 @@ class ServiceHistory(Lives[Sent]):
         job = self.random.choices([*jobs], [*jobs.values()])[0]
         with suppress(OSError):  # upkeep counts it and goes on
             if job == "batches":
-                new = [self._batch() for _ in range(self.random.randint(1, 3))]
-                self._take(engine, new + self.random.sample(self.sent, min(2, len(self.sent))))
+                new = [self._make_batch() for _ in range(self.random.randint(1, 3))]
+                self._ingest_batches(
+                    engine, new + self.random.sample(self.sent, min(2, len(self.sent)))
+                )
             elif job == "weather":
-                self._report(engine)
+                self._report_weather(engine)
             elif job == "compaction":
                 weather.join_daily_files(root)
                 compact(root, round_rows=self.random.choice((1, 5, 1000)))
             elif job == "retention":
-                self._retire(root)
+                self._apply_retention(root)
             else:
-                self._flush(engine)  # what upkeep wants is done right after a segment
+                self._flush_acks(engine)  # what upkeep wants is done right after a segment
                 if job == "checkpoint":
-                    self._checkpoint(engine, root)
+                    self._write_checkpoint(engine, root)
             self.done[job] += 1
 
-    def _checkpoint(self, engine: Engine, root: Path) -> None:
+    def _write_checkpoint(self, engine: Engine, root: Path) -> None:
         """Wanted by upkeep, taken by the worker after a segment."""
         stop = threading.Event()
         with ThreadPoolExecutor(1) as upkeep:
             coming = upkeep.submit(engine.checkpoint, stop)
             try:
                 while not coming.done():
-                    self._flush(engine)
+                    self._flush_acks(engine)
             finally:
                 stop.set()
         taken = coming.result()
@@ -186,7 +188,7 @@ class ServiceHistory(Lives[Sent]):
             checkpoints.save(root, taken)
             snapshots.write(root, engine.queries.whole_map(self._now), self._now)
 
-    def _batch(self) -> Sent:
+    def _make_batch(self) -> Sent:
         vehicle = self.random.choice(VEHICLES)
         self._now = self._now + 5 * SECOND
         seq = 1 + sum(one.vehicle == vehicle for one in self.sent)
@@ -203,7 +205,7 @@ class ServiceHistory(Lives[Sent]):
         self.sent.append(Sent(vehicle, seq, self._now, wire.encode(made)))
         return self.sent[-1]
 
-    def _take(self, engine: Engine, batches: list[Sent]) -> None:
+    def _ingest_batches(self, engine: Engine, batches: list[Sent]) -> None:
         wanted = [
             Message(
                 Kind.OBSERVATION, key(one.vehicle), one.payload, wire.ENCODING[Kind.OBSERVATION]
@@ -212,7 +214,7 @@ class ServiceHistory(Lives[Sent]):
         ]
         engine.intake.ingest(wanted, self._now)
 
-    def _flush(self, engine: Engine) -> None:
+    def _flush_acks(self, engine: Engine) -> None:
         durable = {
             (vehicle, seq)
             for vehicle, payload in engine.settlement.flush()
@@ -222,7 +224,7 @@ class ServiceHistory(Lives[Sent]):
         }
         self.acknowledged.update(one for one in self.sent if (one.vehicle, one.seq) in durable)
 
-    def _report(self, engine: Engine) -> None:
+    def _report_weather(self, engine: Engine) -> None:
         report = Report(self._now, 0.5, 0.5, 0.5)
         failures = engine.counts["weather_failures"]
         engine.intake.weather.enqueue(
@@ -232,20 +234,20 @@ class ServiceHistory(Lives[Sent]):
         if engine.counts["weather_failures"] == failures:
             self.weather.add(report.time)
 
-    def _retire(self, root: Path) -> None:
+    def _apply_retention(self, root: Path) -> None:
         today = datetime.fromtimestamp(self._now // SECOND, UTC).date()
         self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_DAYS - 1)
         with suppress(InputError):
             retire_rows(root, LEAST_DAYS, today)
             weather.retire(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
 
-    def _problems(self, root: Path, last: bool) -> list[str]:
+    def _find_problems(self, root: Path, last: bool) -> list[str]:
         rows: Counter[int] = Counter()
         with suppress(FileNotFoundError):
             for table in reading.read(root, Kind.OBSERVATION, ["leave_time"]):
                 rows.update(nanoseconds(table["leave_time"]).tolist())
         found = [f"{time} is there {count} times" for time, count in rows.items() if count > 1]
-        found += self._lost(rows, last) + self._came_back(root, rows)
+        found += self._find_lost(rows, last) + self._came_back(root, rows)
         reports = (load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.files(root))
         there = {
             time
@@ -258,10 +260,10 @@ class ServiceHistory(Lives[Sent]):
             for time in sorted(self.weather - there)
             if time // layout.DAY_NS > self.retired
         ]
-        found += self._known(root, rows)
+        found += self._find_state_errors(root, rows)
         return found
 
-    def _lost(self, rows: Counter[int], last: bool) -> list[str]:
+    def _find_lost(self, rows: Counter[int], last: bool) -> list[str]:
         """Acknowledged, and neither there nor given up; in the last life everything that may
         come was sent again.
         """
@@ -291,7 +293,7 @@ class ServiceHistory(Lives[Sent]):
         keys = (path.read_bytes() for path in (root / "keys").glob("*.key"))
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
 
-    def _known(self, root: Path, rows: Counter[int]) -> list[str]:
+    def _find_state_errors(self, root: Path, rows: Counter[int]) -> list[str]:
         """The map and the batches that are known, from a checkpoint and from the log alone."""
         if not (root / "inbox").is_dir():
             return []
@@ -303,7 +305,7 @@ class ServiceHistory(Lives[Sent]):
         begun, whole = (
             load_state(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare)
         )
-        found = _different(begun, whole, self._now)
+        found = _find_differences(begun, whole, self._now)
         for copy in (same, bare):
             shutil.rmtree(copy)
         pseudonyms = Pseudonyms(root / "keys")
@@ -317,7 +319,7 @@ class ServiceHistory(Lives[Sent]):
             first = one.rows[0]
             name = (
                 number(pseudonyms.of(one.vehicle, first)),
-                pseudonyms.boot(one.vehicle, _boot(one.vehicle), first),
+                pseudonyms.boot(one.vehicle, _compute_boot(one.vehicle), first),
             )
             names = np.array([[*name, REGION, one.seq]], np.int64)
             for memory, by in ((begun, "the checkpoint"), (whole, "the log")):
@@ -327,12 +329,12 @@ class ServiceHistory(Lives[Sent]):
         return found
 
 
-def _boot(vehicle: str) -> int:
+def _compute_boot(vehicle: str) -> int:
     """As `examples.batch` has it."""
     return 1 + sum(vehicle.encode())
 
 
-def _different(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
+def _find_differences(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
     """Return the differences in belief of two states of one archive."""
     if not whole.fusion.size:
         return []

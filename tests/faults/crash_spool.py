@@ -30,7 +30,7 @@ class Files(NamedTuple):
     log: bytes
 
     @staticmethod
-    def of(path: Path) -> Files:
+    def read_files(path: Path) -> Files:
         log = Path(f"{path}-wal")
         return Files(path.read_bytes(), log.read_bytes() if log.exists() else b"")
 
@@ -40,12 +40,12 @@ def spool_history(number: int) -> list[str]:
     random_ = random.Random(number)
     folder = Path(tempfile.mkdtemp(prefix="spool-"))
     try:
-        return _history(random_, folder)
+        return _run_history(random_, folder)
     finally:
         shutil.rmtree(folder)
 
 
-def _history(random_: random.Random, folder: Path) -> list[str]:
+def _run_history(random_: random.Random, folder: Path) -> list[str]:
     path = folder / "spool.sqlite"
     boot = 5
     outbox = Outbox(path, boot=boot, capacity_bytes=CAPACITY)
@@ -54,7 +54,7 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
     found = []
     held.clear()
     for _ in range(COMMITS):
-        before = Files.of(path)
+        before = Files.read_files(path)
         sure = set(held)
         settled = {seq for seq in held if random_.random() < 0.3}
         outbox.settle(stream, [(seq, seq) for seq in settled])
@@ -64,17 +64,17 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
             0.0,
         )
         held.update({batch.seq: batch.payload for batch in batches})
-        after = Files.of(path)
-        for image in (after, _torn(random_, before, after)):
+        after = Files.read_files(path)
+        for image in (after, _tear_write(random_, before, after)):
             owed = sure - settled if image is not after else set(held) - settled
-            found += _problems(folder / "image.sqlite", image, owed, held)
+            found += _find_problems(folder / "image.sqlite", image, owed, held)
         for seq in settled:
             del held[seq]
     outbox.close()
     return found
 
 
-def _torn(random_: random.Random, before: Files, after: Files) -> Files:
+def _tear_write(random_: random.Random, before: Files, after: Files) -> Files:
     """Return the files that power loss during the commit may leave."""
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
@@ -90,7 +90,7 @@ def _torn(random_: random.Random, before: Files, after: Files) -> Files:
     return Files(database, after.log[:cut] + rest)
 
 
-def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes]) -> list[str]:
+def _find_problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes]) -> list[str]:
     path.write_bytes(image.database)
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)

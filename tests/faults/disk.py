@@ -36,7 +36,7 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.kill import begin_with_old_rows, old_days
 from tests.fleet_service.examples import batch, key
@@ -66,7 +66,7 @@ def small_disk(folder: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def full(folder: Path, mounted: bool) -> Iterator[None]:
+def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
     """No room while the block runs."""
     if mounted:
         ballast = folder / "ballast"
@@ -79,12 +79,12 @@ def full(folder: Path, mounted: bool) -> Iterator[None]:
         finally:
             ballast.unlink()
         return
-    with _refused("open", "fsync", "rename", "mkdir"):
+    with _refuse_writes("open", "fsync", "rename", "mkdir"):
         yield
 
 
 @contextmanager
-def _refused(*names: str) -> Iterator[None]:
+def _refuse_writes(*names: str) -> Iterator[None]:
     """These calls of the system fail as on a full disk."""
 
     def refuse(*_: object, **__: object) -> object:
@@ -114,15 +114,15 @@ def run(site: Site) -> list[Figure]:
             with BackgroundJobs(jobs, engine.counts, lambda _: None):
                 acknowledged = 0
                 seq = 0
-                for _ in range(site.of(10, 3)):
+                for _ in range(site.choose_amount(10, 3)):
                     acknowledged += _drive(engine, seq, 3)
                     seq += 3
-                    with full(site.folder / "disk", mounted):
+                    with fill_disk(site.folder / "disk", mounted):
                         got = _drive(engine, seq, 6)
                         seq += 6
                         refused += got == 0
                         acknowledged += got
-                        false += acknowledged > _rows(root)
+                        false += acknowledged > _count_rows(root)
                     acknowledged += _until_settled(engine)
                     stuck += engine.settlement.unsettled > 0
                 acknowledged += _until_done(engine)
@@ -133,16 +133,16 @@ def run(site: Site) -> list[Figure]:
                     if name.endswith(("_runs", "_failures"))
                 }
             )
-            false += acknowledged > _rows(root)
+            false += acknowledged > _count_rows(root)
             room = _room_made(engine, site.folder / "disk") if mounted else 0
         stuck += not _outbox_recovers(site.folder / "disk", mounted)
     site.say(f"{'mounted' if mounted else 'injected'}; {acknowledged} acknowledged, {dict(runs)}")
     return [
-        figure("faults.disk.false_acks", false),
-        figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
-        figure("faults.disk.times_full", refused),
-        figure("faults.disk.jobs_run", min(runs[name] for name in RUNS)),
-        figure("faults.disk.room_made", room)
+        make_figure("faults.disk.false_acks", false),
+        make_figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
+        make_figure("faults.disk.times_full", refused),
+        make_figure("faults.disk.jobs_run", min(runs[name] for name in RUNS)),
+        make_figure("faults.disk.room_made", room)
         if mounted
         else Figure("faults.disk.room_made", 0, "days; nothing was mounted"),
         Figure("faults.disk.mounted", int(mounted), "a real file system"),
@@ -159,12 +159,12 @@ def _drive(engine: Engine, since: int, steps: int) -> int:
             engine.intake.ingest(
                 [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now
             )
-        got += _acked(engine.settlement.flush())
+        got += _count_acked(engine.settlement.flush())
         threading.Event().wait(0.2)  # for the jobs
     return got
 
 
-def _acked(acks: list[tuple[str, bytes]]) -> int:
+def _count_acked(acks: list[tuple[str, bytes]]) -> int:
     return sum(
         last - first + 1
         for _, payload in acks
@@ -177,7 +177,7 @@ def _until_settled(engine: Engine) -> int:
     got = 0
     deadline = time.monotonic() + STUCK_S
     while engine.settlement.unsettled and time.monotonic() < deadline:
-        got += _acked(engine.settlement.flush())
+        got += _count_acked(engine.settlement.flush())
         threading.Event().wait(0.05)
     return got
 
@@ -189,12 +189,12 @@ def _until_done(engine: Engine) -> int:
     got = 0
     deadline = time.monotonic() + STUCK_S
     while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:
-        got += _acked(engine.settlement.flush())
+        got += _count_acked(engine.settlement.flush())
         threading.Event().wait(0.05)
     return got
 
 
-def _rows(root: Path) -> int:
+def _count_rows(root: Path) -> int:
     return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
 
 
@@ -208,7 +208,7 @@ def _room_made(engine: Engine, folder: Path) -> int:
         jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
         retention = next(job for job in jobs if job.name == "retention")
         before = len(old_days(root))
-        with full(folder, mounted=True):
+        with fill_disk(folder, mounted=True):
             retention.work(threading.Event())
             return before - len(old_days(root))
 
@@ -220,7 +220,7 @@ def _outbox_recovers(folder: Path, mounted: bool) -> bool:
     took = len(outbox.store([draft], 0.0))
     refused = False
     if mounted:
-        with full(folder, mounted):
+        with fill_disk(folder, mounted):
             try:
                 took += len(outbox.store([draft] * 50, 0.0))
             except Exception:  # noqa: BLE001 sqlite's own

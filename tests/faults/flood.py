@@ -29,7 +29,7 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from schemas.wire.tile import decode_tile
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
 from tests.secured import READER, ROUTERS, SERVICE, Network, enrolment, network, settings
@@ -45,15 +45,15 @@ START_S: Final = 300.0  # the first start compiles the kernels
 _ASKED: Final = "gripmap/v1/map/**"
 
 
-def places() -> list[tuple[int, float, float]]:
+def list_places() -> list[tuple[int, float, float]]:
     """The road: cell, latitude and longitude."""
     longitudes = [LONGITUDE + 2e-4 * place for place in range(CELLS)]
     return [(int(grid.cell_of(LATITUDE, one)), LATITUDE, one) for one in longitudes]
 
 
-def visit(name: str, seq: int, now: int) -> Batch:
+def make_visit(name: str, seq: int, now: int) -> Batch:
     """One visit of a vehicle; it goes round the road."""
-    cell, latitude, longitude = places()[(seq + hash_of(name)) % CELLS]
+    cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
     return batch(name, seq, now, [mu], cell=[cell], latitude=[latitude], longitude=[longitude])
 
@@ -75,16 +75,16 @@ class Honest:
 
     def __post_init__(self) -> None:
         self._last: dict[int, float] = {}  # when each unsettled one was put last [s]
-        self._acks = self.session.declare_subscriber(keys.ack_key(self.name), self._hear)
+        self._acks = self.session.declare_subscriber(keys.ack_key(self.name), self._record_ack)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _record_ack(self, sample: zenoh.Sample) -> None:
         now = time.monotonic()
         for stream in wire.decode_ack(sample.payload.to_bytes())[1]:
             for first, last in stream.durable:
                 for seq in range(first, last + 1):
                     self.delays.setdefault(seq, now - self.sent[seq][1])
 
-    def _put(self, one: Batch) -> None:
+    def _put_batch(self, one: Batch) -> None:
         self.session.put(
             key(self.name),
             wire.encode(one),
@@ -95,10 +95,10 @@ class Honest:
     def drive(self) -> None:
         """Send the next one."""
         seq = len(self.sent) + 1
-        one = visit(self.name, seq, time.time_ns())
+        one = make_visit(self.name, seq, time.time_ns())
         self._last[seq] = time.monotonic()
         self.sent[seq] = (one, self._last[seq])
-        self._put(one)
+        self._put_batch(one)
 
     def resend(self) -> None:
         """Send again what waits for longer than a outbox waits."""
@@ -109,15 +109,15 @@ class Honest:
             if now - at > RESEND_S:
                 self._last[seq] = now
                 self.resent += 1
-                self._put(self.sent[seq][0])
+                self._put_batch(self.sent[seq][0])
 
 
 def run(site: Site) -> list[Figure]:
     """Half a minute of flood, or three seconds."""
-    seconds = site.of(30, 3)
+    seconds = site.choose_amount(30, 3)
     fleet = enrolment(vehicles=[*HONEST, FLOODER])
     with network(site.folder / "certificates", fleet=fleet) as running:
-        service = _service(site.folder, running)
+        service = _start_service(site.folder, running)
         try:
             honest = [
                 Honest(running.session(name, ROUTERS[k % 2]), name) for k, name in enumerate(HONEST)
@@ -127,33 +127,33 @@ def run(site: Site) -> list[Figure]:
             before = max(delay for one in honest for delay in one.delays.values())
             site.say(f"without a flood the longest delay is {before:.2f} s")
             first = {one.name: len(one.sent) for one in honest}
-            put = _flood(running, honest, seconds)
+            put = _run_flood(running, honest, seconds)
             _settle(honest)
             delays = np.array(
                 [d for one in honest for seq, d in one.delays.items() if seq > first[one.name]]
             )
-            table = _map(running)
+            table = _read_map(running)
             with_flood = time.time_ns()
             for one in honest:
                 one.session.close()
         finally:
             service.terminate()
             service.wait(20.0)
-    expected = _without(site.folder / "calm", honest, seconds, with_flood)
+    expected = _simulate_unflooded(site.folder / "calm", honest, seconds, with_flood)
     site.say(
         f"{put / seconds:.0f} messages/s of flood; honest delays p50 {np.median(delays):.2f} s"
     )
     return [
-        figure("faults.flood.honest_delay_s", float(delays.max())),
-        figure("faults.flood.map_difference", _difference(table, expected, honest)),
-        figure("faults.flood.rate", put / seconds),
+        make_figure("faults.flood.honest_delay_s", float(delays.max())),
+        make_figure("faults.flood.map_difference", _find_difference(table, expected, honest)),
+        make_figure("faults.flood.rate", put / seconds),
         Figure("faults.flood.honest_delay_p50_s", float(np.median(delays)), "s"),
         Figure("faults.flood.calm_delay_s", before, "s"),
         Figure("faults.flood.honest_resent", sum(one.resent for one in honest), "batches"),
     ]
 
 
-def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
+def _start_service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
     """The service as a process; returns when it listens."""
     config = ServiceConfig(
         zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
@@ -186,20 +186,20 @@ def _drive(honest: Sequence[Honest], seconds: float) -> None:
 
 
 def _settle(honest: Sequence[Honest]) -> None:
-    def settled() -> bool:
+    def is_settled() -> bool:
         for one in honest:
             one.resend()
         return all(len(one.delays) == len(one.sent) for one in honest)
 
-    until(settled, 60.0)
+    until(is_settled, 60.0)
 
 
-def _flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
+def _run_flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
     """Let them drive while the flood runs; returns how many messages it put."""
     told = {
         "settings": settings(running.endpoints[ROUTERS[0]], running.folder).model_dump(),
         "name": FLOODER,
-        "cells": places(),
+        "cells": list_places(),
         "mu": FLOODED_MU,
         "seconds": seconds,
     }
@@ -215,13 +215,15 @@ def _flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
         return int(process.stdout.readline())
 
 
-def _map(running: Network) -> pa.Table:
+def _read_map(running: Network) -> pa.Table:
     with running.session(READER) as session:
         replies = [reply.ok.payload.to_bytes() for reply in session.get(_ASKED) if reply.ok]
     return pa.concat_tables([decode_tile(payload) for payload in replies])
 
 
-def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -> pa.Table:
+def _simulate_unflooded(
+    folder: Path, honest: Sequence[Honest], seconds: float, now: int
+) -> pa.Table:
     """The map of the same honest visits, and of the flooder at one visit a second, round the
     road once at least.
     """
@@ -229,7 +231,8 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
     began = min(int(one.columns["leave_time"][0]) for one in sent)
     rounds = max(int(seconds), CELLS)
     sent += [
-        visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds) for k in range(rounds)
+        make_visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds)
+        for k in range(rounds)
     ]
     engine = Engine(ServiceConfig(), folder)
     for one in sorted(sent, key=lambda one: int(one.columns["leave_time"][0])):
@@ -241,7 +244,7 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
     return pa.concat_tables([decode_tile(payload) for _, payload in tiles])
 
 
-def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
+def _find_difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
     """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one
     is missing.
     """

@@ -28,7 +28,7 @@ from typing import Final, NamedTuple, NoReturn
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.runtime.process import force_exit
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 
 RAISED: Final = 2  # exit code; 1: a bar does not hold
 
@@ -49,7 +49,7 @@ class Site:
     seed: int
     say: Callable[[str], None]
 
-    def of(self, full: int, quick: int) -> int:
+    def choose_amount(self, full: int, quick: int) -> int:
         """One of two numbers, by how long it may take."""
         return quick if self.quick else full
 
@@ -63,7 +63,7 @@ class Campaign(NamedTuple):
     in_quick: bool = True
 
 
-def conduct(
+def run_campaigns(
     campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int
 ) -> list[Figure]:
     """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns
@@ -72,13 +72,13 @@ def conduct(
     found: list[Figure] = []
     out.mkdir(parents=True, exist_ok=True)
     for campaign in campaigns:
-        found += _one(campaign, out, quick, seed)
+        found += _run_campaign(campaign, out, quick, seed)
         figures.write(out / "figures.json", title, [seed], found)
         (out / "figures.md").write_text(figures.markdown(found) + "\n")
     return found
 
 
-def leave(run: Callable[[], int]) -> NoReturn:
+def run_and_exit(run: Callable[[], int]) -> NoReturn:
     """Run campaigns and end the process with their exit code; with RAISED and a traceback at once
     if one raises.
 
@@ -97,25 +97,25 @@ def leave(run: Callable[[], int]) -> NoReturn:
     force_exit(code)
 
 
-def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:
+def _run_campaign(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:
     folder = out / campaign.name
     began = time.monotonic()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
 
-    def say(line: str) -> None:
+    def print_progress(line: str) -> None:
         print(
             f"{time.monotonic() - began:7.1f} s  {campaign.name}: {line}",
             file=sys.stderr,
             flush=True,
         )
 
-    say("begins")
-    found = campaign.run(Site(folder, quick, seed, say))
+    print_progress("begins")
+    found = campaign.run(Site(folder, quick, seed, print_progress))
     missing = [name for name in campaign.owes if name not in {one.name for one in found}]
-    found += [figure(name, float("nan")) for name in missing]
+    found += [make_figure(name, float("nan")) for name in missing]
     failed = [one.name for one in found if not one.holds]
-    say(f"DOES NOT HOLD: {', '.join(failed)}; see {folder}" if failed else "holds")
+    print_progress(f"DOES NOT HOLD: {', '.join(failed)}; see {folder}" if failed else "holds")
     if not failed:
         shutil.rmtree(folder)
     return found

@@ -26,7 +26,7 @@ from schemas.errors import InputError, WireError
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from schemas.wire.tile import decode_tile
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.mutants import Mutants
 from tests.fleet_service.examples import SECOND, batch, key
@@ -78,7 +78,7 @@ NEEDED: Final = {"latitude", "longitude"}
 
 def run(site: Site) -> list[Figure]:
     """A million of them, or some thousands."""
-    count = site.of(1_000_000, 10_000)
+    count = site.choose_amount(1_000_000, 10_000)
     began = time.time_ns()
     crashes = 0
     answers = 0
@@ -86,21 +86,21 @@ def run(site: Site) -> list[Figure]:
     engine = Engine(ServiceConfig(), site.folder / "archive")
     # that are rebuilt: each takes a process and a second
     honest = 0
-    pasts = site.of(50, 3)
+    pasts = site.choose_amount(50, 3)
     for turn in range(count // TURN):
         messages = []
         queries = []
         now = mutants.now = began + turn * SECOND
         for place in range(TURN):
             if place % ASKED_EVERY:
-                messages.append(mutants.message())
+                messages.append(mutants.make_message())
             else:
-                queries.append(mutants.query())
+                queries.append(mutants.make_query())
         honest += 1
-        messages[len(messages) // 2 : len(messages) // 2] = list(_honest(honest, now))
-        crashes += _turn(site, engine, messages, now)
+        messages[len(messages) // 2 : len(messages) // 2] = list(_make_honest(honest, now))
+        crashes += _run_turn(site, engine, messages, now)
         for asked in queries:
-            failed, answered, past = _ask(site, engine, asked, now, pasts > 0)
+            failed, answered, past = _ask_query(site, engine, asked, now, pasts > 0)
             crashes = crashes + failed
             answers = answers + answered
             pasts = pasts - past
@@ -111,24 +111,24 @@ def run(site: Site) -> list[Figure]:
             )
     counts = dict(engine.counts)
     engine.close()
-    tiles, broken = _tiles(site, engine, now)
-    rows, impossible, found = _archived(site.folder / "archive", began, now)
+    tiles, broken = _decode_damaged_tiles(site, engine, now)
+    rows, impossible, found = _count_archived(site.folder / "archive", began, now)
     return [
-        figure("faults.fuzz.crashes", crashes + broken),
-        figure("faults.fuzz.admitted_out_of_range", impossible),
-        figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
+        make_figure("faults.fuzz.crashes", crashes + broken),
+        make_figure("faults.fuzz.admitted_out_of_range", impossible),
+        make_figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
         Figure("faults.fuzz.malformed", count + tiles, "messages, queries and tiles"),
-        figure(
+        make_figure(
             "faults.fuzz.refused",
             sum(n for name, n in counts.items() if name.startswith("refused.")),
         ),
         Figure("faults.fuzz.admitted", rows, "rows"),
-        figure("faults.fuzz.answered", answers),
-        figure("faults.fuzz.pasts", site.of(50, 3) - pasts),
+        make_figure("faults.fuzz.answered", answers),
+        make_figure("faults.fuzz.pasts", site.choose_amount(50, 3) - pasts),
     ]
 
 
-def _honest(seq: int, now: int) -> Iterator[Message]:
+def _make_honest(seq: int, now: int) -> Iterator[Message]:
     for name in HONEST:
         sent = batch(name, seq, now, [0.8])
         yield Message(
@@ -136,7 +136,7 @@ def _honest(seq: int, now: int) -> Iterator[Message]:
         )
 
 
-def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
+def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     """One turn of the service's worker; 1 if anything but a refusal came of it."""
     try:
         engine.intake.ingest(messages, now)
@@ -150,7 +150,7 @@ def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     return 0
 
 
-def _ask(
+def _ask_query(
     site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 ) -> tuple[int, int, int]:
     """Return whether a query crashed, was answered, and rebuilt a past map; none does without
@@ -171,11 +171,11 @@ def _ask(
     return 0, 1, rebuilt
 
 
-def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
+def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
     """Damaged tiles as a client reads them: how many, and how many crashes."""
     r = np.random.default_rng(site.seed)
     crashes = 0
-    count = site.of(50_000, 1_000)
+    count = site.choose_amount(50_000, 1_000)
     (_, good), *_ = engine.queries.answer(
         query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now
     )
@@ -195,10 +195,10 @@ def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
     return count, crashes
 
 
-def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
+def _count_archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
     """Rows, impossible rows, and rows of the honest vehicles, in everything that was written."""
     rows = impossible = found = 0
-    honest = _pseudonyms(root, began) | _pseudonyms(root, now)
+    honest = _list_pseudonyms(root, began) | _list_pseudonyms(root, now)
     for file in sorted(root.rglob("*.parquet")):
         table = ds.dataset(file, partitioning=None).to_table()
         bad = np.zeros(table.num_rows, bool)
@@ -233,7 +233,7 @@ def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
     return rows, impossible, found
 
 
-def _pseudonyms(root: Path, now: int) -> set[str]:
+def _list_pseudonyms(root: Path, now: int) -> set[str]:
     from fleet_service.archive.identity.pseudonyms import Pseudonyms
 
     known = Pseudonyms(root / "keys")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fuzz import PARSERS, Fuzzer, keeper, seeds_of
 
 
 def run(site: Site) -> list[Figure]:
     """Ten million executions, or some thousands."""
-    each = site.of(10_000_000, 6_000) // len(PARSERS)
+    each = site.choose_amount(10_000_000, 6_000) // len(PARSERS)
     executions = crashes = hangs = lines = 0
     for name, parser in PARSERS.items():
         found = Fuzzer(parser, seeds_of(name), site.seed, keeper(site.folder / name)).run(
@@ -22,8 +22,8 @@ def run(site: Site) -> list[Figure]:
         hangs = hangs + found.hangs
         lines = lines + found.lines
     return [
-        figure("faults.fuzz_parsers.crashes", crashes),
-        figure("faults.fuzz_parsers.hangs", hangs),
-        figure("faults.fuzz_parsers.executions", executions),
-        figure("faults.fuzz_parsers.lines", lines),
+        make_figure("faults.fuzz_parsers.crashes", crashes),
+        make_figure("faults.fuzz_parsers.hangs", hangs),
+        make_figure("faults.fuzz_parsers.executions", executions),
+        make_figure("faults.fuzz_parsers.lines", lines),
     ]

@@ -21,11 +21,11 @@ from schemas.config import ZenohSettings
 from schemas.errors import WireError
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
-from tests.faults.bars import figure
-from tests.faults.census import take
+from tests.faults.bars import make_figure
+from tests.faults.census import compare_with_archive
 from tests.faults.frame import Site
 from tests.faults.mutants import Mutants, changed_bytes
-from tests.faults.processes import Stage, stage
+from tests.faults.processes import Stage, open_stage
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION
 
 TURN: Final = 200  # malformed messages between two questions
@@ -50,28 +50,28 @@ def run(site: Site) -> list[Figure]:
     r = random.Random(site.seed)
     sent = 0
     answers = 0
-    with stage(site.folder, metrics_port=0) as there:
-        there.load(HONEST, RATE, flush_s=0.5).start()
+    with open_stage(site.folder, metrics_port=0) as there:
+        there.make_load(HONEST, RATE, flush_s=0.5).start()
         there.loads[0].line_with("ready: ")
         session = open_session(ZenohSettings(connect=[there.endpoint]))
         assert session is not None
         with session:
             mutants = Mutants(site.seed, time.time_ns())
-            for turn in range(site.of(200_000, 4_000) // TURN):
+            for turn in range(site.choose_amount(200_000, 4_000) // TURN):
                 mutants.now = time.time_ns()
-                sent += sum(_put(session, *_message(r, mutants)) for _ in range(TURN))
-                answers += _ask(session, r, mutants)
+                sent += sum(_put_message(session, *_make_message(r, mutants)) for _ in range(TURN))
+                answers += _ask_query(session, r, mutants)
                 if not turn % 50:
                     site.say(f"{sent} malformed, {answers} answers")
-            alive = there.service.alive and all(part.alive for part in there.loads)
-            counts = _counts(there)
+            alive = there.service.is_alive and all(part.is_alive for part in there.loads)
+            counts = _read_metrics(there)
         there.drain(DRAIN_S)
-        code = there.service.stop() if there.service.alive else 1
-        census = take(there.journals, there.archive)
+        code = there.service.stop() if there.service.is_alive else 1
+        census = compare_with_archive(there.journals, there.archive)
         said = [
             line
             for part in (there.service, *there.loads)
-            for line in part.lines()
+            for line in part.read_lines()
             if "Traceback" in line
         ]
     failures = counts.get("gripmap_answer_failures_total", 0.0)
@@ -80,19 +80,19 @@ def run(site: Site) -> list[Figure]:
     )
     site.say(f"{census}; {failures:.0f} answers failed, {len(said)} tracebacks, exit {code}")
     return [
-        figure("faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(said) + failures),
-        figure("faults.fuzz_wire.honest_lost", census.lost),
-        figure("faults.fuzz_wire.doubled", census.doubled),
-        figure("faults.fuzz_wire.honest", census.settled),
-        figure("faults.fuzz_wire.refused", refused),
-        figure("faults.fuzz_wire.answered", answers),
+        make_figure("faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(said) + failures),
+        make_figure("faults.fuzz_wire.honest_lost", census.lost),
+        make_figure("faults.fuzz_wire.doubled", census.doubled),
+        make_figure("faults.fuzz_wire.honest", census.settled),
+        make_figure("faults.fuzz_wire.refused", refused),
+        make_figure("faults.fuzz_wire.answered", answers),
         Figure("faults.fuzz_wire.sent", sent, "malformed messages that Zenoh let through"),
     ]
 
 
-def _message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
+def _make_message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
     """Key, payload and encoding of the next."""
-    message = mutants.message()
+    message = mutants.make_message()
     what = r.random()
     if what < 0.02:
         return (
@@ -120,7 +120,7 @@ def _unreadable_ack(r: random.Random) -> bytes:
             return payload
 
 
-def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int:
+def _put_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int:
     """Put it; 0 where it is Zenoh that refuses the key. A longer encoding is the end of the
     sender's own session.
     """
@@ -135,12 +135,12 @@ def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int
     return 1
 
 
-def _ask(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
+def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
     """Ask something malformed, with something malformed in hand; how many answers came, errors
     not counted.
     """
-    parameters = ";".join(f"{name}={value}" for name, value in mutants.query().items())
-    payload = r.choice((None, b"", r.randbytes(300), mutants.message().payload))
+    parameters = ";".join(f"{name}={value}" for name, value in mutants.make_query().items())
+    payload = r.choice((None, b"", r.randbytes(300), mutants.make_message().payload))
     try:
         replies = session.get(f"{r.choice(ASKED)}?{parameters}", payload=payload, timeout=ANSWER_S)
         return sum(reply.ok is not None for reply in replies)
@@ -148,7 +148,7 @@ def _ask(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
         return 0
 
 
-def _counts(there: Stage) -> dict[str, float]:
+def _read_metrics(there: Stage) -> dict[str, float]:
     """The service's metrics."""
     address = there.service.line_with("ready: ").split()[-1]
     with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:

@@ -41,14 +41,14 @@ class Listener:
 
     def __post_init__(self) -> None:
         self._subscribers = [
-            self.session.declare_subscriber(one, self._hear) for one in self.expressions
+            self.session.declare_subscriber(one, self._record_sample) for one in self.expressions
         ]
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _record_sample(self, sample: zenoh.Sample) -> None:
         put = sample.kind == zenoh.SampleKind.PUT
         self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
 
-    def has(self, payload: bytes) -> bool:
+    def has_payload(self, payload: bytes) -> bool:
         """Return True if it received this payload."""
         return any(payload in told for _, _, told in list(self.heard))
 
@@ -63,20 +63,20 @@ class Ground:
         self.service = service
         self._stack = stack
         self.folder = network.folder
-        self.monitor = Listener(self.open(SERVICE), ("gripmap/**",))
+        self.monitor = Listener(self.open_session(SERVICE), ("gripmap/**",))
         self.reader = Listener(
-            self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
+            self.open_session(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
         )
-        self.honest = Listener(self.open(HONEST), (keys.ack_key(HONEST),))
-        self._probe = self.open(SERVICE)
+        self.honest = Listener(self.open_session(HONEST), (keys.ack_key(HONEST),))
+        self._probe = self.open_session(SERVICE)
         self._marks = self._seq = 0
 
-    def open(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
+    def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
         """A session that is closed at the end."""
         return self._stack.enter_context(self.network.session(name, router, **changed))
 
     @property
-    def admitted(self) -> int:
+    def admitted_count(self) -> int:
         """Observations that the service took in."""
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
@@ -88,15 +88,15 @@ class Ground:
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
         session = session or self.honest.session
 
-        def settled() -> bool:
+        def is_settled() -> bool:
             session.put(key(name), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
             with suppress(TimeoutError):
-                until(lambda: self._durable(sent), RESEND_S)
-            return self._durable(sent)
+                until(lambda: self._is_durable(sent), RESEND_S)
+            return self._is_durable(sent)
 
-        until(settled)
+        until(is_settled)
 
-    def _durable(self, sent: wire.Batch) -> bool:
+    def _is_durable(self, sent: wire.Batch) -> bool:
         """Return True if this very batch was acknowledged.
 
         What else lies on the key counts for nothing: the acknowledgement of a batch before that was
@@ -116,11 +116,11 @@ class Ground:
                         return True
         return False
 
-    def judged(self) -> None:
+    def await_judgement(self) -> None:
         """Return when the service has judged and counted everything that reached it before."""
         self.drive()
 
-    def passed(self, session: zenoh.Session, *listeners: Listener) -> None:
+    def await_effects(self, session: zenoh.Session, *listeners: Listener) -> None:
         """Return when everything that `session` did has gone through and the listeners received its
         effects.
         """
@@ -129,11 +129,11 @@ class Ground:
         mark = f"mark {self._marks}".encode()
         self._probe.put(MARKER, mark)
         for one in (self.monitor, self.reader, *listeners):
-            until(lambda one=one: one.has(mark))  # type: ignore[misc]
+            until(lambda one=one: one.has_payload(mark))  # type: ignore[misc]
 
 
 @contextmanager
-def ground(network: Network) -> Iterator[Ground]:
+def open_ground(network: Network) -> Iterator[Ground]:
     """A service behind the network, and the honest parties, connected and heard."""
     config = ServiceConfig(
         zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),
@@ -151,7 +151,7 @@ def ground(network: Network) -> Iterator[Ground]:
         with ExitStack() as stack:
             found = Ground(network, service, stack)
             # only a service is told who answers; the second router is the one further away
-            querier = found.open(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
+            querier = found.open_session(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
             matched(querier)
             querier.undeclare()
             yield found

@@ -28,7 +28,7 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
 from schemas.wire import Batch, Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch
 
@@ -39,18 +39,18 @@ MONTH_NS: Final = 29 * 86_400 * NS
 WARM_S: Final = 60  # until pools and windows are what they are
 
 
-def _growth(grown: float, seconds: int, *, quick: bool) -> Figure:
+def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
     """By the hour; of a quick run as it is: ten megabytes come and go, which is no rate of three
     minutes.
     """
     if quick:
-        return replace(figure("faults.insider.mb_per_hour", grown), unit="MB in all")
-    return figure("faults.insider.mb_per_hour", grown / seconds * 3600)
+        return replace(make_figure("faults.insider.mb_per_hour", grown), unit="MB in all")
+    return make_figure("faults.insider.mb_per_hour", grown / seconds * 3600)
 
 
 def run(site: Site) -> list[Figure]:
     """An hour, or four minutes in a quick run."""
-    seconds = site.of(3600, 240)
+    seconds = site.choose_amount(3600, 240)
     counts = Counter[str]()
     random_ = np.random.default_rng(site.seed)
     start = time.time_ns() - 4000 * NS
@@ -66,18 +66,18 @@ def run(site: Site) -> list[Figure]:
     with closing(Engine(config, site.folder / "archive")) as engine:
         warm = 0.0
         for first in range(6):  # what is compiled at first use is no harm that it does
-            engine.intake.ingest([_attack(first, 0, start - NS, random_)], start - NS)
+            engine.intake.ingest([_make_attack(first, 0, start - NS, random_)], start - NS)
         for second in range(seconds):
             at = float(second)
             now = start + second * NS
-            honest = [_message(_visit(name, second + 1, now, second)) for name in HONEST]
+            honest = [_make_message(_make_visit(name, second + 1, now, second)) for name in HONEST]
             attack: list[Message] = []
             while True:
                 again = sent % 7 == 6 and bool(said)
                 one = (
                     said[int(random_.integers(len(said)))]
                     if again
-                    else _attack(sent, second, now, random_)
+                    else _make_attack(sent, second, now, random_)
                 )
                 if not limits.allows(one.key, len(one.payload), one.encoding):
                     break
@@ -93,47 +93,48 @@ def run(site: Site) -> list[Figure]:
                 warm = _memory_mb()
         grown = _memory_mb() - warm
         alone = sum(
-            _alone(alert.latitude, alert.longitude) for alert in engine.alerts.next_to_repeat(10**6)
+            _is_insider_only(alert.latitude, alert.longitude)
+            for alert in engine.alerts.next_to_repeat(10**6)
         )
         settled = engine.counts[Kind.OBSERVATION]
         ours = {name: n for name, n in engine.counts.items() if n}
     site.say(f"{sent} messages of the insider, {settled} observations; {ours}")
     return [
-        figure("faults.insider.alerts_alone", alone),
-        _growth(grown, seconds - WARM_S, quick=site.quick),
-        figure("faults.insider.honest_delay_s", longest),
-        figure("faults.insider.messages", sent / seconds),
-        figure("faults.insider.replayed", replayed),
-        figure("faults.insider.honest_lost", int(settled < len(HONEST) * seconds)),
+        make_figure("faults.insider.alerts_alone", alone),
+        _make_growth_figure(grown, seconds - WARM_S, quick=site.quick),
+        make_figure("faults.insider.honest_delay_s", longest),
+        make_figure("faults.insider.messages", sent / seconds),
+        make_figure("faults.insider.replayed", replayed),
+        make_figure("faults.insider.honest_lost", int(settled < len(HONEST) * seconds)),
     ]
 
 
-def _attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
+def _make_attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
     """Return the next of its permitted messages, in turn."""
     seq = number + 1
     what = number % 6
     if what == 0:  # places all over the region
-        return _message(_scattered(seq, now, random_, 0.05))
+        return _make_message(_make_scattered(seq, now, random_, 0.05))
     if what == 1:  # ... and over the world
-        return _message(_scattered(seq, now, random_, 60.0))
+        return _make_message(_make_scattered(seq, now, random_, 60.0))
     if what == 2:  # a stream for each batch
-        return _message(
-            replace(_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62)))
+        return _make_message(
+            replace(_make_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62)))
         )
     if what == 3:  # text, which is dear to read
-        one = _scattered(seq, now, random_, 0.001)
-        return _text(one)
+        one = _make_scattered(seq, now, random_, 0.001)
+        return _make_text_message(one)
     if what == 4:  # a foot in another month, on its own ice
         old = now - MONTH_NS
-        one = _ice(seq, now, 2)
+        one = _make_ice(seq, now, 2)
         leave = np.array([old, now])
-        return _message(
+        return _make_message(
             replace(one, columns=one.columns | {"leave_time": leave, "enter_time": leave - NS})
         )
-    return _message(_ice(seq, now, 1))  # and its own report, again and again
+    return _make_message(_make_ice(seq, now, 1))  # and its own report, again and again
 
 
-def _ice(seq: int, now: int, rows: int) -> Batch:
+def _make_ice(seq: int, now: int, rows: int) -> Batch:
     cell = int(grid.cell_of(*ICE))
     where = {
         "latitude": np.full(rows, ICE[0]),
@@ -144,7 +145,7 @@ def _ice(seq: int, now: int, rows: int) -> Batch:
     return replace(one, region=int(grid.region_of(cell)), columns=one.columns | where)
 
 
-def _visit(name: str, seq: int, now: int, second: int) -> Batch:
+def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
     """An honest visit; they go round a road of twenty cells at 12 m/s."""
     longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
     one = batch(name, seq, now, [0.8])
@@ -154,7 +155,7 @@ def _visit(name: str, seq: int, now: int, second: int) -> Batch:
     )
 
 
-def _scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
+def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
     """Visits of fifty cells anywhere near a place; a batch has the region of its first."""
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)
@@ -169,12 +170,12 @@ def _scattered(seq: int, now: int, random_: np.random.Generator, degrees: float)
     return replace(one, region=int(region[0]), columns=one.columns | where)
 
 
-def _message(one: Batch) -> Message:
+def _make_message(one: Batch) -> Message:
     place = keys.observation_key(one.region, one.vehicle)
     return Message(one.kind, place, wire.encode(one), wire.ENCODING[one.kind])
 
 
-def _text(one: Batch) -> Message:
+def _make_text_message(one: Batch) -> Message:
     """A batch as a person would write it."""
     text = {
         "vehicle": one.vehicle,
@@ -191,7 +192,7 @@ def _text(one: Batch) -> Message:
     return Message(one.kind, place, json.dumps(text).encode(), "application/json")
 
 
-def _alone(latitude: float, longitude: float) -> bool:
+def _is_insider_only(latitude: float, longitude: float) -> bool:
     """Return True if an alert is at a place that only the insider reports."""
     return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
 

@@ -28,10 +28,10 @@ from fleet_service.serve.encode import cell_table
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
-from tests.faults.census import Census, take, told
+from tests.faults.bars import make_figure
+from tests.faults.census import Census, compare_with_archive, read_journals
 from tests.faults.frame import Site
-from tests.faults.processes import Part, Stage, stage
+from tests.faults.processes import Part, Stage, open_stage
 
 AGENTS: Final = 12
 # Observations/s of each: one that is restarting offers none, and 5 000/s are to remain. A start
@@ -82,12 +82,19 @@ def run(site: Site) -> list[Figure]:
     difference = 0.0
     found = []
     upkeep: frozenset[str] = frozenset()
-    for number in range(site.of(10, 1)):
+    for number in range(site.choose_amount(10, 1)):
         began = time.monotonic()
         begin_with_old_rows(site.folder / f"round-{number}" / "archive")
-        with stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as there:
-            census, load = _round(there, site.of(AGENTS, 6), site.of(KILLS_PER_ROUND, 5), random_)
-        upkeep = upkeep.union(_done(there.archive), {"retention"} if load.retired else ())
+        with open_stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as there:
+            census, load = _run_round(
+                there,
+                site.choose_amount(AGENTS, 6),
+                site.choose_amount(KILLS_PER_ROUND, 5),
+                random_,
+            )
+        upkeep = upkeep.union(
+            _find_finished_jobs(there.archive), {"retention"} if load.retired else ()
+        )
         difference = max(difference, map_difference(there.archive))
         kills += sum(part.starts - 1 for part in there.parts)
         offered = offered + load.observations
@@ -97,13 +104,13 @@ def run(site: Site) -> list[Figure]:
         site.say(f"round {number}: {kills} killed so far, {census}")
     total = {name: sum(getattr(census, name) for census in found) for name in vars(found[0])}
     return [
-        figure("faults.kill.acknowledged_lost", total["acknowledged_lost"]),
-        figure("faults.kill.doubled", total["doubled"]),
-        figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
-        figure("faults.kill.map_difference", difference),
-        _reached(site, "faults.kill.upkeep", len(upkeep), 2),
-        _reached(site, "faults.kill.kills", kills, 5),
-        _reached(site, "faults.kill.offered_per_s", offered / seconds, 100),
+        make_figure("faults.kill.acknowledged_lost", total["acknowledged_lost"]),
+        make_figure("faults.kill.doubled", total["doubled"]),
+        make_figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
+        make_figure("faults.kill.map_difference", difference),
+        _make_figure(site, "faults.kill.upkeep", len(upkeep), 2),
+        _make_figure(site, "faults.kill.kills", kills, 5),
+        _make_figure(site, "faults.kill.offered_per_s", offered / seconds, 100),
         Figure(
             "faults.kill.whole_per_s",
             total["observations"] / whole_s,
@@ -113,9 +120,9 @@ def run(site: Site) -> list[Figure]:
     ]
 
 
-def _reached(site: Site, name: str, value: float, quick: float) -> Figure:
+def _make_figure(site: Site, name: str, value: float, quick: float) -> Figure:
     """A figure with its bar, or with the one of a quick run, which is smaller."""
-    found = figure(name, value)
+    found = make_figure(name, value)
     return replace(found, bar=quick) if site.quick else found
 
 
@@ -133,7 +140,7 @@ def old_days(archive: Path) -> list[Path]:
     return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
-def _done(archive: Path) -> frozenset[str]:
+def _find_finished_jobs(archive: Path) -> frozenset[str]:
     """Return the results of background jobs, which prove that the kills met them."""
     found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
     return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
@@ -161,12 +168,14 @@ def map_difference(archive: Path) -> float:
     )
 
 
-def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tuple[Census, Load]:
+def _run_round(
+    there: Stage, agents: int, kills: int, random_: random.Random
+) -> tuple[Census, Load]:
     """Run one round; return its census, and the load offered from the start of all processes until
     the drain.
     """
     for number in range(agents):
-        there.load([f"sim-{number:03}"], RATE, seed=number).start()
+        there.make_load([f"sim-{number:03}"], RATE, seed=number).start()
     for part in there.loads:
         part.line_with("ready: ")
     words = ["retention", "--archive", str(there.archive), "--raw-days", str(LEAST_DAYS), "--yes"]
@@ -176,12 +185,12 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
     old = len(old_days(there.archive))
     assert old
     while killed < kills:
-        if killed % RETIRED_EVERY == 1 and not retention.alive:
+        if killed % RETIRED_EVERY == 1 and not retention.is_alive:
             retention.start()
         time.sleep(random_.uniform(*PAUSE_S))
         if random_.random() < RETIRING_KILLED:
             retention.kill()
-        victims = _victims(there, random_)
+        victims = _choose_victims(there, random_)
         for part in victims:
             part.kill()
         killed += 1
@@ -198,12 +207,14 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
     retention.wait(DRAIN_S)
     assert not old_days(there.archive), f"retention did not go on after a kill; see {retention.log}"
     amid = sum(
-        records for records, at in told(there.journals).stored.values() if began <= at <= end
+        records
+        for records, at in read_journals(there.journals).stored.values()
+        if began <= at <= end
     )
-    return take(there.journals, there.archive), Load(amid, end - began, retired)
+    return compare_with_archive(there.journals, there.archive), Load(amid, end - began, retired)
 
 
-def _victims(there: Stage, random_: random.Random) -> list[Part]:
+def _choose_victims(there: Stage, random_: random.Random) -> list[Part]:
     """One or several at once; router and service as often as all the agents together."""
     chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
     return chosen + random_.sample(

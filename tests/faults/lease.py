@@ -11,7 +11,7 @@ from unittest.mock import patch
 from fleet_service.replication import lease as lease_module
 from fleet_service.replication.lease import Lease
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.lease_histories import ServiceHistory, judge_history
 
@@ -61,17 +61,17 @@ def judge_without_expiry(seeds: Iterable[int]) -> Judged:
 def run(site: Site) -> list[Figure]:
     """Judge the histories, and two protocols that each lack a rule and must be found out."""
     first = 1000 * site.seed
-    judged = judge_seeds(range(first, first + site.of(200, 12)))
-    controls = range(first, first + site.of(40, 12))
+    judged = judge_seeds(range(first, first + site.choose_amount(200, 12)))
+    controls = range(first, first + site.choose_amount(40, 12))
     unlike = judge_without_comparison(controls)
     endless = judge_without_expiry(controls)
     site.say(f"{judged}; without comparison {unlike}; without expiry {endless}")
     return [
-        figure("faults.lease.acknowledged_by_two", judged.acknowledged_by_two),
-        figure("faults.history.violations", judged.violations),
-        figure("faults.history.failovers", judged.failovers),
-        figure("faults.history.acknowledged", judged.acknowledged),
-        figure("faults.lease.refused", judged.refused),
-        figure("faults.lease.control_unlike", unlike.acknowledged_by_two),
-        figure("faults.lease.control_endless", endless.acknowledged_by_two),
+        make_figure("faults.lease.acknowledged_by_two", judged.acknowledged_by_two),
+        make_figure("faults.history.violations", judged.violations),
+        make_figure("faults.history.failovers", judged.failovers),
+        make_figure("faults.history.acknowledged", judged.acknowledged),
+        make_figure("faults.lease.refused", judged.refused),
+        make_figure("faults.lease.control_unlike", unlike.acknowledged_by_two),
+        make_figure("faults.lease.control_endless", endless.acknowledged_by_two),
     ]

@@ -122,7 +122,7 @@ class VirtualTime:
     def spawn(self, process: _Process, run: Callable[[], None]) -> _Actor:
         """Start a thread of a process."""
         actor = _Actor(process, run)
-        self._push(self.now, actor)
+        self._push_event(self.now, actor)
         threading.Thread(target=self._run_actor, args=(actor,), daemon=True).start()
         return actor
 
@@ -132,7 +132,7 @@ class VirtualTime:
         assert actor is not None
         end = self.now + seconds
         while True:
-            self._push(end, actor)
+            self._push_event(end, actor)
             self._main.release()
             actor.turn.acquire()
             if self._is_over or actor.process.is_dead:
@@ -151,7 +151,7 @@ class VirtualTime:
             actor.turn.release()
             self._main.acquire()
 
-    def _push(self, at: float, actor: _Actor) -> None:
+    def _push_event(self, at: float, actor: _Actor) -> None:
         self._count += 1
         heapq.heappush(self._queue, (at, self._count, actor))
 
@@ -263,9 +263,9 @@ class ServiceHistory:
     def run(self) -> None:
         """Play the history to its end."""
         for name in NAMES:
-            self._start(name, 0.0)
+            self._start_process(name, 0.0)
         chaos = _Process("chaos", self._random, 1.0)
-        self._world.spawn(chaos, self._disturb)
+        self._world.spawn(chaos, self._disturb_processes)
         with (
             patch.object(lease_module, "time", self._world),
             patch.object(lease_module, "elapsed_seconds", self._world.monotonic),
@@ -276,22 +276,22 @@ class ServiceHistory:
         read = _batches_of(self._find_counted(names))
         self.events.append(Event("reads", max(self._fences, default=0), read))
 
-    def _start(self, name: str, after: float) -> None:
+    def _start_process(self, name: str, after: float) -> None:
         """Start a process; half of them have a lease time of their own."""
         common = LEASES[0]
         own = self._random.choice(LEASES) if self._random.random() < 0.5 else common
         process = _Process(name, self._random, own)
         self._processes[name] = process
 
-        def live() -> None:
+        def serve_repeatedly() -> None:
             self._world.sleep(after)
             while True:
                 self._serve_once(process)
                 self._world.sleep(self._random.uniform(0.5, 3.0))
 
-        self._world.spawn(process, live)
+        self._world.spawn(process, serve_repeatedly)
 
-    def _disturb(self) -> None:
+    def _disturb_processes(self) -> None:
         r = self._random
         while True:
             self._world.sleep(r.uniform(1.0, 6.0))
@@ -300,7 +300,7 @@ class ServiceHistory:
             kind = r.choice(("kill", "freeze", "cut", "token"))
             if kind == "kill":
                 process.is_dead = True
-                self._start(process.name, r.uniform(0.0, 8.0))
+                self._start_process(process.name, r.uniform(0.0, 8.0))
             elif kind == "freeze":
                 process.frozen_until = until
             elif kind == "cut":
@@ -308,7 +308,7 @@ class ServiceHistory:
             else:
                 process.token_until = until
 
-    def _stands(self, name: str) -> bool:
+    def _has_token(self, name: str) -> bool:
         process = self._processes.get(name)
         return process is not None and self._world.now >= process.token_until
 
@@ -317,12 +317,12 @@ class ServiceHistory:
         name = process.name
         lease = Lease(name, cast(ObjectBucket, self._bucket), name, process.lease_s)
         stop = VirtualStop(self._world)
-        standby = Standby(lambda: True, self._stands, lambda: None, lambda: None)
+        standby = Standby(lambda: True, self._has_token, lambda: None, lambda: None)
         try:
             lease.wait(cast(threading.Event, stop), lambda _: None, lambda: 0, standby)
             lease._stop = cast(threading.Event, stop)
             keeper = self._world.spawn(process, lease._renew_until_stopped)
-            known = self._join(lease)
+            known = self._begin_serving(lease)
         except InputError:
             self.refused += 1
             process.lease_s = LEASES[0] if self._random.random() < 0.5 else process.lease_s
@@ -332,14 +332,14 @@ class ServiceHistory:
             return
         end = self._world.now + self._random.uniform(5.0, 30.0)
         while not lease.lost and self._world.now < end:
-            self._accept(lease, known)
+            self._accept_batch(lease, known)
         stop.set()
         while not keeper.is_done:
             self._world.sleep(0.1)
         if self._random.random() < 0.7:
             lease.release()
 
-    def _join(self, lease: Lease) -> set[int]:
+    def _begin_serving(self, lease: Lease) -> set[int]:
         """List the bucket, put the fence, and begin to serve."""
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number
@@ -350,7 +350,7 @@ class ServiceHistory:
         self.events.append(Event("serves", number, batches))
         return set(batches)
 
-    def _accept(self, lease: Lease, known: set[int]) -> None:
+    def _accept_batch(self, lease: Lease, known: set[int]) -> None:
         """Upload a batch that a vehicle offers, and acknowledge it if the lease allows it."""
         self._world.sleep(self._random.uniform(0.0, 0.3))
         offered = range(int(self._world.now * BATCHES_PER_S) + 1)

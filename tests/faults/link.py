@@ -24,7 +24,7 @@ import numpy as np
 from fleet_service.enrolment.fleet import Enrolment, Router
 from schemas import grid, keys
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.link_relay import DEVICE, LinkTerms
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, key
@@ -63,43 +63,47 @@ class Namespaces:
         }
         names = {"services": [SERVICE], "readers": [READER], "vehicles": [*HONEST, FLOODER]}
         registry(self.certificates).enrol(Enrolment.model_validate({"routers": routers, **names}))
-        self.road = self._add("road")
+        self.road = self._add_namespace("road")
 
-    def _add(self, name: str) -> str:
+    def _add_namespace(self, name: str) -> str:
         namespace = f"{self._tag}-{name}"
-        run("ip", "netns", "add", namespace)
-        self._stack.callback(run, "ip", "netns", "delete", namespace)
-        run("ip", "-n", namespace, "link", "set", "lo", "up")
+        run_command("ip", "netns", "add", namespace)
+        self._stack.callback(run_command, "ip", "netns", "delete", namespace)
+        run_command("ip", "-n", namespace, "link", "set", "lo", "up")
         return namespace
 
-    def connect(
+    def connect_cars(
         self, name: str, terms: LinkTerms, net: str = "10.77.0"
     ) -> tuple[str, subprocess.Popen[str]]:
         """Return a new namespace of cars, linked to the road, and the process of the link."""
-        car = self._add(name)
+        car = self._add_namespace(name)
         device = f"{DEVICE}{net[3:5]}"
         given = {"left": car, "right": self.road, "device": device, "terms": asdict(terms)}
-        link = self.start("", "tests.faults.link_relay", given)
+        link = self.start_process("", "tests.faults.link_relay", given)
         read_line(link)
         for namespace, number in ((car, 2), (self.road, 1)):
-            run("ip", "-n", namespace, "address", "add", f"{net}.{number}/24", "dev", device)
-            run("ip", "-n", namespace, "link", "set", device, "up")
+            run_command(
+                "ip", "-n", namespace, "address", "add", f"{net}.{number}/24", "dev", device
+            )
+            run_command("ip", "-n", namespace, "link", "set", device, "up")
         if net != "10.77.0":
-            run("ip", "-n", car, "route", "add", "10.77.0.0/24", "dev", device)
+            run_command("ip", "-n", car, "route", "add", "10.77.0.0/24", "dev", device)
         return car, link
 
-    def move(self, car: str, number: int) -> None:
+    def move_car(self, car: str, number: int) -> None:
         """Give the car another address, as a mobile network does; the old one is gone."""
         device = f"{DEVICE}77"
-        run("ip", "-n", car, "address", "flush", "dev", device)
-        run("ip", "-n", car, "address", "add", f"10.77.0.{number}/24", "dev", device)
+        run_command("ip", "-n", car, "address", "flush", "dev", device)
+        run_command("ip", "-n", car, "address", "add", f"10.77.0.{number}/24", "dev", device)
 
-    def start(self, namespace: str, module: str, given: dict[str, Any]) -> subprocess.Popen[str]:
+    def start_process(
+        self, namespace: str, module: str, given: dict[str, Any]
+    ) -> subprocess.Popen[str]:
         """Start a process of the campaign; it ends with the campaign at the latest."""
         inside = ["ip", "netns", "exec", namespace] if namespace else []
-        return self._popen([*inside, sys.executable, "-m", module, json.dumps(given)])
+        return self._open_process([*inside, sys.executable, "-m", module, json.dumps(given)])
 
-    def router(
+    def start_router(
         self, letter: str = "a", protocols: Sequence[str] = ("quic", "tls"), *, capped: bool = True
     ) -> subprocess.Popen[str]:
         """Start a router of the road as `fleet-service certs` configures it, on some of its
@@ -126,11 +130,11 @@ class Namespaces:
             "--config",
             str(used),
         ]
-        process = self._popen(command)
+        process = self._open_process(command)
         read_line(process)
         return process
 
-    def end(
+    def start_end(
         self, role: str, namespace: str, name: str, protocols: Sequence[str], **given: object
     ) -> subprocess.Popen[str]:
         """Start one end of the campaign; see `link_ends.py`."""
@@ -145,22 +149,22 @@ class Namespaces:
             "certificates": str(self.certificates),
             **given,
         }
-        return self.start(namespace, "tests.faults.link_ends", whole)
+        return self.start_process(namespace, "tests.faults.link_ends", whole)
 
-    def _popen(self, command: list[str]) -> subprocess.Popen[str]:
+    def _open_process(self, command: list[str]) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
-        self._stack.callback(stop, process)
+        self._stack.callback(stop_process, process)
         return process
 
 
-def run(*command: str) -> None:
+def run_command(*command: str) -> None:
     """Run a command of iproute2."""
     subprocess.run(command, check=True, capture_output=True)
 
 
-def stop(process: subprocess.Popen[str]) -> None:
+def stop_process(process: subprocess.Popen[str]) -> None:
     """End a process."""
     process.kill()
     process.wait()
@@ -178,7 +182,7 @@ def read_line(process: subprocess.Popen[str]) -> str:
     return line
 
 
-def release(process: subprocess.Popen[str]) -> dict[str, Any]:
+def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
     """Close the stdin of an end, which then prints its result."""
     assert process.stdin is not None
     process.stdin.close()
@@ -186,7 +190,7 @@ def release(process: subprocess.Popen[str]) -> dict[str, Any]:
     return found
 
 
-def command(process: subprocess.Popen[str], line: str) -> None:
+def write_line(process: subprocess.Popen[str], line: str) -> None:
     """Write a line to a process."""
     assert process.stdin is not None
     process.stdin.write(line + "\n")
@@ -194,7 +198,7 @@ def command(process: subprocess.Popen[str], line: str) -> None:
 
 
 @contextmanager
-def namespaces(folder: Path) -> Iterator[Namespaces]:
+def open_namespaces(folder: Path) -> Iterator[Namespaces]:
     """Namespaces that are gone afterwards."""
     folder.mkdir(parents=True)
     with ExitStack() as stack:
@@ -205,22 +209,24 @@ def change_address(site: Site, protocol: str, seconds: float) -> tuple[int, int,
     """Return how many samples a car put and lost while its address changed twice, and the
     longest gap [s].
     """
-    with namespaces(site.folder / f"address-{protocol}") as there:
-        there.router()
-        car, _ = there.connect("car", MOBILE)
+    with open_namespaces(site.folder / f"address-{protocol}") as there:
+        there.start_router()
+        car, _ = there.connect_cars("car", MOBILE)
         place = key(HONEST[0])
-        service = there.end("receive", there.road, SERVICE, ("tls",), keys=[place])
+        service = there.start_end("receive", there.road, SERVICE, ("tls",), keys=[place])
         read_line(service)
         streams = [{"key": place, "size": 300, "rate": SAMPLES_PER_S}]
-        vehicle = there.end("send", car, HONEST[0], (protocol,), streams=streams, drain_s=QUIET_S)
+        vehicle = there.start_end(
+            "send", car, HONEST[0], (protocol,), streams=streams, drain_s=QUIET_S
+        )
         read_line(vehicle)
-        command(vehicle, "go")
+        write_line(vehicle, "go")
         for number in (3, 4):
             time.sleep(seconds / 3)
-            there.move(car, number)
+            there.move_car(car, number)
         time.sleep(seconds / 3)
-        put = release(vehicle)[place]
-        arrived = release(service).get(place, [])
+        put = finish_end(vehicle)[place]
+        arrived = finish_end(service).get(place, [])
     numbers = {number for number, _, _ in arrived}
     times = np.sort([at for _, _, at in arrived])
     return put, put - len(numbers), float(np.diff(times).max())
@@ -228,25 +234,25 @@ def change_address(site: Site, protocol: str, seconds: float) -> tuple[int, int,
 
 def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
     """Return the delays of alerts over a lossy link with tiles next to them."""
-    with namespaces(site.folder / f"lossy-{protocol}") as there:
-        there.router()
-        car, _ = there.connect("car", LOSSY)
+    with open_namespaces(site.folder / f"lossy-{protocol}") as there:
+        there.start_router()
+        car, _ = there.connect_cars("car", LOSSY)
         alert = keys.alert_key(TILE)
         tile = keys.map_key(TILE)
-        reader = there.end("receive", car, READER, (protocol,), keys=[alert, tile])
+        reader = there.start_end("receive", car, READER, (protocol,), keys=[alert, tile])
         used = json.loads(read_line(reader))["protocols"]
         assert used == [protocol], used
         streams = [
             {"key": alert, "size": 150, "rate": ALERTS_PER_S},
             {"key": tile, "size": TILE_BYTES, "rate": TILES_PER_S},
         ]
-        service = there.end("send", there.road, SERVICE, ("tls",), streams=streams)
+        service = there.start_end("send", there.road, SERVICE, ("tls",), streams=streams)
         read_line(service)
-        command(service, "go")
+        write_line(service, "go")
         time.sleep(seconds)
-        put = release(service)
+        put = finish_end(service)
         time.sleep(QUIET_S)
-        arrived = release(reader)
+        arrived = finish_end(reader)
     delays = 1e3 * np.array([delay for _, delay, _ in arrived[alert]])
     return {
         "p50": float(np.quantile(delays, 0.5)),
@@ -259,12 +265,12 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
 
 def block_udp(site: Site) -> float:
     """Return how long a session takes to open where UDP is blocked [s]."""
-    with namespaces(site.folder / "udp") as there:
+    with open_namespaces(site.folder / "udp") as there:
         for letter in "ab":
-            there.router(letter)
-        car, _ = there.connect("car", LinkTerms(delay_s=0.04, drop_udp=True))
+            there.start_router(letter)
+        car, _ = there.connect_cars("car", LinkTerms(delay_s=0.04, drop_udp=True))
         found = json.loads(
-            read_line(there.end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS))
+            read_line(there.start_end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS))
         )
         assert found["protocols"] == ["tls"], found
         return float(found["seconds"])
@@ -275,17 +281,17 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
     [s].
     """
     longest = 0.0
-    with namespaces(site.folder / "back") as there:
-        router = there.router()
-        car, _ = there.connect("car", MOBILE)
-        watched = there.end("watch", car, HONEST[0], ("quic", "tls"), ports=PORTS)
+    with open_namespaces(site.folder / "back") as there:
+        router = there.start_router()
+        car, _ = there.connect_cars("car", MOBILE)
+        watched = there.start_end("watch", car, HONEST[0], ("quic", "tls"), ports=PORTS)
         assert json.loads(read_line(watched))["protocols"] == ["quic"]
         for outage_s in outages_s:
-            stop(router)
+            stop_process(router)
             while json.loads(read_line(watched))["connected"]:
                 pass
             time.sleep(outage_s)
-            router = there.router(protocols=("tls",))
+            router = there.start_router(protocols=("tls",))
             back = time.monotonic()
             while not (told := json.loads(read_line(watched)))["connected"]:
                 pass
@@ -294,33 +300,37 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
     return longest
 
 
-def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
+def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
     """Return the p99 of honest messages with a flooding car over that without, and what passed
     of the flood [1/s].
     """
-    with namespaces(site.folder / f"flood-{capped}") as there:
-        there.router(capped=capped)
-        cars, _ = there.connect("car", MOBILE)
-        flooding, _ = there.connect("flood", UPLINK, FLOOD_NET)
+    with open_namespaces(site.folder / f"flood-{capped}") as there:
+        there.start_router(capped=capped)
+        cars, _ = there.connect_cars("car", MOBILE)
+        flooding, _ = there.connect_cars("flood", UPLINK, FLOOD_NET)
         streams = [{"name": name, "key": key(name), "size": 1000, "rate": 4.0} for name in HONEST]
         place = key(FLOODER)
-        service = there.end("receive", there.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"])
+        service = there.start_end(
+            "receive", there.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"]
+        )
         read_line(service)
-        honest = there.end("send", cars, HONEST[0], ("quic",), streams=streams, drain_s=QUIET_S)
-        attacker = there.end(
+        honest = there.start_end(
+            "send", cars, HONEST[0], ("quic",), streams=streams, drain_s=QUIET_S
+        )
+        attacker = there.start_end(
             "send", flooding, FLOODER, ("quic",), streams=[{"key": place, "size": 1000, "rate": 0}]
         )
         read_line(honest)
         read_line(attacker)
-        command(honest, "go")
+        write_line(honest, "go")
         time.sleep(seconds)
         began = time.monotonic()
-        command(attacker, "go")
+        write_line(attacker, "go")
         time.sleep(seconds)
         ended = time.monotonic()
-        stop(attacker)
-        release(honest)
-        arrived = release(service)
+        stop_process(attacker)
+        finish_end(honest)
+        arrived = finish_end(service)
     delays: dict[bool, list[float]] = {False: [], True: []}
     for name in HONEST:
         for _, delay, at in arrived[key(name)]:
@@ -333,9 +343,9 @@ def flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
 
 def measure(site: Site) -> list[Figure]:
     """Run all parts of the campaign."""
-    address_s = site.of(15, 6)
-    lossy_s = site.of(60, 12)
-    flood_s = site.of(20, 5)
+    address_s = site.choose_amount(15, 6)
+    lossy_s = site.choose_amount(60, 12)
+    flood_s = site.choose_amount(20, 5)
     put, lost, gap = change_address(site, "quic", address_s)
     _, tls_lost, tls_gap = change_address(site, "tls", address_s)
     site.say(
@@ -346,30 +356,30 @@ def measure(site: Site) -> list[Figure]:
     site.say(f"lossy link: QUIC {quic}; TLS {tls}")
     ready_s = block_udp(site)
     back_s = return_with_tls(site, (1.0, 4.0, 7.0) if not site.quick else (2.0,))
-    ratio, passed = flood(site, flood_s, capped=True)
-    free_ratio, free = flood(site, flood_s, capped=False)
+    ratio, passed = measure_flood(site, flood_s, capped=True)
+    free_ratio, free = measure_flood(site, flood_s, capped=False)
     site.say(
         f"flood: {passed:.0f} of {free:.0f} messages/s pass; honest p99 {ratio:.2f} "
         f"{free_ratio:.2f} uncapped"
     )
     return [
-        figure("link.address_change.lost", lost),
-        figure("link.address_change.gap_s", gap),
-        figure("link.address_change.samples", put),
+        make_figure("link.address_change.lost", lost),
+        make_figure("link.address_change.gap_s", gap),
+        make_figure("link.address_change.samples", put),
         Figure("link.address_change.tls_lost", tls_lost, "samples, the same over TLS"),
         Figure("link.address_change.tls_gap_s", tls_gap, "s, the same over TLS"),
-        figure("link.lossy.alert_p99_ms", quic["p99"]),
-        figure("link.lossy.alert_p99_ratio", quic["p99"] / tls["p99"]),
-        figure("link.lossy.alerts_lost", quic["alerts_lost"]),
+        make_figure("link.lossy.alert_p99_ms", quic["p99"]),
+        make_figure("link.lossy.alert_p99_ratio", quic["p99"] / tls["p99"]),
+        make_figure("link.lossy.alerts_lost", quic["alerts_lost"]),
         Figure("link.lossy.alert_p50_ms", quic["p50"], "ms"),
         Figure("link.lossy.tls_p50_ms", tls["p50"], "ms, over TLS"),
         Figure("link.lossy.tls_p99_ms", tls["p99"], "ms, over TLS"),
         Figure("link.lossy.tiles_share", quic["tiles_share"], "of tiles that arrived"),
         Figure("link.lossy.tls_tiles_share", tls["tiles_share"], "of tiles that arrived over TLS"),
-        figure("link.udp_blocked.ready_s", ready_s),
-        figure("link.router_back_tls_only_s", back_s),
-        figure("link.flood.honest_p99_ratio", ratio),
-        figure("link.flood.sent_per_s", free),
+        make_figure("link.udp_blocked.ready_s", ready_s),
+        make_figure("link.router_back_tls_only_s", back_s),
+        make_figure("link.flood.honest_p99_ratio", ratio),
+        make_figure("link.flood.sent_per_s", free),
         Figure("link.flood.passed_per_s", passed, "messages/s of the flooding car"),
         Figure("link.flood.uncapped_p99_ratio", free_ratio, "with a flood over without, no caps"),
     ]

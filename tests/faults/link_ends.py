@@ -45,13 +45,13 @@ def receive(given: dict[str, Any]) -> None:
     """
     arrived: dict[str, list[tuple[int, float, float]]] = {}
 
-    def note(sample: zenoh.Sample) -> None:
+    def note_arrival(sample: zenoh.Sample) -> None:
         now = time.monotonic()
         number, put_at = HEAD.unpack(sample.payload.to_bytes()[: HEAD.size])
         arrived.setdefault(str(sample.key_expr), []).append((number, now - put_at, now))
 
     with open_end(given) as session:
-        subscribers = [session.declare_subscriber(key, note) for key in given["keys"]]
+        subscribers = [session.declare_subscriber(key, note_arrival) for key in given["keys"]]
         print(
             json.dumps({"protocols": wait_for_link(session), "subscribers": len(subscribers)}),
             flush=True,
@@ -69,7 +69,7 @@ def send(given: dict[str, Any]) -> None:
     over = threading.Event()
     counts = dict[str, int]()
 
-    def drive(session: zenoh.Session, stream: dict[str, Any]) -> None:
+    def drive_stream(session: zenoh.Session, stream: dict[str, Any]) -> None:
         quality = quality_of(keys.TOPICS[stream["key"].split("/")[2]])
         filling = bytes(stream["size"] - HEAD.size)
         number = 0
@@ -91,7 +91,7 @@ def send(given: dict[str, Any]) -> None:
     sys.stdin.readline()
     threads = [
         threading.Thread(
-            target=drive, args=(sessions[one.get("name", given["name"])], one), daemon=True
+            target=drive_stream, args=(sessions[one.get("name", given["name"])], one), daemon=True
         )
         for one in given["streams"]
     ]
@@ -126,7 +126,7 @@ def watch(given: dict[str, Any]) -> None:
     with open_end(given) as session:
         seen: list[LinkWatch] = []
 
-        def tell() -> None:
+        def print_state() -> None:
             if seen:
                 told = {
                     "time": time.monotonic(),
@@ -135,9 +135,9 @@ def watch(given: dict[str, Any]) -> None:
                 }
                 print(json.dumps(told), flush=True)
 
-        seen.append(LinkWatch(session, given["name"], tell))
+        seen.append(LinkWatch(session, given["name"], print_state))
         wait_for_link(session)
-        tell()
+        print_state()
         sys.stdin.read()
 
 

@@ -62,7 +62,9 @@ class Direction:
     free_at: float = 0.0
     number: int = 0
 
-    def take(self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random) -> None:
+    def accept_packet(
+        self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
+    ) -> None:
         """Accept a packet or lose it."""
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return
@@ -76,7 +78,7 @@ class Direction:
         self.number += 1
         heapq.heappush(self.flying, (self.free_at + terms.delay_s, self.number, packet))
 
-    def deliver(self, now: float) -> None:
+    def deliver_packets(self, now: float) -> None:
         """Write the packets that have arrived."""
         while self.flying and self.flying[0][0] <= now:
             packet = heapq.heappop(self.flying)[2]
@@ -86,7 +88,7 @@ class Direction:
                 continue
 
 
-def enter(namespace: str) -> None:
+def enter_namespace(namespace: str) -> None:
     """Move this thread into a named network namespace."""
     with Path("/run/netns", namespace).open("rb") as file:
         if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET):
@@ -95,13 +97,13 @@ def enter(namespace: str) -> None:
 
 def open_device(namespace: str, device: str) -> int:
     """Create a TUN device in a namespace; return its file descriptor."""
-    enter(namespace)
+    enter_namespace(namespace)
     found = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(found, TUNSETIFF, struct.pack("16sH", device.encode(), IFF_TUN | IFF_NO_PI))
     return found
 
 
-def relay(ends: tuple[int, int], terms: LinkTerms) -> None:
+def relay_packets(ends: tuple[int, int], terms: LinkTerms) -> None:
     """Move packets until stdin is closed."""
     ways = {ends[0]: Direction(ends[1]), ends[1]: Direction(ends[0])}
     draw = random.Random(terms.seed)
@@ -118,14 +120,14 @@ def relay(ends: tuple[int, int], terms: LinkTerms) -> None:
                         return
                     terms = replace(terms, **json.loads(line))
                     continue
-                for packet in _packets(key.fd):
-                    ways[key.fd].take(packet, time.monotonic(), terms, draw)
+                for packet in _read_packets(key.fd):
+                    ways[key.fd].accept_packet(packet, time.monotonic(), terms, draw)
             now = time.monotonic()
             for way in ways.values():
-                way.deliver(now)
+                way.deliver_packets(now)
 
 
-def _packets(device: int) -> list[bytes]:
+def _read_packets(device: int) -> list[bytes]:
     found: list[bytes] = []
     while len(found) < 64:
         try:
@@ -143,7 +145,7 @@ def main() -> int:
         open_device(given["right"], given["device"]),
     )
     print("relay: ready", flush=True)
-    relay(ends, LinkTerms(**given["terms"]))
+    relay_packets(ends, LinkTerms(**given["terms"]))
     return 0
 
 

@@ -49,7 +49,7 @@ class Plan:
     cells_across: int = 64  # of the square that the vehicles drive in
 
 
-def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
+def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
     """Print `+ vehicle boot kind region seq records time` for each batch on disk, `- …` for each
     settled one.
     """
@@ -66,16 +66,20 @@ class WatchedOutbox(Outbox):
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)
-        note("+", ((batch.stream, batch.seq, batch.records) for batch in held))
+        print_events("+", ((batch.stream, batch.seq, batch.records) for batch in held))
         return held
 
     def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
         settled = list(ranges)
-        note("-", ((stream, seq, 0) for first, last in settled for seq in range(first, last + 1)))
+        print_events(
+            "-", ((stream, seq, 0) for first, last in settled for seq in range(first, last + 1))
+        )
         return super().settle(stream, settled)
 
 
-def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int) -> RecordBlock:
+def make_visits(
+    rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int
+) -> RecordBlock:
     """One made-up visit per element of `vehicle` (n,), all just left; now [ns]."""
     n = len(vehicle)
     columns: Columns = {}
@@ -98,7 +102,7 @@ def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: 
     return RecordBlock(Kind.OBSERVATION, columns, vehicle, np.zeros(n, bool))
 
 
-def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
+def offer_blocks(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
     """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and
     the longest lag [s].
     """
@@ -114,7 +118,7 @@ def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int
         owed -= n
         first = rng.integers(0, len(plan.names))
         vehicles = np.sort((first + np.arange(n)) % len(plan.names)).astype(np.int64)
-        publisher.offer(visits(rng, vehicles, time.time_ns(), plan.cells_across))
+        publisher.offer(make_visits(rng, vehicles, time.time_ns(), plan.cells_across))
         due += BLOCK_S
         lag = time.monotonic() - due
         late += lag > 0.0
@@ -123,7 +127,7 @@ def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int
     return late, longest
 
 
-def _set(*events: threading.Event) -> None:
+def _set_events(*events: threading.Event) -> None:
     for event in events:
         event.set()
 
@@ -135,13 +139,13 @@ def main(path: str) -> int:
     leave = threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: _set(leave, quiet))
+        signal.signal(number, lambda *_: _set_events(leave, quiet))
     outbox = WatchedOutbox(Path(plan.outbox), capacity_bytes=round(plan.capacity_mb * 1e6))
     config = AgentConfig(zenoh=ZenohSettings(connect=[plan.endpoint]), flush_s=plan.flush_s)
     publisher = Publisher(plan.names, outbox, config, "load")
     publisher.start()
     print("ready: load", flush=True)
-    late, longest = drive(plan, publisher, quiet)
+    late, longest = offer_blocks(plan, publisher, quiet)
     while publisher.unsettled() and not leave.wait(BLOCK_S):
         pass
     clean = publisher.close(STOPPED_DRAIN_S)

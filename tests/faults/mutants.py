@@ -98,12 +98,12 @@ class Mutants:
         self.now = now
         self._seq = 0
 
-    def message(self) -> Message:
+    def make_message(self) -> Message:
         """The next one."""
         r = self._random
         kind = r.choice(list(Kind))
         name = f"rogue-{r.randrange(50):02}"
-        payload, encoding = self._payload(kind, name)
+        payload, encoding = self._make_payload(kind, name)
         place = key(name) if kind is Kind.OBSERVATION else keys.state_key(REGION, name)
         if r.random() < 0.05:
             place = _changed_key(r, place)
@@ -113,9 +113,9 @@ class Mutants:
             r.choice(list(Kind)) if r.random() < 0.02 else kind, place, payload, encoding
         )
 
-    def _payload(self, kind: Kind, name: str) -> tuple[bytes, str]:
+    def _make_payload(self, kind: Kind, name: str) -> tuple[bytes, str]:
         r = self._random
-        message = self._valid(kind, name)
+        message = self._make_valid(kind, name)
         if r.random() < 0.1:
             text = json_format.MessageToJson(message, preserving_proto_field_name=True)
             return _changed_text(r, text).encode("utf-8", "replace"), wire.JSON
@@ -125,7 +125,7 @@ class Mutants:
             return message.SerializeToString(), wire.ENCODING[kind]
         return changed_bytes(r, message.SerializeToString()), wire.ENCODING[kind]
 
-    def _valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+    def _make_valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
         self._seq += 1
         message = _MESSAGE[kind]()
         message.CopyFrom(self._random.choice(_VALID[kind]))
@@ -140,7 +140,7 @@ class Mutants:
             message.time[:] = [self.now] * rows
         return message
 
-    def query(self) -> dict[str, str]:
+    def make_query(self) -> dict[str, str]:
         """Parameters of a malformed query."""
         r = self._random
         asked = dict(r.sample(list(_QUERY.items()), r.randrange(1, 4)))
@@ -165,7 +165,7 @@ class Mutants:
         return asked
 
 
-def _states() -> Any:  # noqa: ANN401
+def _make_states() -> Any:  # noqa: ANN401
     state = pb.StateBatch.FromString(wire.encode(whole_batch(Kind.STATE)))
     state.region = REGION
     state.first_held = 1
@@ -173,7 +173,7 @@ def _states() -> Any:  # noqa: ANN401
     return state
 
 
-def _at(place: int, rows: int) -> dict[str, Any]:
+def _shift_columns(place: int, rows: int) -> dict[str, Any]:
     """Columns of a batch some cells to the east."""
     longitude = LONGITUDE + 2e-4 * place
     return {
@@ -185,13 +185,13 @@ def _at(place: int, rows: int) -> dict[str, Any]:
 _VALID: Final = {
     Kind.OBSERVATION: [
         pb.ObservationBatch.FromString(
-            wire.encode(batch("rogue-00", 1, 0, mu, told=told, **_at(place, len(mu))))
+            wire.encode(batch("rogue-00", 1, 0, mu, told=told, **_shift_columns(place, len(mu))))
         )
         for mu in ([0.8], [0.2], [0.3, 0.9], [0.5, 0.6, 0.7, 0.8, 0.9])
         for told in (True, False)
         for place in range(PLACES)
     ],
-    Kind.STATE: [_states()],
+    Kind.STATE: [_make_states()],
 }
 _QUERY: Final = {
     "bbox": "11.9,57.6,12.0,57.8",

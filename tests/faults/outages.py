@@ -9,10 +9,10 @@ import time
 from typing import Final
 
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
-from tests.faults.census import Census, take, told
+from tests.faults.bars import make_figure
+from tests.faults.census import Census, compare_with_archive, read_journals
 from tests.faults.frame import Site
-from tests.faults.processes import Part, Stage, stage
+from tests.faults.processes import Part, Stage, open_stage
 
 AGENTS_PER_PROCESS: Final = 10
 RATE: Final = 10.0  # observations/s of each agent
@@ -21,10 +21,10 @@ DRAIN_S: Final = 60.0
 
 def router_down(site: Site) -> list[Figure]:
     """The router killed, gone for a minute, back: everything of that minute is settled soon."""
-    down_s = site.of(60, 4)
-    with stage(site.folder) as there:
-        _agents(there, site.of(5, 2))
-        time.sleep(site.of(3, 1))
+    down_s = site.choose_amount(60, 4)
+    with open_stage(site.folder) as there:
+        _load_agents(there, site.choose_amount(5, 2))
+        time.sleep(site.choose_amount(3, 1))
         there.router.kill()
         down = time.time()
         time.sleep(down_s)
@@ -32,50 +32,50 @@ def router_down(site: Site) -> list[Figure]:
         there.router.line_with("router: ")
         back = time.time()
         census = _at_rest(there)
-        known = told(there.journals)
+        known = read_journals(there.journals)
         recovery = known.longest_wait(back)
         amid = known.stored_between(down, back)
     site.say(f"{census}")
     return [
-        figure("faults.router_down.lost", census.lost),
-        figure("faults.router_down.recovery_s", recovery),
-        figure("faults.router_down.batches", amid),
+        make_figure("faults.router_down.lost", census.lost),
+        make_figure("faults.router_down.recovery_s", recovery),
+        make_figure("faults.router_down.batches", amid),
         Figure("faults.router_down.seconds", down_s, "s without a router"),
     ]
 
 
-def frozen(site: Site) -> list[Figure]:
+def freeze_parts(site: Site) -> list[Figure]:
     """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose
     nothing.
     """
-    frozen_s = site.of(20, 3)
+    frozen_s = site.choose_amount(20, 3)
     spans = []
-    with stage(site.folder) as there:
-        _agents(there, site.of(3, 1))
+    with open_stage(site.folder) as there:
+        _load_agents(there, site.choose_amount(3, 1))
         for part in (there.router, there.service):
-            time.sleep(site.of(3, 1))
-            part.send(signal.SIGSTOP)
+            time.sleep(site.choose_amount(3, 1))
+            part.send_signal(signal.SIGSTOP)
             began = time.time()
             time.sleep(frozen_s)
             spans.append((began, time.time()))
-            part.send(signal.SIGCONT)
+            part.send_signal(signal.SIGCONT)
         census = _at_rest(there)
-        known = told(there.journals)
+        known = read_journals(there.journals)
         ends = [
-            json.loads(next(line for line in part.lines() if line.startswith("{")))
+            json.loads(next(line for line in part.read_lines() if line.startswith("{")))
             for part in there.loads
         ]
     site.say(f"{census}; {ends}")
     return [
-        figure("faults.frozen.lost", census.lost),
-        figure("faults.frozen.batches", min(known.stored_between(*span) for span in spans)),
-        figure("faults.frozen.agent_deadline_misses", sum(end["late_blocks"] for end in ends)),
+        make_figure("faults.frozen.lost", census.lost),
+        make_figure("faults.frozen.batches", min(known.stored_between(*span) for span in spans)),
+        make_figure("faults.frozen.agent_deadline_misses", sum(end["late_blocks"] for end in ends)),
         Figure("faults.frozen.longest_lag_s", max(end["longest_lag_s"] for end in ends), "s"),
         Figure("faults.frozen.seconds", frozen_s, "s frozen, each"),
     ]
 
 
-def leaving(site: Site) -> list[Figure]:
+def stop_parts(site: Site) -> list[Figure]:
     """Send SIGTERM with a running router and with a frozen one: agent and service end soon, and
     lose nothing.
     """
@@ -83,25 +83,25 @@ def leaving(site: Site) -> list[Figure]:
     lost = 0
     acknowledged = 0
     for freeze in (False, True):
-        with stage(site.folder / str(freeze)) as there:
-            _agents(there, 1)
-            time.sleep(site.of(3, 1))
+        with open_stage(site.folder / str(freeze)) as there:
+            _load_agents(there, 1)
+            time.sleep(site.choose_amount(3, 1))
             if freeze:
-                there.router.send(signal.SIGSTOP)
-                time.sleep(site.of(3, 1))
+                there.router.send_signal(signal.SIGSTOP)
+                time.sleep(site.choose_amount(3, 1))
             for part in (*there.loads, there.service):
                 began = time.monotonic()
-                _clean(part)
+                _check_clean_stop(part)
                 longest = max(longest, time.monotonic() - began)
-            there.router.send(signal.SIGCONT)
-            census = take(there.journals, there.archive)
+            there.router.send_signal(signal.SIGCONT)
+            census = compare_with_archive(there.journals, there.archive)
             lost = lost + census.acknowledged_lost
             acknowledged = acknowledged + census.settled
     site.say(f"gone after {longest:.1f} s at the most")
     return [
-        figure("faults.leaving.longest_s", longest),
-        figure("faults.leaving.acknowledged_lost", lost),
-        figure("faults.leaving.acknowledged", acknowledged),
+        make_figure("faults.leaving.longest_s", longest),
+        make_figure("faults.leaving.acknowledged_lost", lost),
+        make_figure("faults.leaving.acknowledged", acknowledged),
     ]
 
 
@@ -109,45 +109,45 @@ def disk_full(site: Site) -> list[Figure]:
     """No file of the service may grow, then none of the agents: nothing false is acknowledged,
     and all of it later.
     """
-    full_s = site.of(10, 2)
+    full_s = site.choose_amount(10, 2)
     false_acks = recovered = waiting = 0
-    with stage(site.folder) as there:
-        _agents(there, 2)
+    with open_stage(site.folder) as there:
+        _load_agents(there, 2)
         for parts in ([there.service], there.loads, there.parts[1:]):
-            time.sleep(site.of(3, 1))
+            time.sleep(site.choose_amount(3, 1))
             for part in parts:
                 part.limit_files(0)
             time.sleep(full_s)
-            census = take(there.journals, there.archive)
+            census = compare_with_archive(there.journals, there.archive)
             false_acks += census.acknowledged_lost
             waiting = max(waiting, census.stored - census.settled)
             for part in parts:
                 part.limit_files(-1)
-            recovered += _settles(there)
+            recovered += _is_settled(there)
         census = _at_rest(there)
     site.say(f"{census}")
     return [
-        figure("faults.disk_full.false_acks", false_acks + census.acknowledged_lost),
-        figure("faults.disk_full.recovered", recovered if not census.lost else 0),
-        figure("faults.disk_full.waiting", waiting),
+        make_figure("faults.disk_full.false_acks", false_acks + census.acknowledged_lost),
+        make_figure("faults.disk_full.recovered", recovered if not census.lost else 0),
+        make_figure("faults.disk_full.waiting", waiting),
         Figure("faults.disk_full.seconds", full_s, "s full, each"),
     ]
 
 
-def _agents(there: Stage, processes: int) -> None:
+def _load_agents(there: Stage, processes: int) -> None:
     for number in range(processes):
         names = [f"sim-{number}{place:02}" for place in range(AGENTS_PER_PROCESS)]
-        there.load(names, RATE, seed=number, flush_s=1.0).start()
+        there.make_load(names, RATE, seed=number, flush_s=1.0).start()
     for part in there.loads:
         part.line_with("ready: ")
 
 
-def _settles(there: Stage) -> bool:
+def _is_settled(there: Stage) -> bool:
     """Return True if everything stored by now gets settled in time."""
     since = time.time()
     deadline = time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:
-        if told(there.journals).longest_wait(since) < float("inf"):
+        if read_journals(there.journals).longest_wait(since) < float("inf"):
             return True
         time.sleep(0.2)
     return False
@@ -155,10 +155,10 @@ def _settles(there: Stage) -> bool:
 
 def _at_rest(there: Stage) -> Census:
     there.drain(DRAIN_S)
-    _clean(there.service)
-    return take(there.journals, there.archive)
+    _check_clean_stop(there.service)
+    return compare_with_archive(there.journals, there.archive)
 
 
-def _clean(part: Part) -> None:
+def _check_clean_stop(part: Part) -> None:
     code = part.stop()
     assert code == 0, f"{part.name} ended with {code}; see {part.log}"

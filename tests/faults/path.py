@@ -25,7 +25,7 @@ from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
 
@@ -42,27 +42,27 @@ METRES_PER_DEGREE: Final = 111_195.0
 
 def run(site: Site) -> list[Figure]:
     """A thousand teleports and three ways of two cars, or a few hundred."""
-    teleports = site.of(1_000, 140)
-    accepted, honest_lost = _teleport(site, teleports)
+    teleports = site.choose_amount(1_000, 140)
+    accepted, honest_lost = _drive_teleports(site, teleports)
     alerts = {way: _two_cars(site, way) for way in ("leaps", "backlog", "live")}
     site.say(f"alerts of two cars at {PLACES} places: {alerts}")
     return [
-        figure("faults.path.implausible_accepted", accepted),
-        figure("faults.path.honest_excluded", honest_lost),
-        figure("faults.path.teleports", teleports),
-        figure("faults.path.two_car_alerts", max(alerts.values())),
-        figure("faults.path.pair_alerts", _honest(site, 2)),
-        figure("faults.path.honest_alerts", _honest(site, 3)),
+        make_figure("faults.path.implausible_accepted", accepted),
+        make_figure("faults.path.honest_excluded", honest_lost),
+        make_figure("faults.path.teleports", teleports),
+        make_figure("faults.path.two_car_alerts", max(alerts.values())),
+        make_figure("faults.path.pair_alerts", _count_honest_alerts(site, 2)),
+        make_figure("faults.path.honest_alerts", _count_honest_alerts(site, 3)),
     ]
 
 
-def _at(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, FloatArray]:
+def _offset_position(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, FloatArray]:
     latitude = np.asarray(LATITUDE + north_m / METRES_PER_DEGREE, np.float64)
     longitude = LONGITUDE + east_m / METRES_PER_DEGREE / np.cos(np.radians(latitude))
     return latitude, np.asarray(longitude, np.float64)
 
 
-def _visits(
+def _make_visits(
     name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float
 ) -> list[Batch]:
     """Return one batch per region of visits at these times [ns] and places."""
@@ -83,7 +83,7 @@ def _visits(
     return out
 
 
-def _messages(batches: Sequence[Batch]) -> list[Message]:
+def _make_messages(batches: Sequence[Batch]) -> list[Message]:
     return [
         Message(
             b.kind, keys.observation_key(b.region, b.vehicle), wire.encode(b), wire.ENCODING[b.kind]
@@ -92,7 +92,7 @@ def _messages(batches: Sequence[Batch]) -> list[Message]:
     ]
 
 
-def _teleport(site: Site, count: int) -> tuple[int, int]:
+def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
     """Return how many of the teleports were fused, and how many honest rows were not."""
     rng = np.random.default_rng(site.seed)
     start = time.time_ns() - 7200 * SECOND
@@ -103,7 +103,7 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
             kind = KINDS[number % len(KINDS)]
             north = np.arange(30) * 15.0
             when = start + np.arange(30) * SECOND
-            way = _visits(name, 1, when, _at(north, np.zeros(30)), 0.8)
+            way = _make_visits(name, 1, when, _offset_position(north, np.zeros(30)), 0.8)
             wrong = _far_away(kind, name, start, rng)
             before = engine.counts["implausible_moves"]
             if kind == "row":
@@ -111,15 +111,19 @@ def _teleport(site: Site, count: int) -> tuple[int, int]:
                 (other,) = wrong
                 columns = {k: np.concatenate([v, other.columns[k]]) for k, v in one.columns.items()}
                 engine.intake.ingest(
-                    _messages([replace(one, columns=columns)]), start + 100 * SECOND
+                    _make_messages([replace(one, columns=columns)]), start + 100 * SECOND
                 )
             elif kind == "between":  # the first half of the way, the far place, the second half
-                half = _visits(name, 1, when[:15], _at(north[:15], np.zeros(15)), 0.8)
-                rest = _visits(name, 2, when[15:], _at(north[15:], np.zeros(15)), 0.8)
+                half = _make_visits(
+                    name, 1, when[:15], _offset_position(north[:15], np.zeros(15)), 0.8
+                )
+                rest = _make_visits(
+                    name, 2, when[15:], _offset_position(north[15:], np.zeros(15)), 0.8
+                )
                 later = [replace(one, seq=3) for one in wrong]
-                engine.intake.ingest(_messages([*half, *rest, *later]), start + 100 * SECOND)
+                engine.intake.ingest(_make_messages([*half, *rest, *later]), start + 100 * SECOND)
             else:
-                engine.intake.ingest(_messages([*way, *wrong]), start + 100 * SECOND)
+                engine.intake.ingest(_make_messages([*way, *wrong]), start + 100 * SECOND)
             found = engine.counts["implausible_moves"] - before
             most = sum(len(b.columns["mu"]) for b in wrong)
             if found < most:
@@ -139,17 +143,20 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
     ):  # in leaps that the row before would allow; the first two may be what the budget allows
         steps = np.arange(2, 50)
         when = start + 31 * SECOND + steps * (SECOND // 1000)
-        return _visits(name, 2, when, _at(450.0 + np.zeros(len(steps)), steps * 2 * STEP_M), 0.2)
+        return _make_visits(
+            name, 2, when, _offset_position(450.0 + np.zeros(len(steps)), steps * 2 * STEP_M), 0.2
+        )
     if kind == "row":  # the batch is of one region, and so is the place
         home = grid.region_of(grid.cell_of(LATITUDE, LONGITUDE))
         sides = [FAR_M * 1j**turn for turn in range(4)]
         far = next(
             s
             for s in sides
-            if grid.region_of(grid.cell_of(*_at(np.array(s.real), np.array(s.imag)))) == home
+            if grid.region_of(grid.cell_of(*_offset_position(np.array(s.real), np.array(s.imag))))
+            == home
         )
-    place = _at(np.array([float(np.real(far))]), np.array([float(np.imag(far))]))
-    found = _visits(
+    place = _offset_position(np.array([float(np.real(far))]), np.array([float(np.imag(far))]))
+    found = _make_visits(
         name, 1 if kind == "boot" else 2, start + np.array([int(second * SECOND)]), place, 0.2
     )
     return [replace(one, boot=one.boot + 1) for one in found] if kind == "boot" else found
@@ -165,21 +172,21 @@ def _two_cars(site: Site, way: str) -> int:
         for place in range(PLACES):
             when = np.array([start + place * apart])
             for car in range(2):
-                visits = _visits(
+                visits = _make_visits(
                     f"insider-{car}",
                     place + 1,
                     when + car,
-                    _at(np.zeros(1), np.array([place * STEP_M])),
+                    _offset_position(np.zeros(1), np.array([place * STEP_M])),
                     0.15,
                 )
                 alerts = engine.intake.ingest(
-                    _messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end
+                    _make_messages(visits), int(when[0]) + 2 * SECOND if way == "live" else end
                 )
                 raised |= {alert.cell for alert in alerts if alert.raised}
     return len(raised)
 
 
-def _honest(site: Site, cars: int) -> int:
+def _count_honest_alerts(site: Site, cars: int) -> int:
     """Return at how many icy places of a lonely road this many honest cars raise an alert."""
     start = time.time_ns() - 3600 * SECOND
     raised = set[int]()
@@ -187,16 +194,16 @@ def _honest(site: Site, cars: int) -> int:
         for place in range(ICY_PLACES):
             for car in range(cars):
                 when = np.array([start + (place * 90 + car * 60) * SECOND])
-                visits = _visits(
+                visits = _make_visits(
                     f"car-{car}",
                     place + 1,
                     when,
-                    _at(np.zeros(1), np.array([place * 1_500.0])),
+                    _offset_position(np.zeros(1), np.array([place * 1_500.0])),
                     0.15,
                 )
                 raised |= {
                     a.cell
-                    for a in engine.intake.ingest(_messages(visits), int(when[0]) + SECOND)
+                    for a in engine.intake.ingest(_make_messages(visits), int(when[0]) + SECOND)
                     if a.raised
                 }
     return len(raised)

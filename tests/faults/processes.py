@@ -55,35 +55,35 @@ class Part:
         return self._process.pid
 
     @property
-    def alive(self) -> bool:
+    def is_alive(self) -> bool:
         """Return True if it runs."""
         return self._process is not None and self._process.poll() is None
 
-    def lines(self) -> list[str]:
+    def read_lines(self) -> list[str]:
         """Return the lines printed since the present start."""
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
         """The first line that begins with `start`; waits for it."""
 
-        def found() -> list[str]:
-            there = [line for line in self.lines() if line.startswith(start)]
-            assert there or self.alive, (
+        def find_lines() -> list[str]:
+            there = [line for line in self.read_lines() if line.startswith(start)]
+            assert there or self.is_alive, (
                 f"{self.name} ended before it said {start!r}; see {self.log}"
             )
             return there
 
-        until(found, START_S)
-        return found()[0]
+        until(find_lines, START_S)
+        return find_lines()[0]
 
-    def send(self, number: signal.Signals) -> None:
+    def send_signal(self, number: signal.Signals) -> None:
         """Send a signal; one that is gone does not mind."""
-        if self.alive:
+        if self.is_alive:
             os.kill(self.pid, number)
 
     def kill(self) -> None:
         """kill -9, and wait until it is gone."""
-        self.send(signal.SIGKILL)
+        self.send_signal(signal.SIGKILL)
         if self._process is not None:
             self.wait(STOP_S)
 
@@ -99,7 +99,7 @@ class Part:
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """SIGTERM, or another signal; returns the exit code."""
-        self.send(number)
+        self.send_signal(number)
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:
@@ -117,10 +117,10 @@ class Stage:
         self.folder = folder
         self.archive = folder / "archive"
         folder.mkdir(parents=True, exist_ok=True)
-        self.router = Part("router", self._router("tcp/127.0.0.1:0"), folder)
+        self.router = Part("router", self._router_command("tcp/127.0.0.1:0"), folder)
         self.router.start()
         self.endpoint = self.router.line_with("router: ").split()[1]
-        self.router.command = self._router(self.endpoint)
+        self.router.command = self._router_command(self.endpoint)
         config = folder / "service.json"
         config.write_text(json.dumps({"zenoh": {"connect": [self.endpoint]}, **service}))
         words = ["run", "--config", str(config), "--archive", str(self.archive)]
@@ -129,10 +129,10 @@ class Stage:
         self.loads: list[Part] = []
 
     @staticmethod
-    def _router(endpoint: str) -> list[str]:
+    def _router_command(endpoint: str) -> list[str]:
         return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
 
-    def load(self, names: Sequence[str], rate: float, **more: object) -> Part:
+    def make_load(self, names: Sequence[str], rate: float, **more: object) -> Part:
         """A generator of observations for these vehicles, `rate` per second each; not yet
         started.
         """
@@ -173,26 +173,26 @@ class Stage:
         """
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
-            part.send(signal.SIGUSR1)
+            part.send_signal(signal.SIGUSR1)
         with suppress(TimeoutError):
-            while any(part.alive for part in self.loads):
-                self._news(patience_s)
+            while any(part.is_alive for part in self.loads):
+                self._await_news(patience_s)
 
-    def _news(self, patience_s: float) -> None:
+    def _await_news(self, patience_s: float) -> None:
         """Wait until the generators have told more than now, or are gone. TimeoutError: nothing
         for so long.
         """
         told = sum(journal.stat().st_size for journal in self.journals)
 
-        def news() -> bool:
+        def has_news() -> bool:
             more = sum(journal.stat().st_size for journal in self.journals) > told
-            return more or not any(part.alive for part in self.loads)
+            return more or not any(part.is_alive for part in self.loads)
 
-        until(news, patience_s)
+        until(has_news, patience_s)
 
 
 @contextmanager
-def stage(folder: Path, **service: object) -> Iterator[Stage]:
+def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
     """A stage whose service is ready; every process of it is gone after the block."""
     there = Stage(folder, **service)
     try:
@@ -200,5 +200,5 @@ def stage(folder: Path, **service: object) -> Iterator[Stage]:
         yield there
     finally:
         for part in there.parts:
-            part.send(signal.SIGCONT)
+            part.send_signal(signal.SIGCONT)
             part.kill()

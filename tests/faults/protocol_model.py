@@ -1,4 +1,4 @@
-"""Explicit-state model of acknowledgement, lease, take-over, hand-over and erasure; `check` visits
+"""Explicit-state model of acknowledgement, lease, take-over, hand-over and erasure; `explore_states` visits
 every state.
 
 Two services share a bucket; a vehicle has BATCHES. Time passes in ticks, during which each
@@ -128,7 +128,7 @@ class Checked(NamedTuple):
     violation: Violation | None
 
 
-def check(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
+def explore_states(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
     """Visit all states with up to this many lease numbers and turns; stop at the first
     violation.
     """
@@ -140,7 +140,7 @@ def check(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
         problem = find_problem(world)
         if problem:
             return Checked(len(came), Violation(problem, _steps_to(world, came)))
-        for step, after in steps(world, rules, most_number, most_turn):
+        for step, after in list_steps(world, rules, most_number, most_turn):
             if after not in came:
                 came[after] = (world, step)
                 waiting.append(after)
@@ -155,7 +155,7 @@ def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tupl
     return tuple(reversed(out))
 
 
-def counting(world: World) -> list[int]:
+def list_counted(world: World) -> list[int]:
     """Return the batches of the objects that count for a reader of the bucket."""
     number, before = world.fence
     return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
@@ -163,7 +163,7 @@ def counting(world: World) -> list[int]:
 
 def find_problem(world: World) -> str:
     """Return the broken invariant, or ""."""
-    counted = counting(world)
+    counted = list_counted(world)
     if len(counted) != len(set(counted)):
         return "a batch counts twice"
     if world.erased & set(counted):
@@ -176,7 +176,7 @@ def find_problem(world: World) -> str:
     return ""
 
 
-def steps(
+def list_steps(
     world: World, rules: Rules, most_number: int, most_turn: int
 ) -> Iterator[tuple[str, World]]:
     """Yield each possible step and the state after it."""
@@ -184,21 +184,26 @@ def steps(
         if slow == NOT_YET or (
             not world.services[slow].slow and world.services[slow].role == "serving"
         ):
-            yield f"tick, slow {slow}", _tick(world, slow, rules)
+            yield f"tick, slow {slow}", _advance_clocks(world, slow, rules)
     for me in NAMES:
         one = world.services[me]
         for batch in one.sending:  # the network delivers whatever the service does
             landed = world._replace(objects=world.objects | {(batch, one.number)})
             known = one._replace(sending=one.sending - {batch}, uploaded=one.uploaded | {batch})
-            yield f"upload of {batch} by {me} lands", _with(landed, me, known)
+            yield f"upload of {batch} by {me} lands", _replace_service(landed, me, known)
         if one.late and world.number == one.number:
             written = world._replace(turn=one.late, released=False)
-            yield f"late turn {one.late} of {me} lands", _with(written, me, one._replace(late=0))
-        yield from _serve(world, me, rules, most_turn)
+            yield (
+                f"late turn {one.late} of {me} lands",
+                _replace_service(written, me, one._replace(late=0)),
+            )
+        yield from _list_serving_steps(world, me, rules, most_turn)
         yield from _stand_by(world, me, rules, most_number)
 
 
-def _serve(world: World, me: int, rules: Rules, most_turn: int) -> Iterator[tuple[str, World]]:
+def _list_serving_steps(
+    world: World, me: int, rules: Rules, most_turn: int
+) -> Iterator[tuple[str, World]]:
     one = world.services[me]
     if one.role != "serving":
         return
@@ -207,23 +212,26 @@ def _serve(world: World, me: int, rules: Rules, most_turn: int) -> Iterator[tupl
     if one.begun == NOT_YET:
         if one.turn < most_turn:
             begun = one._replace(begun=0, turn=one.turn + rules.writes_turn_once)
-            yield f"{me} begins a renewal", _with(world, me, begun)
+            yield f"{me} begins a renewal", _replace_service(world, me, begun)
     elif world.number != one.number:
-        yield f"{me} sees that it lost the lease", _with(world, me, _gone(one))
+        yield f"{me} sees that it lost the lease", _replace_service(world, me, _end_service(one))
     else:
         renewed = one._replace(age=one.begun, begun=NOT_YET, turn=turn)
         if not world.released:
-            yield f"{me} renews turn {turn}", _with(world._replace(turn=turn), me, renewed)
+            yield (
+                f"{me} renews turn {turn}",
+                _replace_service(world._replace(turn=turn), me, renewed),
+            )
         if not one.late:
             given_up = one._replace(begun=NOT_YET, late=turn)
-            yield f"{me} gives up the renewal {turn}", _with(world, me, given_up)
+            yield f"{me} gives up the renewal {turn}", _replace_service(world, me, given_up)
     is_fresh = one.age < lease / 2 or not rules.acknowledges_within_half
     for batch in BATCHES:
         is_refused = batch in world.erased and rules.remembers_erasure
         if batch not in one.known and batch not in one.sending and not is_refused:
             yield (
                 f"{me} takes {batch}",
-                _with(
+                _replace_service(
                     world,
                     me,
                     one._replace(known=one.known | {batch}, sending=one.sending | {batch}),
@@ -241,10 +249,15 @@ def _serve(world: World, me: int, rules: Rules, most_turn: int) -> Iterator[tupl
             gone = one._replace(known=one.known - {batch}, uploaded=one.uploaded - {batch})
             yield (
                 f"{me} erases {batch}",
-                _with(world._replace(objects=kept, erased=world.erased | {batch}), me, gone),
+                _replace_service(
+                    world._replace(objects=kept, erased=world.erased | {batch}), me, gone
+                ),
             )
     if world.number == one.number and not one.sending and not world.released:
-        yield f"{me} hands over", _with(world._replace(released=True), me, _gone(one))
+        yield (
+            f"{me} hands over",
+            _replace_service(world._replace(released=True), me, _end_service(one)),
+        )
 
 
 def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator[tuple[str, World]]:
@@ -259,7 +272,7 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
             and other != rules.lease[me]
         )
         if one.seen != now:
-            yield f"{me} looks", _with(world, me, one._replace(seen=now, same=0))
+            yield f"{me} looks", _replace_service(world, me, one._replace(seen=now, same=0))
         is_free = world.number == 0 or world.released
         is_stale = one.seen[0] == world.number and one.same >= rules.lease[me]
         if not is_refused and world.number < most_number and (is_free or is_stale):
@@ -267,18 +280,18 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
             wait = rules.wait_share * rules.lease[me] // 2 if is_changed else 0
             taken = Service("taking", world.number + 1, age=0, wait=wait)
             after = world._replace(number=world.number + 1, holder=me, turn=0, released=False)
-            yield f"{me} takes number {world.number + 1}", _with(after, me, taken)
+            yield f"{me} takes number {world.number + 1}", _replace_service(after, me, taken)
     elif one.role == "taking" and one.wait <= 0:
         if world.number != one.number:
-            yield f"{me} lost it before it served", _with(world, me, _gone(one))
+            yield f"{me} lost it before it served", _replace_service(world, me, _end_service(one))
             return
-        counted = frozenset(counting(world))
+        counted = frozenset(list_counted(world))
         fence = (one.number, frozenset(world.objects)) if rules.has_fence else world.fence
         served = one._replace(role="serving", wait=0, known=counted, uploaded=counted)
-        yield f"{me} lists", _with(world._replace(fence=fence), me, served)
+        yield f"{me} lists", _replace_service(world._replace(fence=fence), me, served)
 
 
-def _tick(world: World, slow: int, rules: Rules) -> World:
+def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
     """Advance the clocks that are in use: of a lease, of a wait for it, or of a wait before
     listing.
     """
@@ -298,11 +311,11 @@ def _tick(world: World, slow: int, rules: Rules) -> World:
     return world._replace(services=(out[0], out[1]))
 
 
-def _gone(one: Service) -> Service:
+def _end_service(one: Service) -> Service:
     """Return a service that serves no more; messages of it that the network still holds may land."""
     return Service("gone", one.number, age=0, sending=one.sending, late=one.late)
 
 
-def _with(world: World, me: int, one: Service) -> World:
+def _replace_service(world: World, me: int, one: Service) -> World:
     services = (one, world.services[1]) if me == 0 else (world.services[0], one)
     return world._replace(services=services)

@@ -23,9 +23,9 @@ from schemas.config import ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Batch, Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.faults.processes import Stage, stage
+from tests.faults.processes import Stage, open_stage
 from tests.fleet_service.examples import batch
 from tests.waiting import until
 
@@ -35,19 +35,19 @@ HEAVY: Final = 2
 
 def run(site: Site) -> list[Figure]:
     """Twenty thousand cells, half a minute; five thousand and four seconds in a quick run."""
-    seconds = site.of(30, 4)
-    with stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
+    seconds = site.choose_amount(30, 4)
+    with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
         session = open_session(ZenohSettings(connect=[there.endpoint]))
         assert session is not None
         with session:
-            cells = _fill(session, there, site.of(80, 20))
-            _wait(session)
-            readers = [_reader(there.endpoint) for _ in range(HEAVY)]
+            cells = _fill_map(session, there, site.choose_amount(80, 20))
+            _await_tile(session)
+            readers = [_start_reader(there.endpoint) for _ in range(HEAVY)]
             try:
                 for reader in readers:
                     assert reader.stdout
                     assert reader.stdout.readline(), "a heavy reader got no answer"
-                waits = _light(session, seconds)
+                waits = _time_light_queries(session, seconds)
             finally:
                 for reader in readers:
                     reader.terminate()
@@ -56,14 +56,14 @@ def run(site: Site) -> list[Figure]:
                 reader.wait(30.0)
     site.say(f"{cells} cells; {len(waits)} light questions beside {heavy} heavy answers")
     return [
-        figure("faults.query.light_p99_ms", float(np.percentile(waits, 99)) * 1e3),
-        figure("faults.query.heavy_answers", min(heavy)),
-        figure("faults.query.light_answers", len(waits)),
+        make_figure("faults.query.light_p99_ms", float(np.percentile(waits, 99)) * 1e3),
+        make_figure("faults.query.heavy_answers", min(heavy)),
+        make_figure("faults.query.light_answers", len(waits)),
         Figure("faults.query.light_p50_ms", float(np.median(waits)) * 1e3, "ms"),
     ]
 
 
-def _fill(session: zenoh.Session, there: Stage, vehicles: int) -> int:
+def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
     """Every vehicle a lane of 250 cells, each second one further on; until all of it is settled."""
     acked: set[str] = set()
     acks = session.declare_subscriber(
@@ -75,15 +75,15 @@ def _fill(session: zenoh.Session, there: Stage, vehicles: int) -> int:
         for number, name in enumerate(names):
             if keys.ack_key(name) in acked:
                 continue
-            for message in _lane(name, number, now):
+            for message in _make_lane(name, number, now):
                 session.put(message.key, message.payload, encoding=message.encoding)
         time.sleep(1.0)
     acks.undeclare()
-    assert there.service.alive
+    assert there.service.is_alive
     return 250 * vehicles
 
 
-def _lane(name: str, number: int, now: int) -> list[Message]:
+def _make_lane(name: str, number: int, now: int) -> list[Message]:
     out = []
     for seq in range(1, 6):
         at = np.arange(50) + 50 * (seq - 1)
@@ -104,28 +104,28 @@ def _lane(name: str, number: int, now: int) -> list[Message]:
     return out
 
 
-def _tile() -> int:
+def _find_tile() -> int:
     return int(grid.tile_of(grid.cell_of(*PLACE)))
 
 
-def _wait(session: zenoh.Session) -> None:
-    until(lambda: any(reply.ok for reply in session.get(keys.map_key(_tile()))))
+def _await_tile(session: zenoh.Session) -> None:
+    until(lambda: any(reply.ok for reply in session.get(keys.map_key(_find_tile()))))
 
 
-def _light(session: zenoh.Session, seconds: float) -> list[float]:
+def _time_light_queries(session: zenoh.Session, seconds: float) -> list[float]:
     """Return the time of each query for one tile."""
     waits = []
     end = time.monotonic() + seconds
     pause = threading.Event()
     while time.monotonic() < end:
         began = time.perf_counter()
-        assert any(reply.ok for reply in session.get(keys.map_key(_tile()), timeout=30.0))
+        assert any(reply.ok for reply in session.get(keys.map_key(_find_tile()), timeout=30.0))
         waits.append(time.perf_counter() - began)
         pause.wait(0.02)
     return waits
 
 
-def _reader(endpoint: str) -> subprocess.Popen[str]:
+def _start_reader(endpoint: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.faults.queries", endpoint]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 

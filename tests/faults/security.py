@@ -6,21 +6,21 @@ from __future__ import annotations
 
 from schemas.runtime.figures import Figure
 from tests.faults.attempts import ATTEMPTS
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.faults.ground import ground
+from tests.faults.ground import open_ground
 from tests.secured import network
 
 
 def run(site: Site) -> list[Figure]:
     """Every attack on one ground; the last revokes the attacker."""
     breaches = []
-    with network(site.folder / "certificates") as running, ground(running) as found:
+    with network(site.folder / "certificates") as running, open_ground(running) as found:
         for name, attempt in ATTEMPTS.items():
             if attempt(found):
                 breaches.append(name)
                 site.say(f"BREACH: {name}")
     return [
-        figure("faults.security.breaches", len(breaches)),
-        figure("faults.security.attempts", len(ATTEMPTS)),
+        make_figure("faults.security.breaches", len(breaches)),
+        make_figure("faults.security.attempts", len(ATTEMPTS)),
     ]

@@ -15,10 +15,10 @@ import numpy as np
 from schemas.numeric import FloatArray
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
-from tests.faults.census import take
-from tests.faults.frame import Campaign, Site, conduct, leave
-from tests.faults.processes import Part, stage
+from tests.faults.bars import make_figure
+from tests.faults.census import compare_with_archive
+from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
+from tests.faults.processes import Part, open_stage
 
 # 2 000 observations/s
 PROCESSES = 2
@@ -43,12 +43,12 @@ def memory_mb(part: Part) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
 
 
-def handles(part: Part) -> int:
+def count_handles(part: Part) -> int:
     """Open files and sockets of a process."""
     return sum(1 for _ in Path(f"/proc/{part.pid}/fd").iterdir())
 
 
-def slope(times: FloatArray, megabytes: FloatArray) -> float:
+def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
     """Return the growth of a process's permanent memory [MB per 10 min]: a line through the least
     of each minute.
 
@@ -65,15 +65,15 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
     """The steepest slope of memory, and the largest growth of handles, of any process."""
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}
-    with stage(site.folder, compact_s=300.0) as there:
+    with open_stage(site.folder, compact_s=300.0) as there:
         for number in range(PROCESSES):
             names = [f"sim-{number}{place:02}" for place in range(VEHICLES)]
-            there.load(names, RATE, seed=number, cells_across=CELLS_ACROSS).start()
+            there.make_load(names, RATE, seed=number, cells_across=CELLS_ACROSS).start()
         began = time.monotonic()
         while (now := time.monotonic() - began) < minutes * 60:
             times.append(now)
             for part in there.parts:
-                seen.setdefault(part.name, []).append((memory_mb(part), handles(part)))
+                seen.setdefault(part.name, []).append((memory_mb(part), count_handles(part)))
             if len(times) % 24 == 0:
                 site.say(
                     ", ".join(
@@ -83,21 +83,21 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
             time.sleep(EVERY_S)
         there.drain(60.0)
         there.service.stop()
-        census = take(there.journals, there.archive)
+        census = compare_with_archive(there.journals, there.archive)
     first = int(len(times) * SETTLED)
     slopes = {}
     grown = {}
     for name, rows in seen.items():
         kept = np.array(rows[first:])
-        slopes[name] = slope(np.array(times[first:]), kept[:, 0])
+        slopes[name] = fit_slope(np.array(times[first:]), kept[:, 0])
         third = max(len(kept) // 3, 1)
         grown[name] = float(np.median(kept[-third:, 1]) - np.median(kept[:third, 1]))
     site.say(f"{slopes}; {grown}; {census}")
     return [
-        figure("faults.soak.growth_mb", max(slopes.values())),
-        figure("faults.soak.handles", max(grown.values())),
-        figure("faults.soak.lost", census.lost + census.doubled),
-        figure("faults.soak.observations_per_s", census.observations / (minutes * 60)),
+        make_figure("faults.soak.growth_mb", max(slopes.values())),
+        make_figure("faults.soak.handles", max(grown.values())),
+        make_figure("faults.soak.lost", census.lost + census.doubled),
+        make_figure("faults.soak.observations_per_s", census.observations / (minutes * 60)),
         *(
             Figure(f"faults.soak.{name}_growth_mb", slope, "MB per 10 min")
             for name, slope in slopes.items()
@@ -115,10 +115,10 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path(".faults/soak"), help="figures go there")
     args = parser.parse_args()
     campaign = Campaign("soak", partial(run, minutes=args.minutes), OWES)
-    found = conduct([campaign], args.out, "soak", quick=False, seed=0)
+    found = run_campaigns([campaign], args.out, "soak", quick=False, seed=0)
     print(figures.markdown(found))
     return 0 if all(one.holds for one in found) else 1
 
 
 if __name__ == "__main__":
-    leave(main)
+    run_and_exit(main)

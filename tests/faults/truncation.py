@@ -27,7 +27,7 @@ from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import SECOND, batch, key
 
@@ -40,13 +40,13 @@ WHOLE_WAY: Final = 200
 def run(site: Site) -> list[Figure]:
     """Cut at every byte, changed at every fifth; in a quick run, some hundred."""
     logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
-    batches, newest = _archive(site.folder)
+    batches, newest = _write_archive(site.folder)
     whole = newest.read_bytes()
     rng = np.random.default_rng(site.seed)
     lost = tried = 0
-    for damaged in _damages(whole, rng, site.of(1, 97)):
+    for damaged in _make_damages(whole, rng, site.choose_amount(1, 97)):
         newest.write_bytes(damaged)
-        lost += _lost(site.folder, batches)
+        lost += _count_lost(site.folder, batches)
         if tried % WHOLE_WAY == 0:
             lost += _after_all_is_sent_again(site.folder, batches)
         for left in newest.parent.glob("*.parquet*"):
@@ -56,23 +56,23 @@ def run(site: Site) -> list[Figure]:
         if tried % 2000 == 0:
             site.say(f"{tried} damages, {lost} rows lost or doubled")
     return [
-        figure("faults.truncation.lost_rows", lost),
-        figure("faults.truncation.damages", tried),
+        make_figure("faults.truncation.lost_rows", lost),
+        make_figure("faults.truncation.damages", tried),
     ]
 
 
-def _archive(root: Path) -> tuple[list[Batch], Path]:
+def _write_archive(root: Path) -> tuple[list[Batch], Path]:
     """Batches in the order of their segments, and the newest segment."""
     now = time.time_ns() - SECOND
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
     with closing(Engine(ServiceConfig(), root)) as engine:
         for first in range(0, len(batches), BATCHES):
-            engine.intake.ingest(_messages(batches[first : first + BATCHES]), time.time_ns())
+            engine.intake.ingest(_make_messages(batches[first : first + BATCHES]), time.time_ns())
             engine.settlement.flush()
     return batches, segments.paths(root, Kind.OBSERVATION)[-1]
 
 
-def _damages(whole: bytes, rng: np.random.Generator, stride: int) -> Iterator[bytes]:
+def _make_damages(whole: bytes, rng: np.random.Generator, stride: int) -> Iterator[bytes]:
     for place in range(0, len(whole), stride):
         yield whole[:place]
     for place in range(0, len(whole), 5 * stride):
@@ -81,11 +81,11 @@ def _damages(whole: bytes, rng: np.random.Generator, stride: int) -> Iterator[by
         yield bytes(changed)
 
 
-def _messages(batches: Sequence[Batch]) -> list[Message]:
+def _make_messages(batches: Sequence[Batch]) -> list[Message]:
     return [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in batches]
 
 
-def _rows(root: Path) -> list[tuple[int, int, float]]:
+def _read_rows(root: Path) -> list[tuple[int, int, float]]:
     tables = reading.read(root, Kind.OBSERVATION, ["seq", "row", "mu"])
     return [
         row
@@ -94,17 +94,17 @@ def _rows(root: Path) -> list[tuple[int, int, float]]:
     ]
 
 
-def _expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
+def _list_expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
     return {
         (b.seq, row, round(float(mu), 3)) for b in batches for row, mu in enumerate(b.columns["mu"])
     }
 
 
-def _lost(root: Path, batches: Sequence[Batch]) -> int:
+def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
     """Rows of older segments that are missing, and of the newest that count as held and are not,
     or are wrong.
     """
-    held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
+    held = {(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)}
     streams = SequenceTrackers()
     restore_streams(root, streams)
     pseudonyms = Pseudonyms(root / "keys")
@@ -119,7 +119,7 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
         for place, b in enumerate(batches)
         if place < len(batches) - BATCHES or stream.accepted(b.seq)
     ]
-    return len(_expected(owed) - held) + len(held - _expected(batches))
+    return len(_list_expected(owed) - held) + len(held - _list_expected(batches))
 
 
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
@@ -127,9 +127,9 @@ def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
     acknowledged it.
     """
     with closing(Engine(ServiceConfig(), root)) as engine:
-        engine.intake.ingest(_messages(batches), time.time_ns())
+        engine.intake.ingest(_make_messages(batches), time.time_ns())
         ((_, ack),) = engine.settlement.flush()
     (stream,) = wire.decode_ack(ack)[1]
     assert stream.durable == ((1, len(batches)),)
-    rows = [(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)]
-    return len(set(rows) ^ _expected(batches)) + len(rows) - len(set(rows))
+    rows = [(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)]
+    return len(set(rows) ^ _list_expected(batches)) + len(rows) - len(set(rows))

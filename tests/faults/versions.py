@@ -23,7 +23,7 @@ from fleet_service.archive.maintenance.retention import drop_checkpoints
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.archive.kept import DATA, make, map_of
 from tests.fleet_service.archive.test_version import rewritten, with_columns
@@ -54,25 +54,25 @@ def run(site: Site) -> list[Figure]:
                 compact(root)
             if turn == 2:
                 drop_checkpoints(root)
-            difference = max(difference, _difference(root, made))
-            lost += sum(made["rows"][str(kind)] - _rows(root, kind) for kind in Kind)
+            difference = max(difference, _find_difference(root, made))
+            lost += sum(made["rows"][str(kind)] - _count_rows(root, kind) for kind in Kind)
             looks += 1
         aside += count_set_aside(root)
     site.say(f"{changed} files rewritten, {looks} starts")
     return [
-        figure("faults.versions.set_aside", aside),
-        figure("faults.versions.lost_rows", abs(lost)),
-        figure("faults.versions.map_difference", difference),
-        figure("faults.versions.files", changed),
+        make_figure("faults.versions.set_aside", aside),
+        make_figure("faults.versions.lost_rows", abs(lost)),
+        make_figure("faults.versions.map_difference", difference),
+        make_figure("faults.versions.files", changed),
     ]
 
 
-def _difference(root: Path, made: dict[str, Any]) -> float:
+def _find_difference(root: Path, made: dict[str, Any]) -> float:
     with closing(Engine(ServiceConfig(), root)) as engine:
         found = np.asarray(map_of(engine, made["at"])["beliefs"])
     beliefs = np.asarray(made["beliefs"])
     return float(np.abs(found - beliefs).max()) if found.shape == beliefs.shape else float("inf")
 
 
-def _rows(root: Path, kind: Kind) -> int:
+def _count_rows(root: Path, kind: Kind) -> int:
     return sum(table.num_rows for table in reading.read(root, kind, ["seq"]))

@@ -21,7 +21,7 @@ from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import StretchAlert
 from fleet_service.client.webhook import Webhook
 from schemas.runtime.figures import Figure
-from tests.faults.bars import figure
+from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 
 ALERTS: Final = 5
@@ -33,11 +33,11 @@ OK: Final = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 FOREVER: Final = frozenset({"absent", "overflow", "refuses"})
 
 
-def _status(code: int, more: str = "") -> bytes:
+def _make_response(code: int, more: str = "") -> bytes:
     return f"HTTP/1.1 {code} X\r\n{more}Content-Length: 0\r\nConnection: close\r\n\r\n".encode()
 
 
-def _repeat(part: bytes, pause_s: float = 0.0) -> Callable[[socket.socket], None]:
+def _repeat_part(part: bytes, pause_s: float = 0.0) -> Callable[[socket.socket], None]:
     def send(client: socket.socket) -> None:
         client.sendall(b"HTTP/1.1 200 OK\r\n")
         end = time.monotonic() + 4 * TIMEOUT_S
@@ -48,33 +48,33 @@ def _repeat(part: bytes, pause_s: float = 0.0) -> Callable[[socket.socket], None
     return send
 
 
-def _silent(client: socket.socket) -> None:
+def _stay_silent(client: socket.socket) -> None:
     client.settimeout(4 * TIMEOUT_S)
     client.recv(1)
 
 
-def _sends(answer: bytes) -> Callable[[socket.socket], None]:
+def _answer_with(answer: bytes) -> Callable[[socket.socket], None]:
     return lambda client: client.sendall(answer)
 
 
 BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
-    "not-http": _sends(b"220 mail.example ready\r\n\r\n"),
-    "redirect-301": _sends(_status(301, "Location: /login\r\n")),
-    "redirect-302": _sends(_status(302, "Location: /login\r\n")),
-    "redirect-303": _sends(_status(303, "Location: /login\r\n")),
-    "redirect-308": _sends(_status(308, "Location: /login\r\n")),
-    "drips": _repeat(b"x", 0.05),
+    "not-http": _answer_with(b"220 mail.example ready\r\n\r\n"),
+    "redirect-301": _answer_with(_make_response(301, "Location: /login\r\n")),
+    "redirect-302": _answer_with(_make_response(302, "Location: /login\r\n")),
+    "redirect-303": _answer_with(_make_response(303, "Location: /login\r\n")),
+    "redirect-308": _answer_with(_make_response(308, "Location: /login\r\n")),
+    "drips": _repeat_part(b"x", 0.05),
     "closes": lambda _: None,
-    "half-head": _sends(b"HTTP/1.1 200 OK\r\nContent-Le"),
-    "silent": _silent,
-    "huge-head": _repeat(b"x-a: " + b"y" * 60_000),
-    "error-500": _sends(_status(500)),
-    "error-429": _sends(_status(429)),
-    "not-found": _sends(_status(404)),
-    "bad-number": _sends(b"HTTP/1.1 two-hundred OK\r\n\r\n"),
-    "refuses": _sends(_status(400)),
-    "absent": _silent,
-    "overflow": _silent,
+    "half-head": _answer_with(b"HTTP/1.1 200 OK\r\nContent-Le"),
+    "silent": _stay_silent,
+    "huge-head": _repeat_part(b"x-a: " + b"y" * 60_000),
+    "error-500": _answer_with(_make_response(500)),
+    "error-429": _answer_with(_make_response(429)),
+    "not-found": _answer_with(_make_response(404)),
+    "bad-number": _answer_with(b"HTTP/1.1 two-hundred OK\r\n\r\n"),
+    "refuses": _answer_with(_make_response(400)),
+    "absent": _stay_silent,
+    "overflow": _stay_silent,
 }
 
 
@@ -87,7 +87,7 @@ class Receiver:
         self._left = 10**9 if kind in FOREVER else BROKEN
         self._server = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._server.getsockname()[1]}/hook"
-        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread = threading.Thread(target=self._serve_clients, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -96,16 +96,16 @@ class Receiver:
         self._server.close()
         self._thread.join()
 
-    def _serve(self) -> None:
+    def _serve_clients(self) -> None:
         with suppress(OSError):
             while True:
                 client, _ = self._server.accept()
-                threading.Thread(target=self._answer, args=(client,), daemon=True).start()
+                threading.Thread(target=self._answer_client, args=(client,), daemon=True).start()
 
-    def _answer(self, client: socket.socket) -> None:
+    def _answer_client(self, client: socket.socket) -> None:
         with client, suppress(OSError, ValueError, IndexError):
             client.settimeout(4 * TIMEOUT_S)
-            head, text = _request(client)
+            head, text = _read_request(client)
             if self._left > 0:
                 self._left -= 1
                 self._break(client)
@@ -116,7 +116,7 @@ class Receiver:
                 client.sendall(OK)  # a login page answers every GET
 
 
-def _request(client: socket.socket) -> tuple[bytes, bytes]:
+def _read_request(client: socket.socket) -> tuple[bytes, bytes]:
     data = b""
     while b"\r\n\r\n" not in data:
         data += client.recv(65536) or b"\r\n\r\n"
@@ -127,7 +127,7 @@ def _request(client: socket.socket) -> tuple[bytes, bytes]:
     return head, text
 
 
-def stretch(number: int) -> StretchAlert:
+def make_stretch(number: int) -> StretchAlert:
     """Return an alert with a number as its id."""
     return StretchAlert(
         id=f"id-{number}",
@@ -160,7 +160,7 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
     queue = AlertQueue(folder / f"{kind}.sqlite", FEW if kind == "overflow" else 1000)
     hook = Webhook(receiver.url, said.append, queue, TIMEOUT_S)
     for number in range(ALERTS):
-        hook.send(stretch(number))
+        hook.send(make_stretch(number))
     end = time.monotonic() + (1.0 if kind in FOREVER else PATIENCE_S)
     while time.monotonic() < end and len(receiver.heard) + hook.lost_count < ALERTS:
         time.sleep(0.02)
@@ -183,8 +183,8 @@ def run(site: Site) -> list[Figure]:
         kind for kind, (arrived, _) in found.items() if kind not in FOREVER and arrived < ALERTS
     ]
     return [
-        figure("faults.webhook.lost_silently", sum(lost for _, lost in found.values())),
-        figure("faults.webhook.late", len(short)),
-        figure("faults.webhook.kinds", len(found)),
-        figure("faults.webhook.arrived", sum(arrived for arrived, _ in found.values())),
+        make_figure("faults.webhook.lost_silently", sum(lost for _, lost in found.values())),
+        make_figure("faults.webhook.late", len(short)),
+        make_figure("faults.webhook.kinds", len(found)),
+        make_figure("faults.webhook.arrived", sum(arrived for arrived, _ in found.values())),
     ]

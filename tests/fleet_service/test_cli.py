@@ -217,8 +217,8 @@ def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
     try:
         service.line_with("hangs")
         assert service.stop() == code
-        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
-        assert ("IndexError: list index out of range" in service.lines()) == bool(more)
+        assert "shutdown incomplete: a session or a job did not end in time" in service.read_lines()
+        assert ("IndexError: list index out of range" in service.read_lines()) == bool(more)
     finally:
         service.kill()
 
@@ -236,7 +236,7 @@ def test_a_service_that_has_to_be_ended_gives_its_lease_free(
         service.line_with("hangs")
         service.line_with("ready: ")
         assert service.stop() == 0
-        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
+        assert "shutdown incomplete: a session or a job did not end in time" in service.read_lines()
     finally:
         service.kill()
     (lease,) = bucket.place("lease").glob("*.json")

@@ -480,9 +480,9 @@ def test_box_selects_watched_tiles_and_both_options_name_the_router(
         tiles = {name: part.line_with("tile ").split()[1] for name, part in watching.items()}
         assert tiles["here"] != tiles["far"]
         for name, part in watching.items():
-            part.send(signal.SIGTERM)
+            part.send_signal(signal.SIGTERM)
             part.wait(30.0)
-            assert {line.split()[1] for line in part.lines() if line.startswith("tile ")} == {
+            assert {line.split()[1] for line in part.read_lines() if line.startswith("tile ")} == {
                 tiles[name]
             }
     finally:

@@ -29,7 +29,7 @@ from tests.benchmarks.country.coefficients import Coefficients
 from tests.benchmarks.country.replayed import PERIOD_S, RATE, ROWS, VEHICLES, ZONES, Country
 from tests.benchmarks.country.sender import EVERY_S as SAYS_S
 from tests.faults.processes import Part
-from tests.faults.soak import memory_mb, slope
+from tests.faults.soak import fit_slope, memory_mb
 
 # all have been everywhere, the window is full, and two checkpoints have given their memory back
 WARM_S: Final = 660.0
@@ -177,7 +177,7 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
     least = [float("inf")] * (len(parts) - 1)
-    while sender.alive:
+    while sender.is_alive:
         values = [one.values() for one in services]
         looks.append(
             Look(
@@ -215,7 +215,7 @@ def _least(before: list[float], parts: Sequence[Part]) -> list[float]:
 
 def _last_line(sender: Part) -> dict[str, float]:
     """Return the last complete line of the output."""
-    whole = [line for line in sender.lines() if line.endswith("}")]
+    whole = [line for line in sender.read_lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said
 
@@ -281,7 +281,7 @@ def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
     memory, cells = (
         np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells")
     )
-    grown = sum(slope(time_s[late], memory[:, k]) for k in range(len(SERVICES)))
+    grown = sum(fit_slope(time_s[late], memory[:, k]) for k in range(len(SERVICES)))
     new = float(cells[-1].sum() - cells[0].sum())
     beyond = grown - new * coefficients.cell_bytes / 1e6
     return [

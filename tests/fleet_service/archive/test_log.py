@@ -93,8 +93,8 @@ def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path
         after = tmp_path / f"after-{seed}"
         live.mkdir()
         disk = CrashDisk(live, random.Random(seed), None, range(0))
-        with disk.mounted():
+        with disk.intercept_calls():
             key = load_or_create_key(live / "keys" / "2026-01.key")
-        disk.image(after)
+        disk.write_image(after)
         assert (after / "keys" / "2026-01.key").exists()
         assert load_or_create_key(after / "keys" / "2026-01.key") == key

@@ -19,7 +19,7 @@ from schemas.errors import InputError
 from schemas.runtime import tokens
 from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
-from tests.faults.ground import HONEST, Ground, ground
+from tests.faults.ground import HONEST, Ground, open_ground
 from tests.fleet_service.examples import key
 from tests.secured import (
     READER,
@@ -58,7 +58,7 @@ def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Network]
 
 
 def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
-    with ground(running) as found:
+    with open_ground(running) as found:
         assert breaches(found) == set()
 
 
@@ -66,7 +66,7 @@ def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
 def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
     with (
         network(tmp_path, guarded=False, protocol=protocol) as open_to_all,
-        ground(open_to_all) as found,
+        open_ground(open_to_all) as found,
     ):
         assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
 

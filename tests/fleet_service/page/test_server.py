@@ -366,7 +366,7 @@ def test_every_option_of_the_command_does_what_it_says(
         assert (status, ask(address, "/", Host="other.example")[0]) == (200, 421)
         until(lambda: ask(address, "/datex2/situation.xml")[0] == 503)  # no service is there
         assert "img-src 'self' data: https://t.example;" in headers["content-security-policy"]
-        page.send(signal.SIGTERM)
+        page.send_signal(signal.SIGTERM)
         page.wait(30.0)
     finally:
         page.kill()

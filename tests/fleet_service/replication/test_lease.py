@@ -42,12 +42,12 @@ LEASE_S = 4.0  # of who is no process: a request may take a quarter of it
 
 
 def frozen(host: Host) -> None:
-    host.part.send(signal.SIGSTOP)
+    host.part.send_signal(signal.SIGSTOP)
 
 
 GONE: dict[str, Callable[[Host], None]] = {
     "killed": lambda host: host.part.kill(),
-    "stopped": lambda host: host.part.send(signal.SIGTERM),
+    "stopped": lambda host: host.part.send_signal(signal.SIGTERM),
     "frozen": frozen,
     "cut from the bucket": lambda host: host.to_bucket.cut(),
     "cut from the routers": lambda host: host.to_router.cut(),
@@ -73,7 +73,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         two.part.line_with("ready: ")
         until(driven(fleet, during), PATIENCE_S)
         if how == "frozen":
-            one.part.send(signal.SIGCONT)
+            one.part.send_signal(signal.SIGCONT)
         one.to_router.mend()
         if how not in {
             "killed",
