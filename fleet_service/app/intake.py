@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from itertools import compress
 from pathlib import Path
 
@@ -107,9 +108,8 @@ class Intake:
         with self._shared.guard:
             fused = np.flatnonzero(~self._excluded_from_fusion(rows))
             taken = observations_of(rows, rows["witness"]).take(fused)
-            updated = state.fusion.update(taken)
-            if state.visitors is not None:
-                state.visitors.add(taken)
+            with nullcontext() if state.public is None else state.public.follow(taken):
+                updated = state.fusion.update(taken)
             state.map.mark_changed(updated.slots)
             raised = state.alerts.update(updated.slots)
             if raised:

@@ -19,9 +19,10 @@ from typing import BinaryIO, Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.fusion import Fusion, Observations
-from fleet_service.replay.rebuild import Box, past_fusion, rows_near, too_much
+from fleet_service.fusion import Fusion
+from fleet_service.replay.rebuild import Box, Heard, past_fusion, rows_near, too_much
 from fleet_service.serve.map_state import MapState
+from fleet_service.serve.public_cells import PublicCells
 from fleet_service.serve.query import answer
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
@@ -174,11 +175,11 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.
     """
-    heard: list[Visitors] = []
+    heard: list[PublicCells] = []
 
-    def listener(fusion: Fusion) -> Callable[[Observations], None]:
-        heard.append(Visitors(fusion))
-        return heard[0].add
+    def listener(fusion: Fusion) -> Heard:
+        heard.append(PublicCells(fusion, Visitors(fusion), question.public))
+        return heard[0].follow
 
     listening = listener if question.public > 1 else None
     try:

@@ -37,11 +37,20 @@ class Queries:
         shown = self._shared.tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
 
+    def take_changed(self, now: int) -> list[int]:
+        """Return the tiles that changed since the last call, or whose changes are published now."""
+        state = self._shared.state
+        if state.public is not None:
+            with self._shared.guard:
+                state.public.publish(now)
+                state.map.mark_changed(state.public.take_published())
+        return state.map.take_dirty()
+
     def changed_tiles(self, now: int) -> list[tuple[int, bytes]]:
         """Return tile and payload of every tile that changed since the last call and is not
         empty.
         """
-        changed = self._shared.state.map.take_dirty()
+        changed = self.take_changed(now)
         return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:

@@ -93,7 +93,7 @@ class Service:
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
             config.put_s,
-            lambda: self.engine.state.map.take_dirty(),
+            lambda: self.engine.queries.take_changed(self._clock.now()),
             self._put_tile,
             self.engine.counts,
             time.monotonic,

@@ -27,6 +27,7 @@ from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
 from fleet_service.serve.map_state import MapState
+from fleet_service.serve.public_cells import PublicCells
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
@@ -47,7 +48,7 @@ class ServiceState(NamedTuple):
         streams: admitted batches.
         weather: all weather reports used.
         refused: checkpoints that could not be loaded.
-        visitors: recent vehicles per cell; None if every cell is public.
+        public: what readers may see; None for everything.
     """
 
     fusion: Fusion
@@ -56,7 +57,7 @@ class ServiceState(NamedTuple):
     streams: SequenceTrackers
     weather: Reports
     refused: int
-    visitors: Visitors | None
+    public: PublicCells | None
 
     def drop_old(self) -> int:
         """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their
@@ -70,8 +71,8 @@ class ServiceState(NamedTuple):
             place = self.fusion.drop(stale)
             self.map.rebuild()
             self.alerts.renumber(place)
-            if self.visitors is not None:
-                self.visitors.renumber(place)
+            if self.public is not None:
+                self.public.renumber(place)
             return dropped
         return 0
 
@@ -79,7 +80,7 @@ class ServiceState(NamedTuple):
         """Return the content of a checkpoint, which includes everything up to the segment `cut` and
         these weather files."""
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(
-            self.visitors
+            None if self.public is None else self.public.visitors
         )
         return Taken(tables, cut, tuple(path.name for path in weather))
 
@@ -105,7 +106,7 @@ class SharedState:
     def adopt(self, state: ServiceState) -> None:
         """Replace the state and start with an empty tile cache."""
         self.state = state
-        self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.visitors)
+        self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.public)
 
 
 def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:
@@ -133,14 +134,15 @@ def load_state(
     begin = load_restart(root, config.lateness_s, (VISITORS,))
     fusion = begin.fusion
     streams = begin.streams
-    visitors = None
+    public = None
     if (
         config.public_vehicles > 1
     ):  # after a checkpoint that does not have them nothing is shown until so many came
         kept = begin.extra_tables.get(VISITORS)
         visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
+        public = PublicCells(fusion, visitors, config.public_vehicles)
     shown = MapState(fusion)
-    alerts = Alerts(fusion, IdleRoads())
+    alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)
     used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
     fusion.update_weather(
@@ -148,7 +150,7 @@ def load_state(
     )
     restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
     matters = Begin(first_day(root), begin.cut, until)
-    heard = nobody if visitors is None else visitors.add
+    heard = nobody if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
@@ -163,6 +165,6 @@ def load_state(
         else:
             noting.result()
     pa.default_memory_pool().release_unused()  # the archive went through it
-    memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, visitors)
+    memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, public)
     memory.drop_old()
     return memory

@@ -346,6 +346,11 @@ def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: Boo
     )
 
 
+def voted_keys(o: Observations) -> IntArray:
+    """Return the keys that observations vote on, with repetitions."""
+    return _votes(o, np.arange(len(o.time)))[1]
+
+
 def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """Votes of some observations: row, key and share; those of other cells and of a second
     sector too; by time.

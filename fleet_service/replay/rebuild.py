@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
@@ -149,11 +150,12 @@ class Since(NamedTuple):
         return found or None
 
 
-Heard = Callable[[Observations], None]
+Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
-def nobody(_: Observations) -> None:
+def nobody(_: Observations) -> AbstractContextManager[None]:
     """Ignore observations."""
+    return nullcontext()
 
 
 def too_much() -> InputError:
@@ -183,7 +185,7 @@ def past_fusion(
     """Return the fusion of a service that had received everything until a moment [ns], near a box
     [deg].
 
-    The object that `listener` makes for it is called with the fused observations.
+    The object that `listener` makes for it follows the fusion of observations as a context.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -227,7 +229,7 @@ def replay(
         fusion: a new one, or one that holds everything before `since`.
         since: selection of rows.
         damaged: called with a damaged file.
-        heard: called with fused observations.
+        heard: context in which observations are fused.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -297,8 +299,8 @@ def _fuse_epochs(
     for start, stop in pairwise([0, *borders.tolist(), len(order)]):
         if start < stop:
             taken, used = _select_rows(o, before, slice(start, stop))
-            updated = fusion.update(taken, used)
-            heard(taken)
+            with heard(taken):
+                updated = fusion.update(taken, used)
             yield updated
 
 

@@ -12,7 +12,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE
 from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
-from fleet_service.serve.view import LOWER, UPPER
+from fleet_service.serve.view import LOWER, UPPER, coarse_counts
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
@@ -33,6 +33,7 @@ FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
 CLEAR_SOURCES: Final = (4, 5)  # ... that grip needs to end an alert: at least and at most
 SOURCE_NS: Final = 3600 * NS  # sources count for an hour; older ice belongs to an older road
+TIME_STEP_NS: Final = 60 * NS  # of alerts where persons are kept private
 QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long may fade
 
 
@@ -43,10 +44,14 @@ class Alerts:
         fusion: owner of the cells.
         idle_roads: limit on alerts where nobody but the witnesses drives; None for no limit, in
             simulations.
+        is_private: True if times and numbers of vehicles are given in steps.
     """
 
-    def __init__(self, fusion: Fusion, idle_roads: IdleRoads | None = None) -> None:
+    def __init__(
+        self, fusion: Fusion, idle_roads: IdleRoads | None = None, *, is_private: bool = False
+    ) -> None:
         self._fusion = fusion
+        self._is_private = is_private
         self._idle_roads = idle_roads
         self._standing: dict[int, Alert] = {}
 
@@ -143,6 +148,10 @@ class Alerts:
         belief = fusion.beliefs(np.array([slot]), time)
         latitude, longitude = grid.centre(cell)
         lower, mu, upper = quantiles(belief, (LOWER, 0.5, UPPER))[:, 0].tolist()
+        vehicles = int(fusion.live.vehicles[slot])
+        if self._is_private:
+            vehicles = int(coarse_counts(np.array([vehicles]))[0])
+            time = time // TIME_STEP_NS * TIME_STEP_NS
         return Alert(
             cell=cell,
             sector=sector,
@@ -152,7 +161,7 @@ class Alerts:
             mu_lower=lower,
             mu_upper=upper,
             p_slippery=float(belief[0] @ SLIPPERY_SHARE),
-            vehicles=int(fusion.live.vehicles[slot]),
+            vehicles=vehicles,
             latitude=float(latitude),
             longitude=float(longitude),
             reason=reason,

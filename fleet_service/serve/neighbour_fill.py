@@ -26,30 +26,31 @@ KEPT: Final = 0.8
 
 
 def impute(
-    fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int
+    fusion: Fusion, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
-    """Return the unvisited cells of a tile next to its visited `slots`, same sector; along a route,
-    the cells of its keys.
+    """Return the cells of a tile that are not `known` next to those of its cells that are, same
+    sector; along a route, the cells of its keys.
 
     The belief is half the prior and half the mean of the visited neighbours, less of them at
     greater distance. `vehicles` is the minimum of theirs, so that an imputed value is never more
     public than its sources. Times are the newest and oldest of theirs.
     """
     live = fusion.live
+    slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
     visited = np.repeat(slots, 8)
     sector = live.key[visited] % grid.SECTORS
     free = (
         (near >= 0)
         & (grid.tile_of(near) == tile)
-        & (fusion.slots_of(np.maximum(near, 0), sector) < 0)
+        & ~np.isin(fusion.slots_of(np.maximum(near, 0), sector), slots)
     )
     keys = (near * grid.SECTORS + sector)[free]
     visited = visited[free]
     share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
         ahead = np.isin(keys, route)
-        along = _along(fusion, route, tile)
+        along = _along(fusion, route, tile, known)
         keys, visited, share = (
             np.concatenate([a[ahead], b])
             for a, b in zip((keys, visited, share), along, strict=True)
@@ -80,13 +81,16 @@ def impute(
     )
 
 
-def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return unvisited keys of a route in a tile, the slots of the nearest visited ones before and
+def _along(
+    fusion: Fusion, route: IntArray, tile: int, known: IntArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return unknown keys of a route in a tile, the slots of the nearest visited ones before and
     behind, and their shares.
 
     A key appears once for each side within REACH; adjacent keys are handled as neighbours.
     """
     slots = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
+    slots = np.where(np.isin(slots, known), slots, -1)
     place = np.arange(len(route))
     before = np.maximum.accumulate(np.where(slots >= 0, place, -1))
     behind = np.minimum.accumulate(np.where(slots >= 0, place, len(route))[::-1])[::-1]

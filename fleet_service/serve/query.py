@@ -96,7 +96,14 @@ def _view_tile(
             passed = found[found >= 0]
         cells = cache.seen(cache.public(passed, now), now)
         if query.basis == "borrowed":
-            cells = joined(cells, impute(fusion, tile, slots, route, now))
+            known = slots
+            if route is not None:
+                along = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
+                known = np.union1d(slots, along[along >= 0])
+            known = cache.public(known, now)
+            with cache.as_published(known):
+                borrowed = impute(fusion, tile, known, route, now)
+            cells = joined(cells, cache.coarse(borrowed))
     return used_once(cells, now)
 
 

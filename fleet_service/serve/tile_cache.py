@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
+from fleet_service.serve.public_cells import PublicCells
 from fleet_service.serve.view import CellView, coarsen, view
-from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -66,8 +66,8 @@ class TileCache:
     Args:
         state: the map.
         guard: lock held while the map is read, but not while Arrow is written.
-        least: minimum number of vehicles of a public cell.
-        visitors: counts the vehicles of the recent window; None counts all vehicles.
+        least: minimum number of vehicles of a public cell, ever.
+        public: what readers may see where persons are kept private; None for everything.
     """
 
     def __init__(
@@ -75,12 +75,12 @@ class TileCache:
         state: MapState,
         guard: AbstractContextManager[Any],
         least: int,
-        visitors: Visitors | None = None,
+        public: PublicCells | None = None,
     ) -> None:
         self.state = state
         self.guard = guard
         self._least = least
-        self._visitors = visitors
+        self._public = public
         self._kept: dict[int, ShownTile] = {}
         self._held = 0  # bytes
         self._acknowledged = 0  # change up to which all must be seen
@@ -112,20 +112,23 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of slots as readers see them: coarse if more than one vehicle makes a
-        cell public.
-        """
-        cells = view(self.state.fusion, slots, now)
-        return coarsen(cells) if self._least > 1 else cells
+        """Return the cells of public slots as readers see them."""
+        if self._public is None:
+            return view(self.state.fusion, slots, now)
+        return self._public.view(slots, now)
+
+    def as_published(self, slots: IntArray) -> AbstractContextManager[None]:
+        """Let the fusion hold these slots as readers see them, within this context."""
+        return nullcontext() if self._public is None else self._public.as_published(slots)
+
+    def coarse(self, cells: CellView) -> CellView:
+        """Return cells with times and counts as readers see them."""
+        return cells if self._public is None else coarsen(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
         """Return the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
-        return (
-            slots
-            if self._visitors is None
-            else slots[self._visitors.count(slots, now) >= self._least]
-        )
+        return slots if self._public is None else self._public.select(slots, now)
 
     def _from_south(self, slots: IntArray) -> IntArray:
         _, row = grid.deinterleave(self.state.fusion.live.key[slots] // grid.SECTORS)

@@ -74,16 +74,17 @@ def coarsen(cells: CellView) -> CellView:
     """Return the cells as readers see them with privacy on: no single passage shows in a time or
     a count.
     """
-    steps = COUNT_STEPS
-    counts = [
-        steps[np.maximum(np.searchsorted(steps, column, "right") - 1, 0)]
-        for column in (
-            np.asarray(cells.vehicles, np.int64),
-            np.asarray(cells.observations, np.int64),
-        )
-    ]
+    vehicles, observations = (
+        coarse_counts(np.asarray(column, np.int64))
+        for column in (cells.vehicles, cells.observations)
+    )
     first, last = (time // TIME_STEP_NS * TIME_STEP_NS for time in (cells.first, cells.last))
-    return cells._replace(vehicles=counts[0], observations=counts[1], first=first, last=last)
+    return cells._replace(vehicles=vehicles, observations=observations, first=first, last=last)
+
+
+def coarse_counts(counts: IntArray) -> IntArray:
+    """Return counts in steps of 1, 2, 5, rounded down."""
+    return COUNT_STEPS[np.maximum(np.searchsorted(COUNT_STEPS, counts, "right") - 1, 0)]
 
 
 def joined(*views: CellView) -> CellView:

@@ -42,12 +42,17 @@ class Visitors:
         self._grow()
         part = o.time // PART_NS
         self._move_on(int(part.max(initial=self._part)))
-        bit = np.uint64(1) << ((o.vehicle.astype(np.uint64) * _FIBONACCI) >> _SHIFT)
+        bit = bit_of(o.vehicle)
         for sector in (o.sector, o.second):
             slot = self._fusion.slots_of(o.cell, np.maximum(sector, 0))
             for back in range(PARTS):
                 mine = (part == self._part - back) & (slot >= 0) & (sector >= 0)
                 np.bitwise_or.at(self._bits[:, back], slot[mine], bit[mine])
+
+    @property
+    def newest(self) -> int:
+        """Return the begin of the newest part of the window [ns]."""
+        return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
         """Return the distinct vehicles (k,) of slots within the window that ends at `now` [ns]."""
@@ -97,3 +102,8 @@ class Visitors:
             self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]
             self._bits[:, :ago] = 0
             self._part = part
+
+
+def bit_of(vehicle: IntArray) -> NDArray[np.uint64]:
+    """Return one bit of 64 for each vehicle; two vehicles may share a bit."""
+    return np.uint64(1) << ((vehicle.astype(np.uint64) * _FIBONACCI) >> _SHIFT)

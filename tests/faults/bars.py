@@ -112,6 +112,15 @@ BARS: Final = {
     "faults.path.two_car_alerts": Bar("of 210 places on idle roads, the worst of three ways", 2),
     "faults.path.pair_alerts": Bar("of 20 icy places, by two honest cars alone", 2, "more"),
     "faults.path.honest_alerts": Bar("of 20 icy places, by three honest cars", 20, "more"),
+    "faults.privacy.position_over_chance": Bar(
+        "of the puts a reader finds a lone car within 25 m, over a place drawn at random", 0.05
+    ),
+    "faults.privacy.street_over_chance": Bar("likewise, of the car's street among five", 0),
+    "faults.privacy.slippery_delay_s": Bar("s, over those of a map that shows every visit", 1),
+    "faults.privacy.puts": Bar("puts while a lone car drove", 200, "more"),
+    "faults.privacy.control_position": Bar(
+        "as the first, if every visit is shown at once", 0.5, "more"
+    ),
     "faults.query.light_p99_ms": Bar("ms", 100),
     "faults.query.heavy_answers": Bar("whole maps of the slower of two", 2, "more"),
     "faults.query.light_answers": Bar("answers", 20, "more"),

@@ -24,6 +24,7 @@ from tests.faults import (
     model,
     outages,
     path,
+    privacy,
     queries,
     security,
     soak,
@@ -205,6 +206,15 @@ CAMPAIGNS: Final = (
                 "faults.path.teleports",
             ),
             *("faults.path.two_car_alerts", "faults.path.pair_alerts", "faults.path.honest_alerts"),
+        ),
+    ),
+    Campaign(
+        "privacy",
+        privacy.run,
+        (
+            *("faults.privacy.position_over_chance", "faults.privacy.street_over_chance"),
+            *("faults.privacy.slippery_delay_s", "faults.privacy.puts"),
+            "faults.privacy.control_position",
         ),
     ),
     Campaign(

@@ -19,6 +19,7 @@ from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
+from fleet_service.serve.public_cells import PERIOD_NS
 from fleet_service.serve.view import CellView, coarsen
 from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
@@ -67,6 +68,11 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
     engine.settlement.flush()
 
 
+def later() -> int:
+    """Return a time at which the visits of now are published."""
+    return time.time_ns() + PERIOD_NS
+
+
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
     """Cells of an answer."""
     tiles = engine.queries.answer(
@@ -84,9 +90,10 @@ def test_a_cell_is_public_from_k_vehicles_on_in_answers_and_tiles(start: Start) 
         assert not rows(engine, None, **parameters)
     assert not engine.queries.changed_tiles(time.time_ns())
     hear(engine, *MORE)
-    assert [row["vehicles"] for row in rows(engine)] == [5]
-    assert len(engine.queries.changed_tiles(time.time_ns())) == 1
-    assert not rows(engine, min_vehicles="7")
+    assert not rows(engine), "the next moment of publication has not come"
+    assert [row["vehicles"] for row in rows(engine, later())] == [5]
+    assert len(engine.queries.changed_tiles(later())) == 1
+    assert not rows(engine, later(), min_vehicles="7")
 
 
 def test_the_past_is_no_more_public_than_the_present(start: Start) -> None:
@@ -108,10 +115,10 @@ def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) ->
     """Times and counts are coarse: a pass at night changes neither."""
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
-    (before,) = rows(engine)
+    (before,) = rows(engine, later())
     assert (before["vehicles"], before["observations"]) == (5, 5)
     hear(engine, "sim-006")
-    (after,) = rows(engine)
+    (after,) = rows(engine, later())
     assert (after["vehicles"], after["observations"]) == (5, 5)
     for name in ("first_time", "last_time"):
         moment = after[name]
@@ -148,6 +155,7 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     names = [f"sim-{k:03}" for k in range(6)]
     route = f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}"
     hear(engine, *names, now=day)
+    day += PERIOD_NS
     assert (
         len(rows(engine, day))
         == len(rows(engine, day, route=route))
@@ -162,7 +170,8 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     assert not engine.queries.whole_map(night).num_rows
     assert not engine.queries.changed_tiles(night)
     hear(engine, *MORE, now=night + SECOND)
-    (row,) = rows(engine, night + 2 * SECOND)
+    assert not rows(engine, night + 2 * SECOND)
+    (row,) = rows(engine, night + PERIOD_NS)
     assert row["vehicles"] in (5, 10), "of twelve, less those that share a bit, rounded down"
     hour = datetime.fromtimestamp(day / 1e9, UTC)
     assert rows(engine, night, at=f"{hour + timedelta(minutes=1):%Y-%m-%dT%H:%M:%SZ}")
@@ -180,7 +189,7 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
     for _ in ("checkpoint", "log"):
         engine.close()
         engine = start(3)
-        assert [row["vehicles"] for row in rows(engine)] == [5]
+        assert [row["vehicles"] for row in rows(engine, later())] == [5]
         drop_checkpoints(tmp_path)
 
 

@@ -1,0 +1,271 @@
+"""Reader that follows a lone car by night, with the shipped secure settings.
+
+Five side streets with STREETS households join a main road. All cars leave twice by day; one leaves
+alone by night, and its agent cuts the begin of the trip. The reader holds the tiles of every put.
+In each put it takes the cell that appeared, or whose interval, times or counts changed most, for
+the place of the car, and the street nearest to the first such places for the car's. A reader that
+sees no change guesses at random; such guesses count by their probability.
+
+The control shows every visit at once. The reader must find the car there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from fleet_service.serve.public_cells import PublicCells
+from fleet_service.serve.visitors import PART_NS
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.figures import Figure
+from schemas.wire import Batch
+from tests.faults.bars import make_figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, batch
+
+PUBLIC: Final = 3  # vehicles of a public cell in the secure configuration
+CUT: Final = 16  # cells of a trip's begin that the agent does not publish: 200 m
+STREETS: Final = (4, 3, 3, 2, 1)  # households
+LENGTH: Final = 30  # cells of a street
+PART: Final = 40  # visits of a batch
+MAIN: Final = 60  # cells of the main road
+NEAR_M: Final = 25.0
+EAST: Final = 0
+SOUTH: Final = 3
+YAW: Final = (0.0, np.pi / 2, np.pi, -np.pi / 2)
+HOUR: Final = 3600 * SECOND
+MU: Final = 0.8
+ICE: Final = 0.12
+
+
+class Trip(NamedTuple):
+    """Cells and sectors of a trip that the agent publishes, one visit a second."""
+
+    cell: IntArray
+    sector: IntArray
+
+
+class Pursuit(NamedTuple):
+    """Result of a reader's pursuit: probabilities of a right place per put, of one drawn at random,
+    and of the right street.
+    """
+
+    hits: list[float]
+    chance: list[float]
+    street: float
+
+
+def _trip(street: int, house: int) -> Trip:
+    """Return the trip from a house down its street to the main road's end."""
+    column, row = (int(v) for v in grid.deinterleave(np.int64(CELL)))
+    junction = 10 * street + 5
+    down = np.arange(LENGTH - house, 0, -1)
+    x = np.concatenate([np.full(len(down), junction), np.arange(junction, MAIN)])
+    y = np.concatenate([down, np.zeros(MAIN - junction, int)])
+    sector = np.where(y > 0, SOUTH, EAST)
+    cell = np.asarray(grid.interleave(column + x, row - y), np.int64)
+    return Trip(cell[CUT:], sector[CUT:])
+
+
+def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> list[Message]:
+    """Return the messages of a part of a trip that ends at `when` [ns]."""
+    cell = trip.cell[at]
+    latitude, longitude = grid.centre(cell)
+    regions = grid.region_of(cell)
+    out = []
+    for region in np.unique(regions).tolist():
+        mine = regions == region
+        columns = {
+            "latitude": latitude[mine],
+            "longitude": longitude[mine],
+            "cell": cell[mine],
+            "sector": trip.sector[at][mine].astype(np.int8),
+            "yaw": np.array(YAW, np.float32)[trip.sector[at][mine]],
+        }
+        one: Batch = batch(name, seq, when, [mu] * int(mine.sum()), **columns)
+        one = replace(one, region=int(region))
+        out.append(
+            Message(
+                one.kind,
+                keys.observation_key(one.region, name),
+                wire.encode(one),
+                wire.ENCODING[one.kind],
+            )
+        )
+    return out
+
+
+class Town:
+    """Service of a town, its cars by day, and the tiles that a reader holds."""
+
+    def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:
+        self._random = np.random.default_rng(seed)
+        self.engine = Engine(ServiceConfig(public_vehicles=public), folder)
+        # so that the night lies in one part of the window with the evening
+        self.day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS
+        self.held: dict[int, pa.Table] = {}
+        self._sent = 0
+        for hour in (7, 17):
+            cars = [(street, house) for street, n in enumerate(STREETS) for house in range(n)]
+            for turn, k in enumerate(self._random.permutation(len(cars)).tolist()):
+                street, house = cars[k]
+                when = self.day + hour * HOUR + turn * 400 * SECOND
+                trip = _trip(street, house)
+                for first in range(0, len(trip.cell), PART):
+                    part = slice(first, min(first + PART, len(trip.cell)))
+                    self.drive(f"car-{street}{house}", when + part.stop * SECOND, trip, part)
+        self.put(self.day + 21 * HOUR)
+
+    def drive(
+        self, name: str, when: int, trip: Trip, at: slice, mu: float = MU
+    ) -> list[wire.Alert]:
+        """Take in a part of a trip; return the alerts."""
+        self._sent += 1
+        seen = float(np.clip(mu + self._random.normal(0.0, 0.02), 0.05, 1.0))
+        alerts = self.engine.intake.ingest(
+            _visit(name, self._sent, when, trip, at, seen), when + SECOND // 2
+        )
+        self.engine.settlement.flush()
+        return alerts
+
+    def put(self, now: int) -> dict[int, tuple[pa.Table | None, pa.Table]]:
+        """Publish the changed tiles; return each as it was and as it is."""
+        out = {}
+        for tile, payload in self.engine.queries.changed_tiles(now):
+            table = pa.ipc.open_stream(payload).read_all()
+            out[tile] = (self.held.get(tile), table)
+            self.held[tile] = table
+        return out
+
+
+def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float, int]]:
+    """Yield by how much each cell changed in a way that age does not change it."""
+    known = {}
+    if before is not None:
+        known = {(row["cell"], row["sector"]): row for row in before.to_pylist()}
+    for row in after.to_pylist():
+        old = known.pop((row["cell"], row["sector"]), None)
+        if old is None:
+            yield 10.0, row["cell"]
+            continue
+        narrowed = (old["mu_upper"] - old["mu_lower"]) - (row["mu_upper"] - row["mu_lower"])
+        names = ("vehicles", "observations", "first_time", "last_time")
+        changed = any(old[name] != row[name] for name in names)
+        if narrowed > 1e-4 or changed:
+            yield narrowed + changed, row["cell"]
+
+
+def _places(cells: IntArray) -> FloatArray:
+    """Return places [m] as complex numbers."""
+    latitude, longitude = grid.centre(cells)
+    north = (latitude - LATITUDE) * 111_195.0
+    east = (longitude - LONGITUDE) * 111_195.0 * np.cos(np.radians(LATITUDE))
+    return np.asarray(east + 1j * north)
+
+
+def pursue(town: Town, street: int) -> Pursuit:
+    """Let a car of a street leave alone by night, and its pursuer look at each put."""
+    trip = _trip(street, 0)
+    begin = town.day + 22 * HOUR
+    hits: list[float] = []
+    chance: list[float] = []
+    found: list[int] = []
+    for k in range(len(trip.cell)):
+        when = begin + k * SECOND
+        town.drive(f"car-{street}0", when, trip, slice(k, k + 1))
+        put = town.put(when + SECOND)
+        car = _places(trip.cell[k : k + 1])[0]
+        seen = np.concatenate([t["cell"].to_numpy() for _, t in put.values()] or [trip.cell[:0]])
+        random = float((np.abs(_places(seen) - car) <= NEAR_M).mean()) if len(seen) else 0.0
+        suspects = sorted(s for both in put.values() for s in _suspects(*both))
+        if suspects:
+            found.append(suspects[-1][1])
+            place = _places(np.array(found[-1:]))[0]
+            hits.append(float(abs(place - car) <= NEAR_M))
+        else:
+            hits.append(random)
+        chance.append(random)
+    town.put(begin + HOUR)
+    return Pursuit(hits, chance, _name_street(found, street))
+
+
+def _name_street(found: list[int], street: int) -> float:
+    """Return the probability that the reader names the right street from the first places."""
+    if not found:
+        return 1.0 / len(STREETS)
+    first = _places(np.array(found[:3]))
+    nearest = []
+    for number in range(len(STREETS)):
+        way = _places(_trip(number, 0).cell[: LENGTH - CUT])
+        nearest.append(np.abs(first[:, None] - way[None, :]).min(axis=1).mean())
+    best = np.flatnonzero(np.array(nearest) <= min(nearest) + 1.0)
+    return float(street in best) / len(best)
+
+
+def _slippery_delay(folder: Path, public: int) -> float:
+    """Return after how many seconds the map and an alert tell of ice that two cars found."""
+    town = Town(folder, 0, public)
+    with closing(town.engine):
+        trip = _trip(0, 0)
+        at = slice(len(trip.cell) - 20, len(trip.cell) - 17)
+        cells = set(trip.cell[at].tolist())
+        begin = town.day + 22 * HOUR
+        alerts = town.drive("car-10", begin, trip, at, ICE)
+        alerts += town.drive("car-20", begin + SECOND, trip, at, ICE)
+        for delay in range(60):
+            town.put(begin + (1 + delay) * SECOND)
+            rows = [row for table in town.held.values() for row in table.to_pylist()]
+            shown = any(row["cell"] in cells and row["p_slippery"] > 0.5 for row in rows)
+            if shown and alerts:
+                return float(delay)
+    return float("inf")
+
+
+def run(site: Site) -> list[Figure]:
+    """Pursue a car of each street, and find it in a map that shows every visit."""
+    over: list[float] = []
+    puts = 0
+    streets: list[float] = []
+    for seed in range(site.choose_amount(3, 1)):
+        for street in range(len(STREETS)):
+            town = Town(site.folder / f"{seed}-{street}", site.seed + seed)
+            with closing(town.engine):
+                found = pursue(town, street)
+            puts += len(found.hits)
+            streets.append(found.street)
+            over.append(float(np.mean(found.hits) - np.mean(found.chance)))
+            site.say(
+                f"street {street}: {np.mean(found.hits):.3f} of the puts, by chance "
+                f"{np.mean(found.chance):.3f}; street named {found.street:.2f}"
+            )
+    named = float(np.mean(streets))
+    control = _control(site.folder / "control")
+    delay = _slippery_delay(site.folder / "ice", PUBLIC) - _slippery_delay(site.folder / "open", 1)
+    return [
+        make_figure("faults.privacy.position_over_chance", float(np.mean(over))),
+        make_figure("faults.privacy.street_over_chance", round(named - 1.0 / len(STREETS), 9)),
+        make_figure("faults.privacy.slippery_delay_s", delay),
+        make_figure("faults.privacy.puts", puts),
+        make_figure("faults.privacy.control_position", control),
+    ]
+
+
+def _control(folder: Path) -> float:
+    """Return the share of places found over chance if every visit is shown at once."""
+    with patch.object(PublicCells, "as_published", lambda *_: nullcontext()):
+        town = Town(folder, 0)
+        with closing(town.engine):
+            found = pursue(town, 0)
+    return float(np.mean(found.hits) - np.mean(found.chance))
