@@ -228,6 +228,11 @@ class ServiceConfig(MonitoringSettings):
         description="[kB] at once, for example after an outage of an hour; the largest batch must "
         "fit",
     )
+    publishers: list[VehicleName] = Field(
+        default=[],
+        description="senders that report many places at once, such as the witness of "
+        "`fleet-service cits`: they have no path",
+    )
     fleet: Path | None = Field(
         default=None, description="enrolment file; reports of other vehicles are ignored"
     )

@@ -132,14 +132,18 @@ class Intake:
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
         """Return which rows are archived and not fused: their vehicle cannot be there, or reports
-        too many new places."""
+        too many new places. A publisher is no vehicle and has no path."""
         witness = rows["witness"]
-        beyond = self._paths.find_implausible(
-            witness, rows["leave_time"], rows["latitude"], rows["longitude"]
+        beyond = np.zeros(len(witness), bool)
+        publishers = [self.batches.witness_of(name) for name in self._config.publishers]
+        vehicles = np.flatnonzero(~np.isin(witness, publishers))
+        beyond[vehicles] = self._paths.find_implausible(
+            witness[vehicles],
+            *(rows[name][vehicles] for name in ("leave_time", "latitude", "longitude")),
         )
         self._counts["implausible_moves"] += int(beyond.sum())
         slots = self._shared.state.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64))
-        new = np.flatnonzero((slots < 0) & ~beyond)
+        new = vehicles[(slots < 0)[vehicles] & ~beyond[vehicles]]
         over = self._places.beyond(
             witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS
         )

@@ -183,6 +183,14 @@ class BatchIntake:
                 out[kind] = accepted
         return out
 
+    def witness_of(self, name: str) -> int:
+        """Return the number of a sender in the map.
+
+        Raises:
+            OSError: the key can neither be read nor written.
+        """
+        return self._witnesses.number_of(name)
+
     def sync(self) -> None:
         """Make the identities of the vehicles of accepted batches durable.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import threading
 import time
@@ -20,7 +21,7 @@ from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.service import Service
 from fleet_service.ingest.inbox import Message
-from schemas import wire
+from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.fleet_service.archive.kept import DATA
@@ -119,6 +120,26 @@ def turns(made: Service) -> tuple[int, int]:
     return calls["begin_flush"], calls["take_dirty"]
 
 
+def count_far_moves(config: ServiceConfig, root: Path) -> int:
+    """Reports of one sender that is at two distant places at once, and is refused at one."""
+    now = time.time_ns()
+    with closing(Engine(config, root)) as engine:
+        for seq, latitude in enumerate((57.7, 58.7), 1):
+            report: dict[str, Any] = {
+                "vehicle": "sim-001",
+                "boot": "1",
+                "seq": str(seq),
+                "enter_time": [str(now)],
+            }
+            report |= {"latitude": [latitude], "longitude": [11.97], "mu_utilised": [0.2]}
+            region = int(grid.region_of(int(grid.cell_of(latitude, 11.97))))
+            where = keys.observation_key(region, "sim-001")
+            body = json.dumps(report).encode()
+            engine.intake.ingest([Message(Kind.OBSERVATION, where, body, wire.JSON)], now)
+        assert engine.counts[Kind.OBSERVATION] == 2
+        return engine.counts["implausible_moves"]
+
+
 def refused(engine: Engine) -> object:
     return engine.counts["refused.time"], engine.counts["late"]
 
@@ -148,6 +169,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "vehicle_kb_s": (1e9, of_service(let_in)),
     "vehicle_burst_kb": (100.0, of_service(let_in)),
     "fleet": ("{fleet}", of_service(let_in)),
+    "publishers": (["sim-001"], count_far_moves),
     "segment_s": (1.0, of_service(turns)),
     "put_s": (0.1, of_service(turns)),
 }

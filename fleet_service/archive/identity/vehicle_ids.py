@@ -58,12 +58,9 @@ class VehicleIds:
         Raises:
             OSError: the key can neither be read nor written, or the line cannot be written.
         """
-        if self._key is None or self._known is None:
-            self._key = load_or_create_key(self._folder / _KEY)
+        number = self.number_of(vehicle)
+        if self._known is None:
             self._known = set(read(self._folder))
-        number = int.from_bytes(
-            blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True
-        )
         if pseudonym not in self._known:
             path = self._folder / f"{layout.with_term(month, self._term)}{ENDING}"
             path.touch(_SECRET)
@@ -76,6 +73,18 @@ class VehicleIds:
                     raise OSError(errno.ENOSPC, "no room for a line", str(path))
             self._known.add(pseudonym)
         return number
+
+    def number_of(self, vehicle: str) -> int:
+        """Return the number of a vehicle.
+
+        Raises:
+            OSError: the key can neither be read nor written.
+        """
+        if self._key is None:
+            self._key = load_or_create_key(self._folder / _KEY)
+        return int.from_bytes(
+            blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True
+        )
 
     def sync(self) -> None:
         """Make new lines durable, before anything of their vehicles is acknowledged.

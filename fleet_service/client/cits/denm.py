@@ -30,6 +30,8 @@ VALIDITY_DEFAULT_S: Final = 600
 POINTS: Final = 23  # most events of a history
 REACH: Final = 131_071  # [0.1 µdeg] farthest point of a history or a trace from the event
 UNITS: Final = 1e7  # per degree
+# Half axis of the ellipse in which 95 % of positions lie, in standard deviations of each axis.
+AXIS: Final = math.sqrt(-2.0 * math.log(0.05))
 # Time counts milliseconds since 2004 by TAI; five leap seconds were added to UTC since then.
 EPOCH_NS: Final = 1_072_915_200 * NS
 LEAP_MS: Final = 5000
@@ -68,13 +70,14 @@ class Denm:
         termination: isCancellation by the originating station, isNegation by another one; None
             while the event lasts.
         position: latitude and longitude [deg].
-        position_std: [m].
+        position_std: [m] of each axis.
         validity_s: after `detected`, for how long the event is taken for present.
         quality: 0 (unknown) to 7.
         cause, sub_cause: codes; 6 is adhesion.
         history: further points of the event [deg].
         traces: ways that lead to the event, each from the event backwards [deg].
         heading: [deg from north, clockwise] of the traffic concerned; None for both directions.
+        both_ways: with a heading, the opposite direction is concerned too.
     """
 
     station: int
@@ -92,6 +95,7 @@ class Denm:
     history: tuple[Point, ...] = ()
     traces: tuple[tuple[Point, ...], ...] = ((),)
     heading: float | None = None
+    both_ways: bool = False
 
 
 def encode_denm(denm: Denm) -> bytes:
@@ -169,12 +173,13 @@ def _write_management(out: BitWriter, denm: Denm) -> None:
         out.write(TERMINATIONS.index(denm.termination), 1)
     out.write(round(UNITS * denm.position[0]) - LEAST["latitude"], 31)
     out.write(round(UNITS * denm.position[1]) - LEAST["longitude"], 32)
-    axis = min(max(round(100.0 * denm.position_std), 1), 4094)
+    axis = min(max(round(100.0 * AXIS * denm.position_std), 1), 4094)  # [cm]
     out.write(axis << 24 | axis << 12, 36)  # half axes, and orientation 0
     out.write(800_001 - LEAST["altitude"], 20)  # unavailable
     out.write(15, 4)  # so is its confidence
     out.write(LESS_THAN_5_KM, 3)
-    out.write(ALL_DIRECTIONS if denm.heading is None else UPSTREAM, 2)
+    one_way = denm.heading is not None and not denm.both_ways
+    out.write(UPSTREAM if one_way else ALL_DIRECTIONS, 2)
     if has_validity:
         out.write(denm.validity_s, 17)
     out.write(ROADSIDE, 8)
@@ -229,9 +234,10 @@ def _read_message(message: Mapping[str, Any]) -> Denm:
     position = (place["latitude"] / UNITS, place["longitude"] / UNITS)
     axis = place["positionConfidenceEllipse"]["semiMajorConfidence"]
     location = content.get("location", {})
-    heading = location.get("eventPositionHeading", {"headingValue": UNAVAILABLE["heading"]})[
-        "headingValue"
-    ]
+    heading = _heading(location)
+    direction = management.get("relevanceTrafficDirection", "allTrafficDirections")
+    if heading is not None and direction == "oppositeTraffic":
+        heading = (heading + 180.0) % 360.0
     event = situation.get("eventType", {"causeCode": 0, "subCauseCode": 0})
     return Denm(
         station=action["originatingStationID"],
@@ -241,7 +247,7 @@ def _read_message(message: Mapping[str, Any]) -> Denm:
         referenced=utc_of(management["referenceTime"]),
         termination=management.get("termination"),
         position=position if place["latitude"] != UNAVAILABLE["latitude"] else (math.nan, math.nan),
-        position_std=axis / 100.0 if axis != UNAVAILABLE["axis"] else math.nan,
+        position_std=axis / (100.0 * AXIS) if axis != UNAVAILABLE["axis"] else math.nan,
         validity_s=management["validityDuration"],
         quality=situation.get("informationQuality", 0),
         cause=event["causeCode"],
@@ -254,8 +260,15 @@ def _read_message(message: Mapping[str, Any]) -> Denm:
             tuple(_decode_delta(position, one["pathPosition"]) for one in trace)
             for trace in location.get("traces", ())
         ),
-        heading=None if heading == UNAVAILABLE["heading"] else heading / 10.0,
+        heading=heading,
+        both_ways=heading is not None and direction == "allTrafficDirections",
     )
+
+
+def _heading(location: Mapping[str, Any]) -> float | None:
+    """Return the heading of the event [deg from north]; None where it is not known."""
+    tenths = location.get("eventPositionHeading", {}).get("headingValue", UNAVAILABLE["heading"])
+    return None if tenths == UNAVAILABLE["heading"] else tenths / 10.0
 
 
 def _decode_delta(origin: Point, delta: Mapping[str, int]) -> Point:

@@ -16,26 +16,28 @@ from fleet_service.client.cits.denm import ADHESION, BLACK_ICE, HEAVY_FROST, ICE
 from schemas import grid, keys
 from schemas.thresholds import NS
 
-# Friction that a sub-cause means: middle and bounds. Snow and ice as in the tyres' table of the
-# simulator; frost and unknown causes between. A salted road is no warning of low friction.
+# Friction that a sub-cause means: middle and bounds. Snow and ice have the ranges of
+# `thresholds.SURFACES`, by which our own DENM name them; frost and unknown causes are wider. A
+# salted road is no warning of low friction.
 GRIP: Final = {
     HEAVY_FROST: (0.3, 0.15, 0.45),
     SNOW: (0.3, 0.2, 0.45),
-    ICE: (0.2, 0.08, 0.35),
-    BLACK_ICE: (0.15, 0.06, 0.3),
+    ICE: (0.12, 0.05, 0.2),
+    BLACK_ICE: (0.12, 0.05, 0.2),
 }
 UNKNOWN: Final = (0.35, 0.15, 0.6)
 USED: Final = 0.6  # of the middle: with less, a report would say only "at least"
-WORST_STD: Final = 30.0  # [m] of a position that names a cell at all
-MOST_CELLS: Final = 24
+WORST_STD: Final = 12.0  # [m] of a position that names a cell at all
+MOST_CELLS: Final = 24  # in both directions they fit into one batch
+QUARTERS: Final = (0.0, 90.0, 180.0, 270.0)  # [deg] headings of the four sectors
 POSITION_STD: Final = 10.0  # [m] where a message does not say
 
 
 def encode_reports(
     denm: Denm, name: str, boot: int, first_seq: int, now: int
 ) -> list[tuple[str, bytes]]:
-    """Return key and JSON of a batch for each region of an event; none if it says nothing about
-    grip here and now.
+    """Return keys and JSON of the batches of an event; none if it says nothing about grip here and
+    now.
 
     Args:
         denm: received.
@@ -47,28 +49,49 @@ def encode_reports(
     if not _is_grip_report(denm, now):
         return []
     mu, lower, upper = GRIP.get(denm.sub_cause, UNKNOWN)
-    by_region: dict[int, list[tuple[float, float]]] = {}
+    rows_of: dict[int, list[tuple[float, float, float]]] = {}
     for point in _event_places(denm):
-        by_region.setdefault(int(grid.region_of(int(grid.cell_of(*point)))), []).append(point)
+        rows = rows_of.setdefault(int(grid.region_of(int(grid.cell_of(*point)))), [])
+        rows += [(*point, heading) for heading in _headings(denm)]
     out: list[tuple[str, bytes]] = []
-    for seq, (region, points) in enumerate(by_region.items(), first_seq):
-        rows = len(points)
+    for seq, (region, rows) in enumerate(rows_of.items(), first_seq):
+        count = len(rows)
         batch: dict[str, Any] = {
             "vehicle": name,
             "boot": str(boot),
             "seq": str(seq),
-            "enter_time": [str(min(denm.referenced, now))] * rows,
-            "latitude": [point[0] for point in points],
-            "longitude": [point[1] for point in points],
-            "yaw": [math.radians(90.0 - (denm.heading or 0.0))] * rows,
-            "position_std": [denm.position_std if denm.position_std > 0.0 else POSITION_STD] * rows,
-            "mu": [mu] * rows,
-            "mu_lower": [lower] * rows,
-            "mu_upper": [upper] * rows,
-            "mu_utilised": [USED * mu] * rows,
+            # The numbers of one start are shared by all regions, and nothing is sent again.
+            "first_held": str(seq),
+            "enter_time": [str(min(denm.referenced, now))] * count,
+            "latitude": [row[0] for row in rows],
+            "longitude": [row[1] for row in rows],
+            "yaw": [math.radians(90.0 - row[2]) for row in rows],
+            "position_std": [denm.position_std if denm.position_std > 0.0 else POSITION_STD]
+            * count,
+            "mu": [mu] * count,
+            "mu_lower": [lower] * count,
+            "mu_upper": [upper] * count,
+            "mu_utilised": [USED * mu] * count,
         }
         out.append((keys.observation_key(region, name), json.dumps(batch).encode()))
     return out
+
+
+def _headings(denm: Denm) -> tuple[float, ...]:
+    """Return the headings [deg from north] of the traffic concerned.
+
+    Without a heading both directions of the road are concerned. The first other point of a trace or
+    of the history gives the road's axis; where there is none, all four sectors are meant.
+    """
+    if denm.heading is not None:
+        return (denm.heading, denm.heading + 180.0) if denm.both_ways else (denm.heading,)
+    for point in (*(point for trace in denm.traces for point in trace), *denm.history):
+        north = denm.position[0] - point[0]
+        east = (denm.position[1] - point[1]) * math.cos(math.radians(denm.position[0]))
+        if north or east:
+            axis = math.degrees(math.atan2(east, north))
+            return axis, axis + 180.0
+    return QUARTERS
 
 
 def _is_grip_report(denm: Denm, now: int) -> bool:

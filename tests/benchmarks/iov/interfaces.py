@@ -21,9 +21,10 @@ from edge_agent.app.estimates_file import write_table
 from edge_agent.app.kuksa_provider import CONDITION, FRICTION, KuksaProvider, surface_condition
 from edge_agent.publish.vss import road_friction
 from fleet_service.app.engine import Engine
-from fleet_service.client.cits.denm import ICE, Denm
+from fleet_service.client.cits.denm import ICE, Denm, decode_denm, encode_denm
 from fleet_service.client.cits.foreign import encode_reports
 from fleet_service.ingest.inbox import Message
+from schemas import grid, keys
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.tables import ESTIMATES_SCHEMA
@@ -33,37 +34,96 @@ from tests.benchmarks.iov.routes import unpack_wheel
 from tests.waiting import until
 
 START: Final = 1_700_000_000 * NS
+# friction as own vehicles report it: one that slid on ice, one that braked on a dry road, and one
+# that used little grip
+SLID: Final = {"mu": 0.2, "mu_lower": 0.12, "mu_upper": 0.28, "mu_utilised": 0.19}
+DRY: Final = {"mu": 0.8, "mu_lower": 0.7, "mu_upper": 0.9, "mu_utilised": 0.7}
+PASSED: Final = {"mu": 0.5, "mu_lower": 0.1, "mu_upper": 1.1, "mu_utilised": 0.1}
 KUKSA: Final = (
     "0.6.0"  # version of kuksa-client, whose generated modules are the published protocol
 )
 
 
 def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
-    """Report false ice at many places, again and again, by one foreign publisher."""
+    """Report ice by one foreign publisher: alone, where own vehicles find grip, and where one finds
+    ice.
+
+    The last run is the control: a witness that nobody ever believes raises no false alert either.
+    """
     draw = np.random.default_rng(4204)
     places = draw.normal((57.7, 11.97), 0.02, (20 if quick else 200, 2)).tolist()
-    turns = 10
-    alerts = 0
+    alone, taken = _alerted(places, foreign=True)
+    contradicted, _ = _alerted(places, DRY, DRY, foreign=True)
+    own, _ = _alerted(places, PASSED, PASSED, SLID)
+    confirmed, _ = _alerted(places, PASSED, PASSED, SLID, foreign=True)
+    return [
+        Figure(
+            "denm.foreign_false_alerts",
+            float(alone + contradicted),
+            "alerts by foreign DENM alone, or where two own vehicles find grip",
+            0.0,
+        ),
+        Figure("denm.foreign_reports", float(taken), "foreign reports taken", 100.0, "more"),
+        Figure("denm.own_witness_alerts", float(own), "alerts by one own vehicle alone", 0.0),
+        Figure(
+            "denm.foreign_confirmed",
+            confirmed / len(places),
+            "of the places where one own vehicle finds ice too, under alert",
+            0.95,
+            "more",
+        ),
+    ]
+
+
+def _alerted(
+    places: list[tuple[float, float]], *own: dict[str, float], foreign: bool = False
+) -> tuple[int, int]:
+    """Return the number of places under alert, and of reports taken.
+
+    Args:
+        places: latitude and longitude [deg].
+        own: friction that each own vehicle finds at all of them.
+        foreign: a publisher warns of ice at all of them.
+    """
+    under_alert = set[int]()
+    cells = [int(grid.cell_of(*place)) for place in places]
     with TemporaryDirectory() as folder:
-        engine = Engine(ServiceConfig(), Path(folder) / "archive")
+        engine = Engine(ServiceConfig(publishers=["cits-se"]), Path(folder) / "archive")
         try:
-            for turn in range(turns):
+            for turn in range(10):
                 now = START + 30 * turn * NS
                 for k, (latitude, longitude) in enumerate(places):
-                    denm = Denm(99, k, 99, START, now, None, (latitude, longitude), 5.0, 3600)
-                    said = replace(denm, sub_cause=ICE, heading=0.0)
-                    batches = encode_reports(said, "cits-se", 5, 1 + k + len(places) * turn, now)
+                    seq = 1 + k + len(places) * turn
+                    batches = [
+                        _own_report(f"car-{k}-{n}", 1 + turn, now, (latitude, longitude), friction)
+                        for n, friction in enumerate(own)
+                    ]
+                    if foreign:
+                        denm = Denm(99, k, 99, START, now, None, (latitude, longitude), 2.0, 3600)
+                        said = decode_denm(encode_denm(replace(denm, sub_cause=ICE, heading=0.0)))
+                        batches += encode_reports(said, "cits-se", 5, seq, now)
                     engine.intake.ingest(
                         [Message(Kind.OBSERVATION, key, body, JSON) for key, body in batches], now
                     )
-                alerts = max(alerts, len(engine.alerts.all))
+                under_alert |= {alert.cell for alert in engine.alerts.all}
             taken = engine.counts[Kind.OBSERVATION]
         finally:
             engine.close()
-    return [
-        Figure("denm.foreign_false_alerts", float(alerts), "alerts by foreign DENM alone", 0.0),
-        Figure("denm.foreign_reports", float(taken), "foreign reports taken", 100.0, "more"),
-    ]
+    assert len(set(cells)) > 0.9 * len(cells)
+    return sum(cell in under_alert for cell in cells), taken
+
+
+def _own_report(
+    name: str, seq: int, now: int, place: tuple[float, float], friction: dict[str, float]
+) -> tuple[str, bytes]:
+    """Return key and JSON of six visits on the way north."""
+    visits = 6
+    region = int(grid.region_of(int(grid.cell_of(*place))))
+    values = {"latitude": place[0], "longitude": place[1], "yaw": np.pi / 2, **friction}
+    columns: dict[str, Any] = {column: [value] * visits for column, value in values.items()}
+    columns["enter_time"] = [str(now - k * NS) for k in reversed(range(visits))]
+    batch = {"vehicle": name, "boot": "5", "seq": str(seq), "first_held": str(seq), **columns}
+    return keys.observation_key(region, name), json.dumps(batch).encode()
 
 
 def measure_kuksa(folder: Path, quick: bool) -> list[Figure]:

@@ -116,6 +116,7 @@ def any_denm(draw: strategies.DrawFn) -> Denm:
         history=points(),
         traces=tuple(points() for _ in range(draw(strategies.integers(0, 8)))),
         heading=draw(strategies.none() | strategies.floats(-360.0, 720.0)),
+        both_ways=draw(strategies.booleans()),
     )
 
 
@@ -142,11 +143,13 @@ def test_an_encoded_denm_is_read_as_it_was(sent: Denm) -> None:
         assert getattr(read, name) == getattr(sent, name), name
     assert read.detected == sent.detected // 10**6 * 10**6
     assert read.position == pytest.approx(sent.position, abs=6e-8)
+    assert read.position_std == pytest.approx(min(sent.position_std, 16.73), abs=5e-3)
     if sent.termination is not None:
         return
     for name in ("quality", "cause", "sub_cause"):
         assert getattr(read, name) == getattr(sent, name), name
     assert (read.heading is None) == (sent.heading is None)
+    assert read.both_ways == (sent.both_ways and sent.heading is not None)
     if read.heading is not None and sent.heading is not None:
         assert math.cos(math.radians(read.heading - sent.heading)) > 0.999
     for got, given_points, most in (
@@ -353,15 +356,67 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
         engine.close()
 
 
-def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
+def _yaws(denm: Denm) -> list[float]:
+    """Return the yaws of its reports [deg], each once."""
+    batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 1, START)]
+    return sorted({round(math.degrees(yaw)) % 360 for batch in batches for yaw in batch["yaw"]})
+
+
+def test_a_foreign_denm_without_a_heading_means_both_directions() -> None:
     denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE)
+    south = (PLACE[0] - 1e-3, PLACE[1])
+    east = (PLACE[0], PLACE[1] + 1e-3)
+    assert _yaws(denm) == [0, 90, 180, 270], "an unknown axis"
+    assert _yaws(replace(denm, traces=((), (south,)))) == [90, 270]
+    assert _yaws(replace(denm, history=(east, south))) == [0, 180]
+    assert _yaws(replace(denm, traces=((south,),), heading=90.0)) == [0], "one direction"
+    assert _yaws(replace(denm, heading=90.0, both_ways=True)) == [0, 180]
+
+
+@pytest.mark.parametrize(
+    ("direction", "heading", "both_ways"),
+    [
+        ("allTrafficDirections", 30.0, True),
+        (None, 30.0, True),
+        ("upstreamTraffic", 30.0, False),
+        ("downstreamTraffic", 30.0, False),
+        ("oppositeTraffic", 210.0, False),
+    ],
+)
+def test_traffic_direction_of_a_foreign_denm_is_read(
+    direction: str | None, heading: float, both_ways: bool
+) -> None:
+    denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE, heading=30.0)
+    oracle = DENM_PDU_Descriptions.DENM
+    oracle.from_uper(encode_denm(denm))
+    content = oracle.get_val()
+    del content["denm"]["management"]["relevanceTrafficDirection"]
+    if direction is not None:
+        content["denm"]["management"]["relevanceTrafficDirection"] = direction
+    oracle.set_val(content)
+    read = decode_denm(oracle.to_uper())
+    assert (read.heading, read.both_ways) == (heading, both_ways)
+
+
+def test_batches_of_an_event_are_numbered_and_short() -> None:
+    history = tuple((PLACE[0], PLACE[1] + 3e-4 * k) for k in range(1, 23))
+    denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE, history=history)
+    batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 7, START)]
+    assert sum(len(batch["mu"]) for batch in batches) == 2 * 23
+    assert max(len(batch["mu"]) for batch in batches) <= 50
+    assert [batch["seq"] for batch in batches] == [str(7 + k) for k in range(len(batches))]
+    assert all(batch["first_held"] == batch["seq"] for batch in batches)
+
+
+def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
+    denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE, heading=0.0)
     said = json.loads(encode_reports(denm, "cits-se", 5, 1, START)[0][1])
-    assert said["mu"] == [0.2]
+    assert said["mu"] == [0.12]
     for other in (
         replace(denm, termination="isCancellation"),
         replace(denm, cause=1),
         replace(denm, sub_cause=SALTED),
-        replace(denm, position_std=40.9),
+        replace(denm, position_std=16.7),
     ):
         assert encode_reports(other, "cits-se", 5, 1, START) == []
     assert encode_reports(denm, "cits-se", 5, 1, START + 601 * NS) == []
