@@ -23,7 +23,7 @@ PHONE: Final = {"width": 390, "height": 844}
 DESK: Final = {"width": 1280, "height": 900}
 
 
-def executable() -> str | None:
+def find_chromium() -> str | None:
     """Where Chromium lies."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
@@ -42,25 +42,25 @@ class Opened:
         page.on("request", lambda request: self.requests.append(request.url))
 
     @property
-    def drawn(self) -> int:
+    def drawn_count(self) -> int:
         """Return the number of shapes that the page reports as painted."""
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
-    def colours(self, panel: int = 0) -> dict[str, int]:
+    def count_colours(self, panel: int = 0) -> dict[str, int]:
         """Opaque colours of a canvas and how many of its points have them."""
         found: dict[str, int] = self.page.evaluate(_COLOURS, panel)
         return found
 
 
 @contextmanager
-def opened(
+def open_page(
     path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False
 ) -> Iterator[Opened]:
     """A file of this machine, or an address, in the browser; skips the test where there is none.
 
     `unbound`: as many pictures a second as it can paint, not as many as a screen shows.
     """
-    program = executable()
+    program = find_chromium()
     if program is None:
         pytest.skip("no Chromium on this machine: apt install chromium")
     api: Any = pytest.importorskip(

@@ -48,7 +48,7 @@ class BucketServer:
         words = ["-m", "localbucket", str(self._folder), "--port", str(self._port)]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen([sys.executable, *words], stdout=quiet, stderr=quiet)
-        until(self._answers)
+        until(self._is_up)
 
     def stop(self) -> None:
         """Be gone: connections are refused."""
@@ -57,7 +57,7 @@ class BucketServer:
             self._process.wait()
             self._process = None
 
-    def away(self, how: str) -> None:
+    def take_away(self, how: str) -> None:
         """Be "stopped", or "frozen": take connections and answer nothing."""
         if how == "stopped":
             self.stop()
@@ -65,15 +65,15 @@ class BucketServer:
             assert self._process is not None
             self._process.send_signal(signal.SIGSTOP)
 
-    def back(self, how: str) -> None:
-        """Go on after `away`."""
+    def bring_back(self, how: str) -> None:
+        """Go on after `take_away`."""
         if how == "stopped":
             self.start()
         else:
             assert self._process is not None
             self._process.send_signal(signal.SIGCONT)
 
-    def objects(self) -> dict[str, bytes]:
+    def read_objects(self) -> dict[str, bytes]:
         """All that is there."""
         base = self._folder / BUCKET / PREFIX
         found = [
@@ -81,11 +81,11 @@ class BucketServer:
         ]
         return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
 
-    def place(self, name: str) -> Path:
+    def path_of(self, name: str) -> Path:
         """Where an object lies."""
         return self._folder / BUCKET / PREFIX / name
 
-    def _answers(self) -> bool:
+    def _is_up(self) -> bool:
         try:
             socket.create_connection(("127.0.0.1", self._port), 1.0).close()
         except OSError:
@@ -104,7 +104,7 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
         made.stop()
 
 
-def held(root: Path) -> dict[str, bytes]:
+def list_copied_files(root: Path) -> dict[str, bytes]:
     """Return the files of an archive that must be in its copy."""
     from fleet_service.replication.replica import FOLDERS
 

@@ -22,7 +22,7 @@ from tests.test_end_to_end import VEHICLES, System
 Cells: TypeAlias = list[dict[str, object]]
 
 
-def commands() -> list[str]:
+def read_commands() -> list[str]:
     """Return the commands of the tutorial's first drive."""
     text = (ROOT / "deploy" / "docs" / "tutorials" / "first-drive.md").read_text(encoding="utf-8")
     block = re.search(r"## A real minute\n.*?```\n(.*?)```", text, re.DOTALL)
@@ -30,19 +30,19 @@ def commands() -> list[str]:
     return block[1].strip().splitlines()
 
 
-def mapped(folder: Path) -> tuple[Cells, list[str]]:
+def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
     """The map's cells and the keys of alerts once the minute was published under all names, by a
     router and a service of its own."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
         system = System(folder, endpoints[0])
         try:
-            return _published(system, folder / "drive.parquet")
+            return _publish_drive(system, folder / "drive.parquet")
         finally:
             system.stop()
 
 
-def _published(system: System, log: Path) -> tuple[Cells, list[str]]:
+def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
     """The minute imported, checked, replayed and published under each name."""
     car = ["--vehicle", str(VEHICLE)]
     out = str(log.with_suffix(".csv"))
@@ -86,6 +86,6 @@ def _published(system: System, log: Path) -> tuple[Cells, list[str]]:
             f"error: publish: {refused} records were refused; it is older than a month: --start now"
             in warned.getvalue()
         )
-        cells = system.ask()
+        cells = system.query_cells()
         held.undeclare()
     return cells, alerts

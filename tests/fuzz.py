@@ -79,11 +79,11 @@ class Result(NamedTuple):
     hangs: int
 
 
-def _text(parse: Callable[[str], object]) -> Callable[[bytes], object]:
+def _decode_first(parse: Callable[[str], object]) -> Callable[[bytes], object]:
     return lambda data: parse(data.decode("utf-8", "replace"))
 
 
-def _query(data: bytes) -> object:
+def _parse_query(data: bytes) -> object:
     pairs = (part.partition("=") for part in data.decode("utf-8", "replace").split(";"))
     return query.parse({name: value for name, _, value in pairs})
 
@@ -113,12 +113,12 @@ PARSERS: Final = {
     "alerts": Parser(wire.decode_alert),
     "standing": Parser(wire.decode_standing),
     "tiles": Parser(decode_tile),
-    "queries": Parser(_query),
-    "keys": Parser(_text(keys.parse)),
-    "versions": Parser(_text(parse_version)),
-    "dbc": Parser(_text(parse_dbc)),
-    "nmea": Parser(_text(parse_nmea), GNSS_ERRORS),
-    "gpsd": Parser(_text(parse_gpsd), GNSS_ERRORS),
+    "queries": Parser(_parse_query),
+    "keys": Parser(_decode_first(keys.parse)),
+    "versions": Parser(_decode_first(parse_version)),
+    "dbc": Parser(_decode_first(parse_dbc)),
+    "nmea": Parser(_decode_first(parse_nmea), GNSS_ERRORS),
+    "gpsd": Parser(_decode_first(parse_gpsd), GNSS_ERRORS),
     "leases": Parser(lambda data: _parse_record("lease/0000000001.json", data)),
     "fences": Parser(
         lambda data: fence_of(cast(ObjectBucket, _OneFence(data))), (InputError, CopyError)
@@ -146,18 +146,18 @@ class Fuzzer:
         self._corpus: list[bytes] = []
         self._executions = self._crashes = self._hangs = 0
         for one in inputs or [b""]:
-            self._run(one, always=True)
+            self._run_input(one, always=True)
 
     def run(self, seconds: float = float("inf"), executions: float = float("inf")) -> Result:
         """Fuzz for a time or a number of executions."""
         end = time.monotonic() + seconds
         while self._executions < executions and time.monotonic() < end:
-            self._run(self._changed(self._random.choice(self._corpus)))
+            self._run_input(self._mutate_input(self._random.choice(self._corpus)))
         return Result(
             self._executions, len(self._corpus), len(self._lines), self._crashes, self._hangs
         )
 
-    def _run(self, data: bytes, *, always: bool = False) -> None:
+    def _run_input(self, data: bytes, *, always: bool = False) -> None:
         known = len(self._lines)
         began = time.process_time()
         self._executions += 1
@@ -194,7 +194,7 @@ class Fuzzer:
 
         return trace_line
 
-    def _changed(self, data: bytes) -> bytes:
+    def _mutate_input(self, data: bytes) -> bytes:
         r = self._random
         out = bytearray(data)
         for _ in range(r.choice((1, 1, 2, 4))):
@@ -221,15 +221,15 @@ def seeds_of(name: str) -> list[bytes]:
     return [path.read_bytes() for path in sorted((SEEDS / name).glob("*"))]
 
 
-def keeper(folder: Path) -> Callable[[str, bytes], None]:
+def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
     """Return a function that writes inputs to a folder, each once."""
 
-    def keep(kind: str, data: bytes) -> None:
+    def write_input(kind: str, data: bytes) -> None:
         path = folder / kind / hashlib.sha256(data).hexdigest()[:16]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 
-    return keep
+    return write_input
 
 
 def main() -> int:
@@ -247,7 +247,9 @@ def main() -> int:
     bad = 0
     for name in args.only or PARSERS:
         kept = [path.read_bytes() for path in sorted((args.out / name / "corpus").glob("*"))]
-        fuzzer = Fuzzer(PARSERS[name], [*seeds_of(name), *kept], args.seed, keeper(args.out / name))
+        fuzzer = Fuzzer(
+            PARSERS[name], [*seeds_of(name), *kept], args.seed, make_keeper(args.out / name)
+        )
         found = fuzzer.run(args.seconds)
         print(f"{name}: {found}", flush=True)
         bad += found.crashes + found.hangs

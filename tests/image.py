@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.runtime.progress_messages import COMPILING
-from tests.packaging import candidates
+from tests.packaging import list_candidates
 from tests.structure import ROOT
 from tests.waiting import until
 
@@ -43,7 +43,7 @@ OURS: Final = (
 START_S: Final = 60.0
 
 
-def steps(text: str) -> list[tuple[str, str]]:
+def parse_steps(text: str) -> list[tuple[str, str]]:
     """Instruction and its words, a line each, without remarks."""
     lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
     joined = re.sub(r"\\\n", " ", "\n".join(lines))
@@ -61,42 +61,42 @@ class Image:
         kept = {name: value for name, value in os.environ.items() if name.startswith(OURS)}
         self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
 
-    def here(self, text: str) -> str:
+    def localize_paths(self, text: str) -> str:
         """A text with the folders of the image below the root, and this user for its owner."""
         for place in PLACES:
             text = re.sub(rf"(?<![\w.]){re.escape(place)}\b", str(self.root) + place, text)
         return re.sub(r"chown (-R )?\d+:\d+", rf"chown \g<1>{os.getuid()}:{os.getgid()}", text)
 
-    def take(self, name: str, words: str) -> None:
+    def run_step(self, name: str, words: str) -> None:
         """Do one instruction."""
         if name == "FROM":
-            self._begin(words)
+            self._start_from(words)
         elif name == "WORKDIR":
-            self.folder = Path(self.here(words))
+            self.folder = Path(self.localize_paths(words))
             self.folder.mkdir(parents=True, exist_ok=True)
         elif name == "COPY":
             *sources, to = words.split()
             for source in sources:
-                self._copy(ROOT / source, self.folder / to)
+                self._copy_path(ROOT / source, self.folder / to)
         elif name == "ENV":
             key, _, value = words.partition("=")
-            self.environment[key] = self.here(value)
+            self.environment[key] = self.localize_paths(value)
         elif name == "USER":
             self.user = words
         elif name == "RUN":
-            self.run("bash", "-euc", self.here(words))
+            self.run_command("bash", "-euc", self.localize_paths(words))
         else:
             raise SystemExit(f"error: {name}: is no step that is known here")
 
-    def run(self, *words: str) -> None:
+    def run_command(self, *words: str) -> None:
         """Run a command of the image; an end that is not 0 ends this."""
         subprocess.run(words, cwd=self.folder, env=self.environment, check=True)
 
-    def _begin(self, base: str) -> None:
+    def _start_from(self, base: str) -> None:
         version = re.fullmatch(r"python:(\d+\.\d+)-slim", base)
         assert version, base
         asked = "import sys; print('%d.%d' % sys.version_info[:2])"
-        for command in candidates(version[1]):
+        for command in list_candidates(version[1]):
             done = subprocess.run(
                 [command, "-c", asked], capture_output=True, text=True, check=False
             )
@@ -107,14 +107,14 @@ class Image:
         raise SystemExit(f"error: Python {version[1]}: is not on this machine")
 
     @staticmethod
-    def _copy(source: Path, to: Path) -> None:
+    def _copy_path(source: Path, to: Path) -> None:
         if source.is_dir():
             shutil.copytree(source, to, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(source, to / source.name if to.is_dir() else to)
 
 
-def starts(image: Image) -> float:
+def time_start(image: Image) -> float:
     """Seconds until a service of the image is ready at a router of it; nothing may be compiled."""
     port = "127.0.0.1:0"
     with subprocess.Popen(
@@ -157,9 +157,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         image = Image(Path(folder))
         (image.root / "home").mkdir()
-        for name, words in steps(DOCKERFILE.read_text()):
+        for name, words in parse_steps(DOCKERFILE.read_text()):
             began = time.monotonic()
-            image.take(name, words)
+            image.run_step(name, words)
             print(
                 f"{time.monotonic() - began:6.1f} s  {name} {shlex.quote(words)[:100]}", flush=True
             )
@@ -167,7 +167,7 @@ def main() -> int:
         assert user.isdecimal(), "Kubernetes must see that it is not root"
         assert int(user) > 0 < int(group)
         print(
-            f"a service of the image is ready after {starts(image):.1f} s, with kernels that the "
+            f"a service of the image is ready after {time_start(image):.1f} s, with kernels that the "
             "build has compiled"
         )
     return 0

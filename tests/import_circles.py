@@ -11,7 +11,7 @@ def circles_of(modules: Mapping[Path, ast.Module]) -> list[str]:
     """Return the circles among modules, given by path below the root; imports inside functions
     count.
     """
-    names = {_dotted(path): tree for path, tree in modules.items()}
+    names = {_module_name(path): tree for path, tree in modules.items()}
     graph: dict[str, set[str]] = {name: set() for name in names}
     for name, tree in names.items():
         for node in _run_time_nodes(tree):
@@ -22,10 +22,10 @@ def circles_of(modules: Mapping[Path, ast.Module]) -> list[str]:
                 full = [f"{node.module}.{alias.name}" for alias in node.names]
                 targets = [target if target in names else node.module for target in full]
             graph[name].update(target for target in targets if target in names and target != name)
-    return [" <-> ".join(sorted(circle)) for circle in _components(graph) if len(circle) > 1]
+    return [" <-> ".join(sorted(circle)) for circle in _find_components(graph) if len(circle) > 1]
 
 
-def _dotted(path: Path) -> str:
+def _module_name(path: Path) -> str:
     parts = path.with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -43,7 +43,7 @@ def _run_time_nodes(tree: ast.Module) -> list[ast.AST]:
     return found
 
 
-def _components(graph: dict[str, set[str]]) -> list[set[str]]:
+def _find_components(graph: dict[str, set[str]]) -> list[set[str]]:
     """Return the strongly connected components of a graph (Kosaraju)."""
     order: list[str] = []
     seen: set[str] = set()

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tests.results import pages
-from tests.structure import ROOT, parse, sources
+from tests.results import list_pages
+from tests.structure import ROOT, list_sources, parse
 
 PACKAGES: Final = ("schemas", "edge_agent", "fleet_service", "deploy", "tests")
 CEILINGS: Final = ROOT / "tests" / "language_ceilings.json"
@@ -99,7 +99,7 @@ class Named(NamedTuple):
 
 def docstrings(package: str) -> Iterator[Docstring]:
     """Yield the docstrings of a package."""
-    for path in sources(ROOT, package):
+    for path in list_sources(ROOT, package):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
@@ -112,7 +112,7 @@ def functions(package: str) -> Iterator[Named]:
     """Yield the functions and methods of a package, tests and properties included, dunder
     methods not.
     """
-    for path in sources(ROOT, package):
+    for path in list_sources(ROOT, package):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not DUNDER.fullmatch(
                 node.name
@@ -137,7 +137,7 @@ def stop_words(text: str) -> list[str]:
     return [found[0] for found in STOP.finditer(text)]
 
 
-def measure(package: str) -> dict[str, float]:
+def measure_package(package: str) -> dict[str, float]:
     """Return the figures of a package; less is better for each.
 
     Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in
@@ -152,25 +152,25 @@ def measure(package: str) -> dict[str, float]:
     return {
         "openings": float(sum(bool(OPENING.match(text)) for text in texts)),
         "stop_words": float(sum(len(stop_words(text)) for text in texts)),
-        "free_relatives": rounded(
+        "free_relatives": round_up(
             1e3 * sum(len(free_relatives(text)) for text in texts) / max(words, 1)
         ),
-        "participles": rounded(100 * sum(map(is_participle, others)) / max(len(others), 1)),
-        "one_word": rounded(
+        "participles": round_up(100 * sum(map(is_participle, others)) / max(len(others), 1)),
+        "one_word": round_up(
             100 * sum("_" not in name.strip("_") for name in others) / max(len(others), 1)
         ),
-        "long_test_names": rounded(
+        "long_test_names": round_up(
             100 * sum(len(name) > LONGEST_TEST_NAME for name in tests) / max(len(tests), 1)
         ),
     }
 
 
-def rounded(value: float) -> float:
+def round_up(value: float) -> float:
     """Return a value rounded up to a tenth, so that a ceiling never lies below its measurement."""
     return -(-int(value * 1000) // 100) / 10
 
 
-def prose(text: str) -> str:
+def extract_prose(text: str) -> str:
     """Return the prose of a Markdown page: without code, tables, generated parts, headings,
     links and markers.
     """
@@ -186,9 +186,9 @@ def prose(text: str) -> str:
     return re.sub(r"`[^`]*`", "Code", text)
 
 
-def sentences(text: str) -> list[str]:
+def split_sentences(text: str) -> list[str]:
     """Return the sentences of a page's prose; a list item or paragraph ends a sentence."""
-    items = re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", prose(text), flags=re.MULTILINE)
+    items = re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", extract_prose(text), flags=re.MULTILINE)
     blocks = re.split(r"\n\s*\n", items)
     found = []
     for block in blocks:
@@ -198,7 +198,7 @@ def sentences(text: str) -> list[str]:
 
 def long_sentences(page: Path) -> list[str]:
     """Return the sentences of a page with more than LONGEST_SENTENCE words."""
-    found = sentences(page.read_text(encoding="utf-8"))
+    found = split_sentences(page.read_text(encoding="utf-8"))
     return [one for one in found if len(re.findall(r"\w[\w'’./-]*", one)) > LONGEST_SENTENCE]
 
 
@@ -214,14 +214,14 @@ def markdown_words() -> int:
     """Return the words of all pages that people wrote: tokens with a letter or digit, the
     results page not counted.
     """
-    written = [page for page in pages() if page.name not in NOT_OURS]
+    written = [page for page in list_pages() if page.name not in NOT_OURS]
     return sum(len(re.findall(r"\S*\w\S*", page.read_text(encoding="utf-8"))) for page in written)
 
 
 def measure_pages() -> dict[str, dict[str, float]]:
     """Return the figures of each page that has a fault, and the words of all pages."""
     found: dict[str, dict[str, float]] = {"*": {"words": float(markdown_words())}}
-    for page in pages():
+    for page in list_pages():
         if page.name in NOT_OURS:
             continue
         figures = {
@@ -233,7 +233,7 @@ def measure_pages() -> dict[str, dict[str, float]]:
     return found
 
 
-def ceilings() -> dict[str, dict[str, dict[str, float]]]:
+def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
     """Return the ceilings: `packages` and `pages`, then package or page, then figure."""
     found: dict[str, dict[str, dict[str, float]]] = json.loads(CEILINGS.read_text(encoding="utf-8"))
     return found
@@ -242,10 +242,10 @@ def ceilings() -> dict[str, dict[str, dict[str, float]]]:
 def lower_ceilings() -> None:
     """Lower each ceiling to the figure of today where that is less; add those that are missing."""
     today = {
-        "packages": {package: measure(package) for package in PACKAGES},
+        "packages": {package: measure_package(package) for package in PACKAGES},
         "pages": measure_pages(),
     }
-    before = ceilings() if CEILINGS.exists() else today
+    before = read_ceilings() if CEILINGS.exists() else today
     lowered: dict[str, dict[str, dict[str, float]]] = {"packages": {}, "pages": {}}
     for package, figures in today["packages"].items():
         old = before["packages"].get(package, figures)
@@ -281,7 +281,7 @@ def print_faults(rule: str) -> None:
             ):
                 print(f"{place}: {name}")
     if rule == "pages":
-        for page in pages():
+        for page in list_pages():
             for fault in (*long_sentences(page), *page_stop_words(page)):
                 print(f"{page.relative_to(ROOT)}: {fault}")
 
@@ -293,7 +293,7 @@ def main() -> None:
         return
     lower_ceilings()
     for package in PACKAGES:
-        print(package, measure(package))
+        print(package, measure_package(package))
     print(measure_pages())
 
 

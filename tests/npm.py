@@ -53,7 +53,7 @@ def file_of(name: str, path: str) -> Path | None:
     return found
 
 
-def fetch(name: str) -> None:
+def fetch_package(name: str) -> None:
     """Fetch the files of a package unless they are there.
 
     Raises:
@@ -86,7 +86,7 @@ def main(names: list[str]) -> int:
     """Fetch the named packages; print those that cannot be fetched, whose tests are skipped."""
     for name in names:
         try:
-            fetch(name)
+            fetch_package(name)
         except (OSError, subprocess.CalledProcessError) as error:
             print(f"{name} was not fetched ({error}); what wants it is skipped", file=sys.stderr)
     return 0

@@ -38,12 +38,12 @@ VERSIONS = ("3.11", "3.12", "3.13")
 WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 
 
-def interpreters() -> list[str]:
+def find_interpreters() -> list[str]:
     """Commands of the VERSIONS that work here; says which are left out, and why."""
     found = []
     for version in VERSIONS:
         why = "no such command on this machine"
-        for here in candidates(version):
+        for here in list_candidates(version):
             said = subprocess.run(
                 [here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60
             )
@@ -57,7 +57,7 @@ def interpreters() -> list[str]:
     return found
 
 
-def candidates(version: str) -> list[str]:
+def list_candidates(version: str) -> list[str]:
     """Where a Python of a version may be: this one, the command of that name, and what pyenv has
     installed.
     """
@@ -80,22 +80,22 @@ def main() -> int:
         nargs="*",
         help=f"interpreters (default: {', '.join(VERSIONS)} where there are such)",
     )
-    pythons = parser.parse_args().python or interpreters()
+    pythons = parser.parse_args().python or find_interpreters()
     if not pythons:
         raise SystemExit(f"none of {', '.join(VERSIONS)} works here")
     with tempfile.TemporaryDirectory() as folder:
         built = Path(folder) / "dist"
-        run([sys.executable, "-m", "build", "--outdir", built, ROOT], ROOT)
+        run_command([sys.executable, "-m", "build", "--outdir", built, ROOT], ROOT)
         (wheel,) = built.glob("*.whl")
         for number, python in enumerate(pythons):
-            use(python, wheel, Path(folder) / f"use{number}")
+            install_and_use(python, wheel, Path(folder) / f"use{number}")
     return 0
 
 
-def use(python: str, wheel: Path, folder: Path) -> None:
+def install_and_use(python: str, wheel: Path, folder: Path) -> None:
     """Install the wheel for an interpreter and do the first steps of a new user in an empty folder."""
     folder.mkdir()
-    run([python, "-m", "venv", folder / "venv"], folder)
+    run_command([python, "-m", "venv", folder / "venv"], folder)
     scripts = folder / "venv" / "bin"
     install: list[str | Path] = [
         "install",
@@ -105,11 +105,11 @@ def use(python: str, wheel: Path, folder: Path) -> None:
         ROOT / "constraints.txt",
         wheel,
     ]
-    run([scripts / "python", "-m", "pip", *install], folder)
-    run([scripts / "python", "-c", FIRST_USE], folder)
+    run_command([scripts / "python", "-m", "pip", *install], folder)
+    run_command([scripts / "python", "-c", FIRST_USE], folder)
     log: list[str | Path] = ["--out", "drive.parquet", "--vehicle-out", "car.json"]
-    run([scripts / "edge-agent", "simulate", "slalom", "--mu", ".6", *log], folder)
-    run(
+    run_command([scripts / "edge-agent", "simulate", "slalom", "--mu", ".6", *log], folder)
+    run_command(
         [
             scripts / "edge-agent",
             "replay",
@@ -121,7 +121,7 @@ def use(python: str, wheel: Path, folder: Path) -> None:
         ],
         folder,
     )
-    run([scripts / "fleet-service", "--help"], folder)
+    run_command([scripts / "fleet-service", "--help"], folder)
     for name, imports in HIDING.items():
         own = folder / f"own-{name}" / name
         own.mkdir(parents=True)
@@ -145,7 +145,7 @@ def use(python: str, wheel: Path, folder: Path) -> None:
                 )
 
 
-def run(command: list[str | Path], folder: Path) -> None:
+def run_command(command: list[str | Path], folder: Path) -> None:
     """Run a command in a folder, with the seconds it took; SystemExit with its output where it
     fails.
     """

@@ -73,7 +73,9 @@ def command_page(program: str) -> str:
                 if action.choices and not action.metavar
                 else ""
             )
-            parts.append(f"| `{_cell(_action_name(action))}` | {_cell(about + choices)} |\n")
+            parts.append(
+                f"| `{_escape_cell(_action_name(action))}` | {_escape_cell(about + choices)} |\n"
+            )
     return "".join(parts)
 
 
@@ -118,7 +120,7 @@ def settings_page() -> str:
     for program, model in SETTINGS.items():
         parts.append(f"\n## `{program}`\n\n| setting | default | |\n|---|---|---|\n")
         parts += [
-            f"| `{name}` | `{_cell(default)}` | {_cell(about)} |\n"
+            f"| `{name}` | `{_escape_cell(default)}` | {_escape_cell(about)} |\n"
             for name, default, about in settings_rows(model)
         ]
     return "".join(parts)
@@ -130,7 +132,8 @@ def tables_page() -> str:
     for title, fields in TABLES.items():
         parts.append(f"\n## {title}\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
         parts += [
-            f"| `{f.name}` | {f.type} | {_cell(f.unit)} | {_cell(f.meaning)} |\n" for f in fields
+            f"| `{f.name}` | {f.type} | {_escape_cell(f.unit)} | {_escape_cell(f.meaning)} |\n"
+            for f in fields
         ]
     return "".join(parts)
 
@@ -186,15 +189,17 @@ def metrics_page(found: Shown) -> str:
     for half, metrics in found.items():
         for metric in metrics:
             kind = metric.kind + (metric.label and f", by {metric.label}")
-            parts.append(f"| `{stored_name(metric)}` | {half} | {kind} | {_cell(metric.help)} |\n")
+            parts.append(
+                f"| `{stored_name(metric)}` | {half} | {kind} | {_escape_cell(metric.help)} |\n"
+            )
     return "".join(parts)
 
 
-def _cell(text: str) -> str:
+def _escape_cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-def write(folder: Path) -> None:
+def write_pages(folder: Path) -> None:
     """Write all pages into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = {f"cli-{program}": command_page(program) for program in COMMAND_LINES}
@@ -210,4 +215,4 @@ def write(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    write_pages(Path(sys.argv[1]))

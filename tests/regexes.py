@@ -19,7 +19,7 @@ from re import _constants as sre  # type: ignore[attr-defined]
 from re import _parser as parser  # type: ignore[attr-defined]
 from typing import Any, Final, NamedTuple
 
-from tests.structure import ROOT, parse, sources
+from tests.structure import ROOT, list_sources, parse
 
 CALLS: Final = {
     "compile",
@@ -57,12 +57,12 @@ class Found(NamedTuple):
 
 def is_superlinear(pattern: str) -> bool:
     """Return True if matching may take more than linear time."""
-    return any(_is_ambiguous(sequence) for sequence in _sequences(parser.parse(pattern)))
+    return any(_is_ambiguous(sequence) for sequence in _find_sequences(parser.parse(pattern)))
 
 
 def _is_ambiguous(sequence: list[Any]) -> bool:
     """Return True if an unbounded repeat meets another one of the same characters, or holds one."""
-    parts = [_part(item) for item in sequence]
+    parts = [_describe_part(item) for item in sequence]
     for k, part in enumerate(parts):
         if not part.is_unbounded:
             continue
@@ -88,7 +88,7 @@ def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
     """Return True if a repeated group ends with a repeat of characters with which it can begin
     again.
     """
-    parts = [_part(one) for one in _opened(item[1][2])]
+    parts = [_describe_part(one) for one in _open_groups(item[1][2])]
     if not any(part.is_unbounded for part in parts):
         return False
     first: Characters = frozenset()
@@ -104,22 +104,22 @@ def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
     return False
 
 
-def _sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
+def _find_sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
     """Yield every sequence of a pattern, with groups without a repeat opened."""
-    yield _opened(parsed)
+    yield _open_groups(parsed)
     for name, value in parsed:
-        for inner in _inner(name, value):
-            yield from _sequences(inner)
+        for inner in _inner_patterns(name, value):
+            yield from _find_sequences(inner)
 
 
-def _opened(parsed: Any) -> list[Any]:  # noqa: ANN401
+def _open_groups(parsed: Any) -> list[Any]:  # noqa: ANN401
     out: list[Any] = []
     for name, value in parsed:
-        out += _opened(value[-1]) if name is sre.SUBPATTERN else [(name, value)]
+        out += _open_groups(value[-1]) if name is sre.SUBPATTERN else [(name, value)]
     return out
 
 
-def _inner(name: Any, value: Any) -> list[Any]:  # noqa: ANN401
+def _inner_patterns(name: Any, value: Any) -> list[Any]:  # noqa: ANN401
     if name is sre.SUBPATTERN:
         return [value[-1]]
     if name in (sre.MAX_REPEAT, sre.MIN_REPEAT):
@@ -129,17 +129,17 @@ def _inner(name: Any, value: Any) -> list[Any]:  # noqa: ANN401
     return [value[1]] if name in (sre.ASSERT, sre.ASSERT_NOT) else []
 
 
-def _part(item: Any) -> Part:  # noqa: ANN401
+def _describe_part(item: Any) -> Part:  # noqa: ANN401
     name, value = item
     if name in (sre.MAX_REPEAT, sre.MIN_REPEAT):
         least, most, inner = value
-        return Part(_characters(inner), least == 0, most is sre.MAXREPEAT or most > MANY)
+        return Part(_match_characters(inner), least == 0, most is sre.MAXREPEAT or most > MANY)
     if name in (sre.AT, sre.ASSERT, sre.ASSERT_NOT):
         return Part(frozenset(), True, False)
-    return Part(_characters([item]), False, False)
+    return Part(_match_characters([item]), False, False)
 
 
-def _characters(items: Any) -> Characters:  # noqa: ANN401
+def _match_characters(items: Any) -> Characters:  # noqa: ANN401
     """Return the ASCII characters that items can match anywhere."""
     out: Characters = frozenset()
     for name, value in items:
@@ -150,14 +150,14 @@ def _characters(items: Any) -> Characters:  # noqa: ANN401
         elif name is sre.ANY:
             out |= CHARACTERS - {10}
         elif name is sre.IN:
-            out |= _set(value)
+            out |= _match_set(value)
         else:
-            for inner in _inner(name, value):
-                out |= _characters(inner)
+            for inner in _inner_patterns(name, value):
+                out |= _match_characters(inner)
     return out
 
 
-def _set(items: Any) -> Characters:  # noqa: ANN401
+def _match_set(items: Any) -> Characters:  # noqa: ANN401
     out: set[int] = set()
     negated = False
     for name, value in items:
@@ -172,21 +172,21 @@ def _set(items: Any) -> Characters:  # noqa: ANN401
     return CHARACTERS - out if negated else frozenset(out) & CHARACTERS
 
 
-def _matching(pattern: str) -> Characters:
+def _match_class(pattern: str) -> Characters:
     return frozenset(c for c in CHARACTERS if re.match(pattern, chr(c)))
 
 
 _CATEGORIES: Final = {
-    sre.CATEGORY_DIGIT: _matching(r"\d"),
-    sre.CATEGORY_NOT_DIGIT: _matching(r"\D"),
-    sre.CATEGORY_SPACE: _matching(r"\s"),
-    sre.CATEGORY_NOT_SPACE: _matching(r"\S"),
-    sre.CATEGORY_WORD: _matching(r"\w"),
-    sre.CATEGORY_NOT_WORD: _matching(r"\W"),
+    sre.CATEGORY_DIGIT: _match_class(r"\d"),
+    sre.CATEGORY_NOT_DIGIT: _match_class(r"\D"),
+    sre.CATEGORY_SPACE: _match_class(r"\s"),
+    sre.CATEGORY_NOT_SPACE: _match_class(r"\S"),
+    sre.CATEGORY_WORD: _match_class(r"\w"),
+    sre.CATEGORY_NOT_WORD: _match_class(r"\W"),
 }
 
 
-def patterns(path: Path) -> Iterator[tuple[int, str]]:
+def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line and text of the literal patterns in a file."""
     for node in ast.walk(parse(path)):
         if (
@@ -206,8 +206,8 @@ def find_all() -> list[Found]:
     return [
         Found(f"{path.relative_to(ROOT)}:{line}", pattern)
         for folder in PRODUCT
-        for path in sources(ROOT, folder)
-        for line, pattern in patterns(path)
+        for path in list_sources(ROOT, folder)
+        for line, pattern in find_patterns(path)
         if is_superlinear(pattern)
     ]
 

@@ -70,7 +70,7 @@ def set_version(root: Path, version: str, day: str) -> None:
     citation.write_text(with_version(text, r'^(date-released: ")', day), encoding="utf-8")
 
 
-def licences() -> str:
+def list_licences() -> str:
     """Return a line per installed package: name, version, licence."""
     lines = []
     for package in distributions():
@@ -102,7 +102,7 @@ def main() -> int:
     sbom = ROOT / "dist" / f"gripmap-{version}.cdx.json"
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(sbom)]
     subprocess.run(command, cwd=ROOT, check=True)
-    (ROOT / "dist" / "licences.txt").write_text(licences(), encoding="utf-8")
+    (ROOT / "dist" / "licences.txt").write_text(list_licences(), encoding="utf-8")
     print(f"dist/ holds version {version}. Commit, then: git tag -s v{version}\n\n{section}")
     return 0
 

@@ -131,13 +131,13 @@ class Table(NamedTuple):
     render: Callable[[dict[str, float]], str]
 
 
-def _study(values: dict[str, float]) -> str:
+def _render_study(values: dict[str, float]) -> str:
     return study_report.markdown(
         [Figure(name, value, "") for name, value in values.items()]
     ).rstrip()
 
 
-def _searches(values: dict[str, float]) -> str:
+def _render_searches(values: dict[str, float]) -> str:
     listed = [Figure(name, value, "") for name, value in values.items()]
     return search_comparison.comparison_tables(listed)
 
@@ -173,14 +173,14 @@ TABLES: Final = (
         "study",
         "Fuzzy memberships of paper 004's filter, held-out drives",
         re.compile(r"tuning\."),
-        _study,
+        _render_study,
     ),
     Table(
         "searches",
         "Searches with equal budgets on paper 004's filter: log-likelihood [nat/s] ± standard "
         "error over seeds",
         re.compile(r"searches\."),
-        _searches,
+        _render_searches,
     ),
     Table(
         "worth",
@@ -212,7 +212,7 @@ LINES: Final = (
 )
 
 
-def pages() -> list[Path]:
+def list_pages() -> list[Path]:
     """Return every Markdown page that is part of the repository, sorted."""
     folders = ("schemas", "edge_agent", "fleet_service", "deploy", "tests", ".github")
     found = [
@@ -222,23 +222,23 @@ def pages() -> list[Path]:
     return sorted(page for page in found if not {"node_modules", "generated"} & set(page.parts))
 
 
-def kept(name: str) -> dict[str, Row]:
+def read_kept(name: str) -> dict[str, Row]:
     """Return the kept figures of a campaign by name; empty if none were kept."""
-    return {row["name"]: row for row in _read(name)[1:]}
+    return {row["name"]: row for row in _read_rows(name)[1:]}
 
 
-def _runs(name: str) -> dict[str, Row]:
+def _read_runs(name: str) -> dict[str, Row]:
     """Return date, machine and seeds of the kept runs, by commit."""
-    return dict(header["runs"]) if (header := next(iter(_read(name)), None)) else {}
+    return dict(header["runs"]) if (header := next(iter(_read_rows(name)), None)) else {}
 
 
-def _read(name: str) -> list[Row]:
+def _read_rows(name: str) -> list[Row]:
     path = FOLDER / f"{name}.json"
     found: list[Row] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     return found
 
 
-def keep(name: str, source: Path) -> str:
+def keep_figures(name: str, source: Path) -> str:
     """Keep the figures of a campaign's last complete run; figures that it did not measure stay.
 
     Args:
@@ -254,8 +254,8 @@ def keep(name: str, source: Path) -> str:
     header, *rows = json.loads(source.read_text(encoding="utf-8"))
     if header["campaign"] != campaign.title:
         return f"{name}: unchanged; {source} is a run of {header['campaign']!r}"
-    before = kept(name)
-    runs = _runs(name)
+    before = read_kept(name)
+    runs = _read_runs(name)
     commit = header["commit"]
     if runs.get(commit, header)["date"] > header["date"]:
         return f"{name}: unchanged; {source} is older than the kept run"
@@ -294,7 +294,10 @@ def _is_wanted(name: str, row: Row, before: dict[str, Row]) -> bool:
 def results_page() -> str:
     """Return the text of `deploy/docs/results.md`, made from the kept figures and nothing else."""
     judged = [
-        (name, row) for name in CAMPAIGNS for row in kept(name).values() if row["bar"] is not None
+        (name, row)
+        for name in CAMPAIGNS
+        for row in read_kept(name).values()
+        if row["bar"] is not None
     ]
     missed = [(name, row) for name, row in judged if not row["holds"]]
     parts = [
@@ -308,7 +311,7 @@ def results_page() -> str:
         "## Bars that do not hold\n",
         "|figure|value|bar|unit|command|commit|\n|---|---|---|---|---|---|",
         *(
-            f"|`{row['name']}` {MISSED}|{number(row['value'])}|{bar(row)}|{text(row['unit'])}|"
+            f"|`{row['name']}` {MISSED}|{format_number(row['value'])}|{format_bar(row)}|{escape_unit(row['unit'])}|"
             f"`{CAMPAIGNS[name].command}`|{row['commit']}|"
             for name, row in missed
         ),
@@ -320,13 +323,13 @@ def results_page() -> str:
 
 def _campaign_section(name: str) -> Iterator[str]:
     """Yield the lines of a campaign: command, runs, figures with the failing ones first, tables."""
-    found = kept(name)
+    found = read_kept(name)
     yield f"\n## `{CAMPAIGNS[name].command}`\n"
     if not found:
         yield "No complete run is kept."
         return
-    for commit, run in _runs(name).items():
-        yield f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, seeds {seeds(run['seeds'])}"
+    for commit, run in _read_runs(name).items():
+        yield f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, seeds {format_seeds(run['seeds'])}"
     tables = [table for table in TABLES if table.campaign == name]
     rows = [
         row for row in found.values() if row["bar"] is not None or not _is_in_table(row, tables)
@@ -337,15 +340,15 @@ def _campaign_section(name: str) -> Iterator[str]:
     for row in rows:
         mark = "" if row["bar"] is None else HOLDS if row["holds"] else MISSED
         yield (
-            f"|`{row['name']}`|{mark}|{number(row['value'])}|{bar(row)}|{text(row['unit'])}|{row['commit']}|"
+            f"|`{row['name']}`|{mark}|{format_number(row['value'])}|{format_bar(row)}|{escape_unit(row['unit'])}|{row['commit']}|"
         )
     values = {key: math.nan if row["value"] is None else row["value"] for key, row in found.items()}
     for table in tables:
         yield f"\n### {table.title}\n"
-        yield _rendered(table, values)
+        yield _render_table(table, values)
 
 
-def _rendered(table: Table, values: dict[str, float]) -> str:
+def _render_table(table: Table, values: dict[str, float]) -> str:
     try:
         return table.render(
             {name: value for name, value in values.items() if table.names.match(name)}
@@ -362,44 +365,44 @@ def readme_block() -> str:
     """Return the results block of the root README, missed bars first."""
     rows = []
     for line in LINES:
-        row = kept(line.campaign).get(line.name)
+        row = read_kept(line.campaign).get(line.name)
         if row is None:
             continue
         mark = HOLDS if row["holds"] else MISSED
         value = line.form.format(row["value"]).replace(",", " ").replace("%", " %")
-        limit = bar(row, line.form).replace("%", " %")
+        limit = format_bar(row, line.form).replace("%", " %")
         rows.append((row["holds"], f"| {line.text} | {value} | {limit} | {mark} |"))
     rows.sort(key=lambda row: row[0])
     head = "| | measured | bar | |\n|---|---|---|---|"
     return "\n".join([BEGIN, head, *(row for _, row in rows), END])
 
 
-def number(value: float | None) -> str:
+def format_number(value: float | None) -> str:
     """Return a value with four significant digits."""
     if value is None:
         return ""
     return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1e4 else f"{value:.4g}"
 
 
-def bar(row: Row, form: str = "{:g}") -> str:
+def format_bar(row: Row, form: str = "{:g}") -> str:
     """Return a bar as text, with its direction."""
     limit = row["bar"]
     if limit is None:
         return ""
     if isinstance(limit, list):
         return f"{form.format(limit[0])} – {form.format(limit[1])}"
-    shown = form.format(limit) if form != "{:g}" else number(limit)
+    shown = form.format(limit) if form != "{:g}" else format_number(limit)
     return f"{'≤' if row['better'] == 'less' else '≥'} {shown.replace(',', ' ')}"
 
 
-def seeds(given: list[int]) -> str:
+def format_seeds(given: list[int]) -> str:
     """Return seeds as text; a run of consecutive numbers as its ends."""
     if len(given) > 2 and given == list(range(given[0], given[0] + len(given))):
         return f"{given[0]} to {given[-1]}"
     return ", ".join(map(str, given))
 
 
-def text(unit: str) -> str:
+def escape_unit(unit: str) -> str:
     """Return a unit that can stand in a table."""
     return unit.replace("|", "\\|")
 
@@ -411,7 +414,7 @@ def with_block(page: str) -> str:
     return f"{before}{readme_block()}{after}" if begin and end else page
 
 
-def stale() -> list[str]:
+def find_stale() -> list[str]:
     """Return the pages that are not current."""
     wanted = {PAGE: results_page(), README: with_block(README.read_text(encoding="utf-8"))}
     return [
@@ -444,7 +447,9 @@ def main() -> int:
         parser.error(f"{', '.join(sorted(unknown))}: unknown; choose from {', '.join(CAMPAIGNS)}")
     if not arguments.pages_only:
         for name, campaign in CAMPAIGNS.items():
-            print(keep(name, Path(given.get(name, ROOT / campaign.output / "figures.json"))))
+            print(
+                keep_figures(name, Path(given.get(name, ROOT / campaign.output / "figures.json")))
+            )
     write_pages()
     return 0
 

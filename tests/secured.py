@@ -35,7 +35,7 @@ FREE = {"quic": "quic/127.0.0.1:0", "tls": "tls/127.0.0.1:0"}
 RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}
 
 
-def enrolment(**changed: object) -> Enrolment:
+def make_enrolment(**changed: object) -> Enrolment:
     """Two routers, a service, a reader and two vehicles."""
     names = {
         "services": [SERVICE],
@@ -48,7 +48,7 @@ def enrolment(**changed: object) -> Enrolment:
     )
 
 
-def registry(folder: Path) -> Registry:
+def open_registry(folder: Path) -> Registry:
     """The authority in a folder, at the present time."""
     return Registry(folder, Terms(), datetime.now(UTC))
 
@@ -86,7 +86,7 @@ class Network:
     endpoints: dict[str, str] = field(default_factory=dict)
     between: dict[str, str] = field(default_factory=dict)
 
-    def session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
+    def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
         """A session under a name of the folder.
 
         Raises:
@@ -137,14 +137,17 @@ class Network:
         with self.routers.pop(router) as process:
             process.terminate()
 
-    def linked(self) -> None:
+    def await_link(self) -> None:
         """Wait until a message put at one router comes out at the other, both ways."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
-            with self.session(SERVICE, first) as here, self.session(SERVICE, second) as there:
+            with (
+                self.open_session(SERVICE, first) as here,
+                self.open_session(SERVICE, second) as there,
+            ):
                 arrived = threading.Event()
-                subscriber = here.declare_subscriber(PROBE, partial(_note, arrived))
+                subscriber = here.declare_subscriber(PROBE, partial(_set_arrived, arrived))
                 # a put each time: a publisher from before the link may never hear that it matches
-                until(partial(_heard, there, arrived))
+                until(partial(_has_arrived, there, arrived))
                 subscriber.undeclare()
 
     def close(self) -> None:
@@ -153,17 +156,17 @@ class Network:
             self.stop(router)
 
 
-def _note(arrived: threading.Event, _: zenoh.Sample) -> None:
+def _set_arrived(arrived: threading.Event, _: zenoh.Sample) -> None:
     arrived.set()
 
 
-def _heard(there: zenoh.Session, arrived: threading.Event) -> bool:
+def _has_arrived(there: zenoh.Session, arrived: threading.Event) -> bool:
     there.put(PROBE, b"")
     return arrived.is_set()
 
 
 @contextmanager
-def network(
+def open_network(
     folder: Path,
     *,
     guarded: bool = True,
@@ -172,11 +175,11 @@ def network(
     capped: bool = False,
 ) -> Iterator[Network]:
     """Certificates in a folder, and both routers."""
-    registry(folder).enrol(fleet or enrolment())
+    open_registry(folder).enrol(fleet or make_enrolment())
     running = Network(folder, guarded, protocol, capped)
     with ExitStack() as stack:
         stack.callback(running.close)
         for router in ROUTERS:
             running.start(router)
-        running.linked()
+        running.await_link()
         yield running

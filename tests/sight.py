@@ -42,7 +42,7 @@ _XYZ: Final = np.array(
 _WHITE: Final = _XYZ.sum(axis=1)
 
 
-def lab(colour: str, sight: str = "normal") -> FloatArray:
+def to_lab(colour: str, sight: str = "normal") -> FloatArray:
     """CIELAB of a colour #rrggbb as a kind of sight has it, (3,)."""
     rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
@@ -52,7 +52,7 @@ def lab(colour: str, sight: str = "normal") -> FloatArray:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
-def difference(first: FloatArray, second: FloatArray) -> float:
+def colour_difference(first: FloatArray, second: FloatArray) -> float:
     """CIEDE2000 of two colours in CIELAB (Sharma, Wu and Dalal 2005, eqs. 2 to 22)."""
     (l1, a1, b1) = first
     (l2, a2, b2) = second

@@ -20,7 +20,7 @@ TRIES = 3
 
 
 @contextmanager
-def cores(count: int) -> Iterator[Any]:
+def spark_session(count: int) -> Iterator[Any]:
     """A session of Spark on so many cores, in the place of any other of this process."""
     from pyspark.sql import SparkSession
 
@@ -49,11 +49,11 @@ def killed_at_first(
     """
     tries.mkdir()
 
-    def done(task: _Task) -> _Outcome:
+    def work_or_die(task: _Task) -> _Outcome:
         outcome = work(task)
         if not (mark := tries / name_of(task)).exists():
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return outcome
 
-    return done
+    return work_or_die

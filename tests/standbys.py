@@ -31,7 +31,7 @@ class Link:
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
         self._ends: list[socket.socket] = []
-        threading.Thread(target=self._accept, daemon=True).start()
+        threading.Thread(target=self._accept_connections, daemon=True).start()
 
     def cut(self) -> None:
         """Nothing passes."""
@@ -42,7 +42,7 @@ class Link:
         """True if it is cut."""
         return not self._open.is_set()
 
-    def mend(self) -> None:
+    def restore(self) -> None:
         """Resume the waiting traffic."""
         self._open.set()
 
@@ -54,7 +54,7 @@ class Link:
             end.close()
         self._open.set()
 
-    def _accept(self) -> None:
+    def _accept_connections(self) -> None:
         with suppress(OSError):
             while True:
                 near, _ = self._server.accept()
@@ -66,9 +66,9 @@ class Link:
                 far.settimeout(None)
                 self._ends += [near, far]
                 for ends in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass, args=ends, daemon=True).start()
+                    threading.Thread(target=self._forward, args=ends, daemon=True).start()
 
-    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
+    def _forward(self, source: socket.socket, sink: socket.socket) -> None:
         with suppress(OSError):
             while data := source.recv(1 << 16):
                 self._open.wait()
@@ -105,7 +105,7 @@ class Host:
         words = ["-m", module, "run", "--config", str(config)]
         self.part = Part("service", [sys.executable, *words], folder)
 
-    def said(self, start: str) -> bool:
+    def has_said(self, start: str) -> bool:
         """Return True if a line of the present start begins with this text."""
         return any(line.startswith(start) for line in self.part.read_lines())
 
@@ -118,7 +118,7 @@ class Host:
 
 
 @contextmanager
-def hosts(
+def open_hosts(
     folder: Path,
     names: Sequence[str],
     router: str,
@@ -141,7 +141,7 @@ def hosts(
         yield made
 
 
-def restored(folder: Path, bucket: BucketServer) -> Path:
+def restore_archive(folder: Path, bucket: BucketServer) -> Path:
     """The archive that an empty disk gets from the bucket; nothing is changed there."""
     root = folder / "archive"
     root.mkdir(parents=True)

@@ -29,7 +29,7 @@ LIGHT: Final = "import schemas.keys, schemas.grid, schemas.wire, schemas.tables,
 HEAVY: Final = ("numba", "llvmlite", "scipy", "zenoh")
 
 
-def sources(root: Path, *folders: str) -> list[Path]:
+def list_sources(root: Path, *folders: str) -> list[Path]:
     """Every Python file below the folders that a person wrote."""
     found = (path for folder in folders for path in sorted((root / folder).rglob("*.py")))
     return [path for path in found if not path.name.endswith("_pb2.py")]
@@ -41,7 +41,7 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
+def list_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Line and full name of everything imported in a syntax tree, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -57,12 +57,12 @@ def room_of(name: str) -> tuple[str, str]:
     return package, room
 
 
-def arrows(root: Path, package: str) -> dict[tuple[str, str], str]:
+def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
     """Which room of a package imports which, each with one place where it does."""
     found: dict[tuple[str, str], str] = {}
-    for path in sources(root, package):
+    for path in list_sources(root, package):
         parts = path.relative_to(root / package).with_suffix("").parts
-        for line, name in imported(parse(path)):
+        for line, name in list_imports(parse(path)):
             other, room = room_of(name)
             if other == package and room and parts[0] not in (room, "__init__"):
                 found.setdefault((parts[0], room), f"{path.relative_to(root)}:{line}")
@@ -77,7 +77,7 @@ def loose_modules(root: Path, package: str) -> list[str]:
 def too_wide(root: Path) -> list[str]:
     """Functions with more positional parameters than a reader holds in mind."""
     found = []
-    for path in sources(root, *PACKAGES):
+    for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
@@ -90,7 +90,7 @@ def too_wide(root: Path) -> list[str]:
 def ambiguous_classes(root: Path) -> dict[str, list[str]]:
     """Names of classes, public or not, that stand for several things, with their places."""
     places: dict[str, list[str]] = {}
-    for path in sources(root, *PACKAGES):
+    for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(f"{path.relative_to(root)}:{node.lineno}")
@@ -127,7 +127,7 @@ PRODUCT: Final = ("schemas", "edge_agent", "fleet_service")
 
 def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
     """Yield place and node of every function."""
-    for path in sources(root, *packages):
+    for path in list_sources(root, *packages):
         for node in ast.walk(parse(path)):
             if isinstance(node, FunctionNode):
                 yield f"{path.relative_to(root)}:{node.lineno} {node.name}", node
@@ -137,9 +137,9 @@ def room_arrows(root: Path, folder: str) -> Places:
     """Return the pairs of sub-packages (or modules) of a folder of which one imports the other."""
     base = folder.replace("/", ".")
     found: dict[tuple[str, str], str] = {}
-    for path in sources(root, folder):
+    for path in list_sources(root, folder):
         own = path.relative_to(root / folder).with_suffix("").parts[0]
-        for line, name in imported(parse(path)):
+        for line, name in list_imports(parse(path)):
             if name.startswith(f"{base}."):
                 other = name.removeprefix(f"{base}.").split(".")[0]
                 exists = (root / folder / other).is_dir() or (
@@ -152,7 +152,9 @@ def room_arrows(root: Path, folder: str) -> Places:
 
 def import_circles(root: Path) -> Places:
     """Return the circles of modules that import each other, imports inside functions included."""
-    return circles_of({path.relative_to(root): parse(path) for path in sources(root, *PACKAGES)})
+    return circles_of(
+        {path.relative_to(root): parse(path) for path in list_sources(root, *PACKAGES)}
+    )
 
 
 def methods_of_largest_class(root: Path) -> Places:
@@ -160,7 +162,7 @@ def methods_of_largest_class(root: Path) -> Places:
     method.
     """
     largest: Places = []
-    for path in sources(root, *PACKAGES):
+    for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef):
                 methods = [item for item in node.body if isinstance(item, FunctionNode)]
@@ -199,7 +201,7 @@ def functions_with_many_parameters(root: Path) -> Places:
 def packed_assignments(root: Path) -> Places:
     """Return the assignments of a tuple that is written out to several names: `a, b = x, y`."""
     found = []
-    for path in sources(root, *PACKAGES):
+    for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
             match node:
                 case ast.Assign(targets=[*_, ast.Tuple()], value=ast.Tuple()):
@@ -212,7 +214,7 @@ def fmt_skips(root: Path) -> Places:
     marker = "# fmt: " + "skip"
     return [
         f"{path.relative_to(root)}:{line}"
-        for path in sources(root, *PACKAGES, "tests")
+        for path in list_sources(root, *PACKAGES, "tests")
         for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if marker in text
     ]
@@ -222,7 +224,7 @@ def long_lines(root: Path) -> Places:
     """Return the lines of more than 100 columns, tests included."""
     return [
         f"{path.relative_to(root)}:{line}"
-        for path in sources(root, *PACKAGES, "tests")
+        for path in list_sources(root, *PACKAGES, "tests")
         for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if len(text) > 100
     ]
@@ -231,7 +233,7 @@ def long_lines(root: Path) -> Places:
 _NESTING: Final = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.AsyncFor, ast.AsyncWith)
 
 
-def _depth(node: ast.AST) -> int:
+def _measure_depth(node: ast.AST) -> int:
     """Return how many blocks are nested in a function; `elif` does not count, inner functions
     count for themselves.
     """
@@ -240,13 +242,15 @@ def _depth(node: ast.AST) -> int:
         if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             continue
         is_elif = isinstance(node, ast.If) and isinstance(child, ast.If) and node.orelse == [child]
-        deepest = max(deepest, _depth(child) + (isinstance(child, _NESTING) and not is_elif))
+        deepest = max(
+            deepest, _measure_depth(child) + (isinstance(child, _NESTING) and not is_elif)
+        )
     return deepest
 
 
 def deep_nesting(root: Path) -> Places:
     """Return the functions with more than four nested blocks."""
-    found = ((place, _depth(node)) for place, node in functions(root, *PACKAGES))
+    found = ((place, _measure_depth(node)) for place, node in functions(root, *PACKAGES))
     return [f"{place} ({depth})" for place, depth in found if depth > 4]
 
 
@@ -270,7 +274,7 @@ def named_constants(root: Path) -> Places:
     value is a number or an expression of numbers, in `CONSTANT_ROOMS`.
     """
     found = []
-    for path in sources(root, *CONSTANT_ROOMS):
+    for path in list_sources(root, *CONSTANT_ROOMS):
         tree = parse(path)
         bodies = [("", tree.body)]
         bodies += [
@@ -311,7 +315,7 @@ def only_tests_use(root: Path) -> Places:
     contains it. Functions with a decorator other than `property` are left out, because the
     decorator may register them.
     """
-    texts = {path: path.read_text(encoding="utf-8") for path in sources(root, *PACKAGES)}
+    texts = {path: path.read_text(encoding="utf-8") for path in list_sources(root, *PACKAGES)}
     others = [
         root / "Makefile",
         root / "pyproject.toml",
@@ -329,7 +333,9 @@ def only_tests_use(root: Path) -> Places:
         )
     )
     tests = set(
-        re.findall(r"\w+", "\n".join(path.read_text("utf-8") for path in sources(root, "tests")))
+        re.findall(
+            r"\w+", "\n".join(path.read_text("utf-8") for path in list_sources(root, "tests"))
+        )
     )
     found = []
     for path in texts:
@@ -353,7 +359,9 @@ def only_tests_use(root: Path) -> Places:
 
 
 def _per_1000_lines(count: int, root: Path) -> float:
-    lines = sum(path.read_text(encoding="utf-8").count("\n") for path in sources(root, *PACKAGES))
+    lines = sum(
+        path.read_text(encoding="utf-8").count("\n") for path in list_sources(root, *PACKAGES)
+    )
     return round(1000.0 * count / lines, 2)
 
 
@@ -420,7 +428,7 @@ def main(arguments: list[str]) -> None:
     for package in PACKAGES[:3]:
         loose = len(loose_modules(root, package))
         print(
-            f"{package}: {loose} loose modules, {len(arrows(root, package))} arrows between rooms"
+            f"{package}: {loose} loose modules, {len(list_room_imports(root, package))} arrows between rooms"
         )
     print(f"class names used more than once: {len(ambiguous_classes(root))}")
     milliseconds, modules, heavy = light_import(root)

@@ -66,7 +66,7 @@ def two_cells() -> pa.Table:
     return table
 
 
-def painted(
+def find_painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
     """Rows of which nothing is known that have a number all the same; fails where there are none
@@ -82,7 +82,7 @@ def painted(
     ]
 
 
-def measured(row: dict[str, Any]) -> bool:
+def is_measured(row: dict[str, Any]) -> bool:
     return bool(row["basis"] == "measured")
 
 
@@ -96,11 +96,11 @@ def test_an_answer_of_the_service_has_no_mu_for_a_bound(form: Format) -> None:
         rows = json.loads(payload)["cells"]
     else:
         rows = [feature["properties"] for feature in json.loads(payload)["features"]]
-    assert painted(rows, measured, "mu") == []
+    assert find_painted(rows, is_measured, "mu") == []
     assert all(row["mu_lower"] < row["mu_upper"] for row in rows), "the interval stays"
 
 
-def read(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[dict[str, Any]]:
     """Rows of an export as a program reads them."""
     if path.suffix == ".csv":
         return pacsv.read_csv(path).to_pylist()
@@ -121,13 +121,13 @@ def test_an_export_has_no_mu_for_a_bound(
         == 0
     )
     if what.startswith("map"):
-        assert painted(read(out), measured, "mu") == []
+        assert find_painted(read_rows(out), is_measured, "mu") == []
     elif what == "observations":
-        assert painted(read(out), lambda row: bool(row["value"]), "mu") == []
+        assert find_painted(read_rows(out), lambda row: bool(row["value"]), "mu") == []
     else:
-        rows = read(out)
+        rows = read_rows(out)
         of_mu = ("value_sum", "mu_sum", "mu_sum_squares", "mu_min", "mu_max")
-        assert painted(rows, lambda row: bool(row["value_count"]), *of_mu) == []
+        assert find_painted(rows, lambda row: bool(row["value_count"]), *of_mu) == []
 
 
 @pytest.mark.parametrize("question", ["replay", "grip"])
@@ -141,7 +141,7 @@ def test_an_answer_of_the_archive_has_no_mu_for_a_bound(
     )
     colour = QUESTIONS[question].colour
     assert colour is not None
-    known = measured if question == "replay" else lambda row: bool(row["values"])
+    known = is_measured if question == "replay" else lambda row: bool(row["values"])
     if ending == "html":
         data = json.loads(out.read_text().split("const data = ")[1].split(";\n")[0])
         basis, *_ = (k for k, name in enumerate(data["names"]) if name in ("basis", "values"))
@@ -149,9 +149,9 @@ def test_an_answer_of_the_archive_has_no_mu_for_a_bound(
             {"basis": row[basis], "values": row[basis] != "0", "colour": number}
             for row, number in zip(data["rows"], data["panels"][0]["values"], strict=True)
         ]
-        assert painted(rows, known, "colour") == []
+        assert find_painted(rows, known, "colour") == []
     else:
-        assert painted(read(out), known, colour) == []
+        assert find_painted(read_rows(out), known, colour) == []
 
 
 def test_a_picture_hatches_what_was_not_measured() -> None:

@@ -89,10 +89,10 @@ def test_the_western_hemisphere_is_asked_like_the_eastern(
 
 
 def test_ctrl_c_is_130_and_one_word(capsys: Capture) -> None:
-    def interrupted() -> int:
+    def raise_interrupt() -> int:
         raise KeyboardInterrupt
 
-    assert commandline.run_guarded(interrupted) == 130
+    assert commandline.run_guarded(raise_interrupt) == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
@@ -115,7 +115,7 @@ def test_a_page_of_somebody_else_in_an_archive_is_not_replaced(archive: Path) ->
     assert (archive / "README.md").read_text() == "mine"
 
 
-def files(folder: Path) -> set[Path]:
+def list_files(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
 
 
@@ -126,16 +126,16 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
     words: list[str], archive: Path, capsys: Capture
 ) -> None:
     command = [*words, "--archive", str(archive)]
-    before = files(archive)
+    before = list_files(archive)
     assert fleet_service.cli.main([*command, "--dry-run"]) == 0
     assert "would be" in capsys.readouterr().out
-    assert files(archive) == before
+    assert list_files(archive) == before
     said = on_terminal([sys.executable, "-m", "fleet_service.cli", *command], "n\n")
     assert "Go on? [y/N]" in said
     assert "nothing" in said
-    assert files(archive) == before
+    assert list_files(archive) == before
     assert fleet_service.cli.main([*command, "--yes"]) == 0
-    assert files(archive) != before
+    assert list_files(archive) != before
 
 
 def on_terminal(command: list[str], answer: str) -> str:

@@ -11,7 +11,7 @@ import pytest
 
 from schemas.runtime import commandline
 from tests import reference_pages
-from tests.results import pages
+from tests.results import list_pages
 from tests.structure import ROOT
 from tests.test_commands import LINES
 from tests.usability import mistakes, readme
@@ -53,7 +53,7 @@ def test_a_mistake_is_made_with_every_command() -> None:
     assert len(mistakes.EDGE) + len(mistakes.FLEET) >= 60
 
 
-def typed(text: str) -> list[str]:
+def list_commands(text: str) -> list[str]:
     """Return the commands in the code blocks of a page, without comments; a synopsis with
     brackets is none.
     """
@@ -68,7 +68,9 @@ def typed(text: str) -> list[str]:
 
 def test_every_command_of_every_page_is_understood() -> None:
     found = [
-        (str(page.relative_to(ROOT)), line) for page in pages() for line in typed(page.read_text())
+        (str(page.relative_to(ROOT)), line)
+        for page in list_pages()
+        for line in list_commands(page.read_text())
     ]
     assert len({page for page, _ in found}) >= 6
     assert len(found) > 30
@@ -91,7 +93,7 @@ def test_every_room_is_in_the_readme_of_its_half(half: str) -> None:
 
 
 def test_every_command_of_the_tutorials_is_understood_and_writes_to_try() -> None:
-    found = readme.commands(readme.pages())
+    found = readme.list_commands(readme.read_pages())
     assert len(found) > 15
     for command in found:
         if "\n" in command:
@@ -131,7 +133,7 @@ def test_git_ignores_what_the_tutorials_make_and_every_key() -> None:
     assert done.stdout == ""
 
 
-def anchors(text: str) -> set[str]:
+def list_anchors(text: str) -> set[str]:
     """Return the anchors of a page's headings, as forges make them, and its explicit labels."""
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     slugs = {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
@@ -141,7 +143,7 @@ def anchors(text: str) -> set[str]:
 def test_links_of_pages_lead_to_files_and_headings() -> None:
     found = [
         (page, link, anchor)
-        for page in pages()
+        for page in list_pages()
         for link, _, anchor in re.findall(
             r"\]\(([^)#\s]*)(#([^)]*))?\)", page.read_text(encoding="utf-8")
         )
@@ -152,7 +154,11 @@ def test_links_of_pages_lead_to_files_and_headings() -> None:
         target = (page.parent / link).resolve() if link else page
         assert target.exists(), (str(page), link)
         if anchor:
-            assert anchor in anchors(target.read_text(encoding="utf-8")), (str(page), link, anchor)
+            assert anchor in list_anchors(target.read_text(encoding="utf-8")), (
+                str(page),
+                link,
+                anchor,
+            )
 
 
 def test_root_readme_is_short_and_soon_has_a_command() -> None:
@@ -162,7 +168,7 @@ def test_root_readme_is_short_and_soon_has_a_command() -> None:
 
 
 def test_room_readmes_have_at_most_sixty_lines() -> None:
-    for page in pages():
+    for page in list_pages():
         name = str(page.relative_to(ROOT))
         if page.name == "README.md" and name not in (CONTRACT, "README.md"):
             lines = len(page.read_text(encoding="utf-8").splitlines())

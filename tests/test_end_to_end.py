@@ -60,7 +60,7 @@ class System:
         self._thread.join(30)
         assert not self._thread.is_alive()
 
-    def drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
+    def publish_drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
         """Record a drive and publish it as `vehicle`."""
         log, file, out = (
             self.folder / f"{vehicle}-{n}"
@@ -92,7 +92,7 @@ class System:
         ]
         assert edge_agent([*words, "--trust", "--config", str(self.agent)]) == 0
 
-    def ask(self, parameters: str = "format=json") -> list[dict[str, object]]:
+    def query_cells(self, parameters: str = "format=json") -> list[dict[str, object]]:
         """The map's cells as a client without our code gets them."""
         session = open_session(ZenohSettings(connect=[self.endpoint]))
         assert session is not None
@@ -120,9 +120,11 @@ def system(tmp_path: Path) -> Iterator[System]:
 def slippery_cells(system: System) -> list[dict[str, object]]:
     """Measured cells after three cars braked on ICE."""
     for seed, vehicle in enumerate(VEHICLES):
-        system.drive(vehicle, "braking", ICE, seed)
+        system.publish_drive(vehicle, "braking", ICE, seed)
     return [
-        cell for cell in system.ask("format=json;min_vehicles=2") if cell["basis"] == "measured"
+        cell
+        for cell in system.query_cells("format=json;min_vehicles=2")
+        if cell["basis"] == "measured"
     ]
 
 
@@ -155,12 +157,12 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
         assert float(str(cell["mu_upper"])) >= ICE
         assert float(str(cell["p_slippery"])) >= 0.5  # of a road that nobody knows it is .3
         assert float(str(cell["mu"])) < 0.4
-    cells = system.ask("format=json;min_vehicles=2")
-    rows = archived(system.folder)
+    cells = system.query_cells("format=json;min_vehicles=2")
+    rows = list_archived(system.folder)
     assert len(set(rows)) == len(rows)
     system.stop()
     system.start()
-    again = {(c["cell"], c["sector"]): c for c in system.ask("format=json;min_vehicles=2")}
+    again = {(c["cell"], c["sector"]): c for c in system.query_cells("format=json;min_vehicles=2")}
     for cell in cells:
         found = again[cell["cell"], cell["sector"]]
         assert found["vehicles"] == cell["vehicles"]
@@ -173,7 +175,7 @@ def _most_slippery_first(cell: dict[str, object]) -> float:
     return -float(str(cell["p_slippery"]))
 
 
-def archived(folder: Path) -> list[tuple[object, ...]]:
+def list_archived(folder: Path) -> list[tuple[object, ...]]:
     """Identities of all archived observations."""
     columns = ("vehicle", "boot", "region", "seq", "row")
     tables = reading.read(folder / "archive", Kind.OBSERVATION, columns)
@@ -185,8 +187,8 @@ def archived(folder: Path) -> list[tuple[object, ...]]:
 
 
 def test_a_straight_drive_leaves_bounds_and_the_prior_s_upper_end(system: System) -> None:
-    system.drive("anna", "straight", 0.8, 0)
-    cells = system.ask()
+    system.publish_drive("anna", "straight", 0.8, 0)
+    cells = system.query_cells()
     assert cells
     assert {cell["basis"] for cell in cells} == {"bound"}
     widths = [float(str(cell["mu_upper"])) - float(str(cell["mu_lower"])) for cell in cells]
@@ -209,5 +211,5 @@ def test_garbage_is_refused_and_the_service_goes_on(system: System) -> None:
         ]
         assert errors
         assert all(error.startswith("bbox: ") for error in errors)
-    system.drive("anna", "braking", 0.8, 0)
-    assert system.ask()
+    system.publish_drive("anna", "braking", 0.8, 0)
+    assert system.query_cells()

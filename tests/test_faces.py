@@ -205,7 +205,7 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     ]
     assert main(drive) == 0
 
-    def command(*words: str) -> subprocess.CompletedProcess[str]:
+    def run_command(*words: str) -> subprocess.CompletedProcess[str]:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
         line = f"import sys, gripmap; sys.exit(gripmap.{words[0]}_main())"
         return subprocess.run(
@@ -216,7 +216,7 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
             env=environment,
         )
 
-    done = command(
+    done = run_command(
         "edge_agent",
         "replay",
         str(log),
@@ -227,14 +227,14 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     )
     assert done.returncode in (0, 3), done.stderr
     assert pq.read_table(tmp_path / "e.parquet")["mu_lower"].to_numpy().max() > 0.11
-    done = command(
+    done = run_command(
         "edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet")
     )
     assert "at-least" in done.stderr
     said = []
     for estimator in ("ckf", "ckf@brush"):
         out = tmp_path / "e.parquet"
-        done = command(
+        done = run_command(
             "edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(out)
         )
         assert done.returncode in (0, 3), done.stderr
@@ -245,7 +245,7 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
         ("ckf@no", "tyre-curve: 'no' is unknown"),
         ("sr-ukf@brush", "tyre-curve: sr-ukf has its own"),
     ):
-        done = command(
+        done = run_command(
             "edge_agent",
             "replay",
             str(log),
@@ -256,7 +256,7 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
         )
         assert problem in done.stderr, done.stderr
     archive = DATA / "v1.0" / "archive"
-    done = command(
+    done = run_command(
         "fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json"
     )
     assert json.loads(done.stdout)["rows"] > 0, done.stderr

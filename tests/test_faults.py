@@ -48,10 +48,10 @@ def test_every_campaign_owes_a_figure_of_what_it_did() -> None:
 
 
 def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
-    def forgetful(site: Site) -> list[Figure]:
+    def run_forgetful(site: Site) -> list[Figure]:
         return [make_figure("faults.kill.doubled", 0)]
 
-    campaign = Campaign("forgetful", forgetful, ("faults.kill.doubled", "faults.frozen.lost"))
+    campaign = Campaign("forgetful", run_forgetful, ("faults.kill.doubled", "faults.frozen.lost"))
     found = run_campaigns([campaign], tmp_path, "test", quick=True, seed=0)
     assert {one.name: one.holds for one in found} == {
         "faults.kill.doubled": True,
@@ -145,7 +145,7 @@ def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(
     assert any("is lost" in problem for number in range(12) for problem in run_log_history(number))
 
 
-def served(number: int, folder: Path) -> list[str]:
+def find_violations(number: int, folder: Path) -> list[str]:
     (folder / str(number)).mkdir()
     return ServiceHistory(number, folder / str(number)).find_violations()
 
@@ -157,7 +157,9 @@ def test_no_history_on_a_forgetful_disk_loses_or_doubles_anything(tmp_path: Path
         84,
     )  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
     assert [
-        problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)
+        problem
+        for number in (*range(3), *found_bugs)
+        for problem in find_violations(number, tmp_path)
     ] == []
 
 
@@ -166,7 +168,9 @@ def test_forgetful_disk_catches_a_service_that_does_not_sync_its_keys(
 ) -> None:
     monkeypatch.setattr(pseudonyms, "sync_directory", lambda folder: None)
     assert any(
-        "key is lost" in problem for number in range(6) for problem in served(number, tmp_path)
+        "key is lost" in problem
+        for number in range(6)
+        for problem in find_violations(number, tmp_path)
     )
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.first_drive import Cells, commands, mapped
+from tests.first_drive import Cells, map_first_drive, read_commands
 from tests.test_end_to_end import VEHICLES
 
 MOST_COMMANDS = 5
@@ -15,7 +15,7 @@ MOST_COMMANDS = 5
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
     """The map's cells and the keys of alerts."""
-    return mapped(tmp_path_factory.mktemp("minute"))
+    return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 
 @pytest.mark.timeout(900)  # the kernels of both halves may have to be compiled
@@ -33,11 +33,11 @@ def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:
 
 
 def test_first_drive_of_the_tutorial_has_few_commands_all_tested() -> None:
-    assert 0 < len(commands()) <= MOST_COMMANDS
-    assert [command.split()[1] for command in commands()] == [
+    assert 0 < len(read_commands()) <= MOST_COMMANDS
+    assert [command.split()[1] for command in read_commands()] == [
         "install",
         "import",
         "check",
         "replay",
     ]
-    assert "--publish --start now" in commands()[-1]
+    assert "--publish --start now" in read_commands()[-1]

@@ -21,12 +21,14 @@ from schemas.config import AgentConfig, ZenohSettings, load
 from schemas.runtime.zenoh_session import open_session
 from tests.fleet_service.conftest import running
 from tests.structure import ROOT
-from tests.usability.wrong_logs import unnoticed
+from tests.usability.wrong_logs import find_unnoticed
 from tests.waiting import until
 
 
 def test_replay_mentions_faulty_signals_and_is_silent_for_sound_ones(tmp_path: Path) -> None:
-    assert unnoticed(tmp_path, ["a_y flipped", "yaw rate in deg/s", "mass in tonnes"], 9000) == []
+    assert (
+        find_unnoticed(tmp_path, ["a_y flipped", "yaw rate in deg/s", "mass in tonnes"], 9000) == []
+    )
 
 
 def test_two_cars_of_one_shipped_configuration_have_an_outbox_each() -> None:

@@ -9,15 +9,15 @@ from tests.fuzz import PARSERS, Fuzzer, Parser, seeds_of
 
 
 def test_fuzzer_finds_a_planted_crash() -> None:
-    def parse(data: bytes) -> None:
+    def parse_planted(data: bytes) -> None:
         if data[:1] == b"{" and data[1:2] == b"|":
             raise KeyError("planted")
         raise InputError("data", "is not valid", "change it")
 
     found: list[tuple[str, bytes]] = []
-    result = Fuzzer(Parser(parse), [b"{x"], 0, lambda kind, data: found.append((kind, data))).run(
-        executions=20_000
-    )
+    result = Fuzzer(
+        Parser(parse_planted), [b"{x"], 0, lambda kind, data: found.append((kind, data))
+    ).run(executions=20_000)
     assert result.crashes > 0
     assert any(kind == "crash" and data.startswith(b"{|") for kind, data in found)
 

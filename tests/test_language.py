@@ -17,8 +17,8 @@ MOST_WORDS = 25_000
 
 @PACKAGES
 def test_language_of_a_package_is_not_worse_than_its_ceilings(package: str) -> None:
-    ceilings = language.ceilings()["packages"][package]
-    measured = language.measure(package)
+    ceilings = language.read_ceilings()["packages"][package]
+    measured = language.measure_package(package)
     worse = {
         name: (value, ceilings[name]) for name, value in measured.items() if value > ceilings[name]
     }
@@ -26,7 +26,7 @@ def test_language_of_a_package_is_not_worse_than_its_ceilings(package: str) -> N
 
 
 def test_language_of_pages_is_not_worse_than_their_ceilings() -> None:
-    ceilings = language.ceilings()["pages"]
+    ceilings = language.read_ceilings()["pages"]
     for page, measured in language.measure_pages().items():
         allowed = ceilings.get(page, {})
         allowed = {**allowed, "words": max(MOST_WORDS, allowed.get("words", 0.0))}
@@ -35,7 +35,7 @@ def test_language_of_pages_is_not_worse_than_their_ceilings() -> None:
 
 
 def test_ceilings_have_every_package_and_only_existing_pages() -> None:
-    ceilings = language.ceilings()
+    ceilings = language.read_ceilings()
     assert set(ceilings["packages"]) == set(language.PACKAGES)
     assert not [page for page in ceilings["pages"] if page != "*" and not (ROOT / page).exists()]
 
@@ -79,7 +79,7 @@ def test_prose_leaves_out_code_tables_and_links() -> None:
         "# Title\n\nOne [word](a/b.md) and `code`.\n\n| a |\n|---|\n\n```\nanew\n```\n- item "
         "one.\n- item two.\n"
     )
-    assert [one.strip() for one in language.sentences(text)] == [
+    assert [one.strip() for one in language.split_sentences(text)] == [
         "One word and Code.",
         "item one.",
         "item two.",

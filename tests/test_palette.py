@@ -13,7 +13,7 @@ import pytest
 
 from edge_agent.estimators import ESTIMATORS as REGISTERED
 from schemas.runtime.palette import ESTIMATORS, GRIP, GRIP_RANGE, SURFACES, TRUTH, shade
-from tests.sight import SIGHTS, difference, lab
+from tests.sight import SIGHTS, colour_difference, to_lab
 
 LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
 
@@ -26,28 +26,33 @@ def test_the_difference_is_the_published_one() -> None:
         ((60.2574, -34.0099, 36.2677), (60.4626, -34.1751, 39.4387), 1.2644),
     ]
     for first, second, expected in pairs:
-        assert difference(np.array(first), np.array(second)) == pytest.approx(expected, abs=1e-4)
+        assert colour_difference(np.array(first), np.array(second)) == pytest.approx(
+            expected, abs=1e-4
+        )
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_ice_snow_wet_and_dry_are_told_apart(sight: str) -> None:
-    shades = [lab(shade(mu, *GRIP_RANGE), sight) for mu in SURFACES.values()]
-    assert min(difference(a, b) for a, b in combinations(shades, 2)) >= LEAST
+    shades = [to_lab(shade(mu, *GRIP_RANGE), sight) for mu in SURFACES.values()]
+    assert min(colour_difference(a, b) for a, b in combinations(shades, 2)) >= LEAST
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_none_of_them_is_the_white_of_what_was_not_measured(sight: str) -> None:
-    white = lab("#ffffff", sight)
+    white = to_lab("#ffffff", sight)
     assert (
-        min(difference(lab(shade(mu, *GRIP_RANGE), sight), white) for mu in SURFACES.values())
+        min(
+            colour_difference(to_lab(shade(mu, *GRIP_RANGE), sight), white)
+            for mu in SURFACES.values()
+        )
         >= LEAST
     )
 
 
 def test_colour_scale_lightness_increases_monotonically() -> None:
-    light = [float(lab(stop)[0]) for stop in GRIP]
+    light = [float(to_lab(stop)[0]) for stop in GRIP]
     assert all(b > a + 2.0 for a, b in pairwise(light))
-    surfaces = [float(lab(shade(mu, *GRIP_RANGE))[0]) for mu in SURFACES.values()]
+    surfaces = [float(to_lab(shade(mu, *GRIP_RANGE))[0]) for mu in SURFACES.values()]
     assert all(b > a + LEAST for a, b in pairwise(surfaces))
 
 
@@ -55,11 +60,14 @@ def test_colour_scale_lightness_increases_monotonically() -> None:
 def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
     assert set(ESTIMATORS) == set(REGISTERED)
     for (first, a), (second, b) in combinations([*ESTIMATORS.items(), ("truth", TRUTH)], 2):
-        assert difference(lab(a.colour, sight), lab(b.colour, sight)) >= LEAST, (first, second)
+        assert colour_difference(to_lab(a.colour, sight), to_lab(b.colour, sight)) >= LEAST, (
+            first,
+            second,
+        )
 
 
 def test_the_old_scale_fails() -> None:
     """Red to green, which this replaced: dry and snow were one olive to one man in twelve."""
-    snow = lab("#b8831b", "deuteranopia")
-    dry = lab("#1bb83e", "deuteranopia")
-    assert difference(snow, dry) < LEAST
+    snow = to_lab("#b8831b", "deuteranopia")
+    dry = to_lab("#1bb83e", "deuteranopia")
+    assert colour_difference(snow, dry) < LEAST

@@ -20,7 +20,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_results_pages_are_current() -> None:
-    assert results.stale() == []
+    assert results.find_stale() == []
 
 
 def test_readme_has_one_results_block_of_at_most_eight_rows() -> None:
@@ -34,7 +34,7 @@ def test_readme_has_one_results_block_of_at_most_eight_rows() -> None:
 def test_every_judged_figure_is_on_the_page_with_its_commit() -> None:
     page = results.results_page()
     for name in results.CAMPAIGNS:
-        for row in results.kept(name).values():
+        for row in results.read_kept(name).values():
             assert row["commit"]
             if row["bar"] is not None:
                 assert f"|`{row['name']}`|" in page
@@ -48,7 +48,7 @@ def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
         [1, 2, 3],
         [Figure("demo.a", 0.9, "", 0.8, "more"), Figure("demo.b", 0.2, "", 0.1)],
     )
-    assert results.keep("demo", left).startswith("demo: 2 figures")
+    assert results.keep_figures("demo", left).startswith("demo: 2 figures")
     page = results.results_page()
     assert "2 figures have a bar; 1 hold and 1 do not." in page
     assert f"|`demo.b` {results.MISSED}|0.2|≤ 0.1|" in page.split("\n## ")[1]
@@ -62,28 +62,28 @@ def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
     figures.write(
         left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("unshown", 1.0, "")]
     )
-    assert results.keep("demo", left).startswith("demo: 1 figures")
+    assert results.keep_figures("demo", left).startswith("demo: 1 figures")
     figures.write(left, "demo", [1], [Figure("demo.b", 0.1, "", 0.12)])
-    assert results.keep("demo", left).startswith("demo: 1 figures")
-    assert set(results.kept("demo")) == {"demo.a", "demo.b"}
+    assert results.keep_figures("demo", left).startswith("demo: 1 figures")
+    assert set(results.read_kept("demo")) == {"demo.a", "demo.b"}
     figures.write(left, "demo --quick", [1], [Figure("demo.a", 0.5, "")])
-    assert "unchanged" in results.keep("demo", left)
-    assert results.kept("demo")["demo.a"]["value"] == 0.955
-    assert "run `make demo` first" in results.keep("demo", folder / "none.json")
+    assert "unchanged" in results.keep_figures("demo", left)
+    assert results.read_kept("demo")["demo.a"]["value"] == 0.955
+    assert "run `make demo` first" in results.keep_figures("demo", folder / "none.json")
 
 
 def test_an_older_run_replaces_nothing(folder: Path) -> None:
     left = folder / "left.json"
     figures.write(left, "demo", [1], [Figure("demo.a", 0.5, "", 0.9)])
-    results.keep("demo", left)
+    results.keep_figures("demo", left)
     rows = json.loads(left.read_text())
     rows[0]["date"] = "2000-01-01T00:00:00+00:00"
     rows[1]["value"] = 0.1
     left.write_text(json.dumps(rows))
-    assert "older" in results.keep("demo", left)
-    assert results.kept("demo")["demo.a"]["value"] == 0.5
+    assert "older" in results.keep_figures("demo", left)
+    assert results.read_kept("demo")["demo.a"]["value"] == 0.5
 
 
 def test_a_table_without_its_figures_says_so() -> None:
     table = next(table for table in results.TABLES if table.campaign == "fleet")
-    assert results._rendered(table, {}).startswith("Not complete: the kept run has no figure ")
+    assert results._render_table(table, {}).startswith("Not complete: the kept run has no figure ")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests import structure
-from tests.structure import MOST_PARAMETERS, PACKAGES, ROOT, imported, parse
+from tests.structure import MOST_PARAMETERS, PACKAGES, ROOT, list_imports, parse
 
 LONGEST_FILE = 530  # lines; beyond that a file does more than one thing
 
@@ -190,28 +190,28 @@ LEFT_BEHIND = ("__pycache__", "gripmap.egg-info", "build", "dist")
 TRIED = "try"  # where the README's commands write; git ignores it
 
 
-def sources(*folders: str) -> list[Path]:
+def all_sources(*folders: str) -> list[Path]:
     """Every Python file below the folders that a person wrote."""
     return [
         path
         for name in folders
-        for path in ([ROOT / name] if name.endswith(".py") else structure.sources(ROOT, name))
+        for path in ([ROOT / name] if name.endswith(".py") else structure.list_sources(ROOT, name))
     ]
 
 
-def where(path: Path, line: int) -> str:
+def place_of(path: Path, line: int) -> str:
     return f"{path.relative_to(ROOT)}:{line}"
 
 
-def crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
+def find_crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
     """Imports of project packages that `package` may not know."""
     forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
-    return [(line, name) for line, name in imported(tree) if name.split(".")[0] in forbidden]
+    return [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in forbidden]
 
 
-def impurities(tree: ast.AST) -> list[tuple[int, str]]:
+def find_impurities(tree: ast.AST) -> list[tuple[int, str]]:
     """Imports and calls by which a pure module would reach the world outside."""
-    found = [(line, name) for line, name in imported(tree) if name.split(".")[0] in IMPURE]
+    found = [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in IMPURE]
     for node in ast.walk(tree):
         if (
             isinstance(node, ast.Call)
@@ -228,7 +228,7 @@ def impurities(tree: ast.AST) -> list[tuple[int, str]]:
     return found
 
 
-def undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def find_undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield public modules, classes and functions without a docstring; names inside a function are
     private.
     """
@@ -274,7 +274,7 @@ def test_figures_count_planted_faults(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("package", ROOMS)
 def test_rooms_import_along_the_way_of_the_data(package: str) -> None:
-    found = structure.arrows(ROOT, package)
+    found = structure.list_room_imports(ROOT, package)
     assert {room for arrow in found for room in arrow} <= set(ROOMS[package]), (
         "a room that the table does not know"
     )
@@ -332,8 +332,8 @@ def shared_numbers(text: str) -> Iterator[tuple[int, str]]:
 
 def test_a_number_that_rooms_share_stands_once() -> None:
     found = [
-        f"{where(path, line)} {number}"
-        for path in sources(*PACKAGES)
+        f"{place_of(path, line)} {number}"
+        for path in all_sources(*PACKAGES)
         if path != ROOT / "schemas" / "thresholds.py"
         for line, number in shared_numbers(path.read_text(encoding="utf-8"))
     ]
@@ -351,18 +351,18 @@ def test_a_shared_number_is_seen(line: str) -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_imports_between_packages_point_one_way(package: str) -> None:
     found = [
-        f"{where(path, line)} imports {name}"
-        for path in sources(package)
-        for line, name in crossings(parse(path), package)
+        f"{place_of(path, line)} imports {name}"
+        for path in all_sources(package)
+        for line, name in find_crossings(parse(path), package)
     ]
     assert not found, "\n".join(found)
 
 
 def test_no_package_imports_relatively() -> None:
     found = [
-        where(path, line)
-        for path in sources(*PACKAGES)
-        for line, name in imported(parse(path))
+        place_of(path, line)
+        for path in all_sources(*PACKAGES)
+        for line, name in list_imports(parse(path))
         if name[0] == "."
     ]
     assert not found, "\n".join(found)
@@ -370,12 +370,12 @@ def test_no_package_imports_relatively() -> None:
 
 @pytest.mark.parametrize("folder", [*PURE, *SANS_IO])
 def test_pure_core_uses_no_files_network_clock_or_global_randomness(folder: str) -> None:
-    assert sources(folder), f"{folder} is gone; name its successor in PURE"
+    assert all_sources(folder), f"{folder} is gone; name its successor in PURE"
     tables = ("pyarrow",) if folder in SANS_IO else ()
     found = [
-        f"{where(path, line)} uses {name}"
-        for path in sources(folder)
-        for line, name in impurities(parse(path))
+        f"{place_of(path, line)} uses {name}"
+        for path in all_sources(folder)
+        for line, name in find_impurities(parse(path))
         if name not in tables
     ]
     assert not found, "\n".join(found)
@@ -387,9 +387,9 @@ def test_pure_core_imports_only_pure_core_and_plain_contract(folder: str) -> Non
         f"schemas.{name}" for name in PURE_SCHEMAS
     }
     found = [
-        f"{where(path, line)} imports {name}"
-        for path in sources(folder)
-        for line, name in imported(parse(path))
+        f"{place_of(path, line)} imports {name}"
+        for path in all_sources(folder)
+        for line, name in list_imports(parse(path))
         if name.split(".")[0] in PACKAGES
         and not any(f"{name}.".startswith(f"{good}.") for good in allowed)
     ]
@@ -408,24 +408,25 @@ def test_pure_core_imports_only_pure_core_and_plain_contract(folder: str) -> Non
     ],
 )
 def test_an_impure_line_is_seen(text: str) -> None:
-    assert impurities(ast.parse(text))
+    assert find_impurities(ast.parse(text))
 
 
 def test_a_generator_as_an_argument_is_pure() -> None:
-    assert not impurities(
+    assert not find_impurities(
         ast.parse("import numpy as np\ndef f(rng: np.random.Generator): return rng.normal()")
     )
 
 
 def test_an_import_across_packages_is_seen() -> None:
-    assert crossings(ast.parse("def f():\n    import fleet_service.app.service"), "edge_agent")
-    assert crossings(ast.parse("from edge_agent import agent"), "schemas")
-    assert not crossings(ast.parse("from schemas import grid"), "edge_agent")
+    assert find_crossings(ast.parse("def f():\n    import fleet_service.app.service"), "edge_agent")
+    assert find_crossings(ast.parse("from edge_agent import agent"), "schemas")
+    assert not find_crossings(ast.parse("from schemas import grid"), "edge_agent")
 
 
 def test_no_file_is_longer_than_it_can_be_read() -> None:
     lengths = {
-        path: path.read_text(encoding="utf-8").count("\n") for path in sources(*PACKAGES, "tests")
+        path: path.read_text(encoding="utf-8").count("\n")
+        for path in all_sources(*PACKAGES, "tests")
     }
     found = [
         f"{path.relative_to(ROOT)}: {length} lines"
@@ -446,9 +447,9 @@ def test_top_level_holds_only_the_entries_of_the_design() -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_everything_public_has_a_docstring(package: str) -> None:
     found = [
-        f"{where(path, line)} {name}"
-        for path in sources(package)
-        for line, name in undocumented(parse(path))
+        f"{place_of(path, line)} {name}"
+        for path in all_sources(package)
+        for line, name in find_undocumented(parse(path))
     ]
     assert not found, "\n".join(found)
 
@@ -457,7 +458,7 @@ def test_a_missing_docstring_is_seen_and_a_private_one_is_not_missed() -> None:
     tree = ast.parse(
         '"""M."""\nclass A:\n    """A."""\n    def f(self): ...\n    def _g(self): ...\ndef _h(): ...'
     )
-    assert [name for _, name in undocumented(tree)] == ["f"]
+    assert [name for _, name in find_undocumented(tree)] == ["f"]
 
 
 def test_the_tests_mirror_the_packages() -> None:

@@ -15,7 +15,7 @@ sys.path.insert(0, str(ROOT))
 
 from tests import reference_pages  # noqa: E402
 
-reference_pages.write(Path(__file__).parent / "reference" / "generated")
+reference_pages.write_pages(Path(__file__).parent / "reference" / "generated")
 
 project = "GripMap"
 author = "GripMap maintainers"

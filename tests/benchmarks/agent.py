@@ -50,11 +50,11 @@ def agent() -> list[Figure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with open_stage(folder / "stage") as there:
-            found = [*live(folder, there.endpoint), *fleet(folder, there.endpoint)]
-        return [*start(folder), *found, *replay(folder)]
+            found = [*measure_live(folder, there.endpoint), *measure_fleet(folder, there.endpoint)]
+        return [*measure_start(folder), *found, *measure_replay(folder)]
 
 
-def drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
+def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
     """A simulated log and its vehicle file."""
     log = folder / f"{name}.parquet"
     vehicle = folder / f"{name}.json"
@@ -72,25 +72,25 @@ def drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Pat
     return log, vehicle
 
 
-def start(folder: Path) -> list[Figure]:
+def measure_start(folder: Path) -> list[Figure]:
     """Help, and a new process's first estimate, compiled code in the cache."""
-    files = [str(path) for path in drive(folder, "short", 0, 2.0)]
+    files = [str(path) for path in simulate_drive(folder, "short", 0, 2.0)]
 
-    def process(*words: str) -> None:
+    def run_process(*words: str) -> None:
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
 
     return [
-        Figure("bench.start.help_s", median_s(lambda: process(*EDGE, "--help")), "s", 0.4),
+        Figure("bench.start.help_s", median_s(lambda: run_process(*EDGE, "--help")), "s", 0.4),
         Figure(
             "bench.start.first_estimate_s",
-            median_s(lambda: process(sys.executable, "-c", FIRST, *files)),
+            median_s(lambda: run_process(sys.executable, "-c", FIRST, *files)),
             "s",
             1.5,
         ),
     ]
 
 
-def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
+def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
     """CPU [s] and resident memory [MB] of a command of the edge agent.
 
     Raises:
@@ -104,7 +104,7 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
         process = subprocess.Popen(
             [*EDGE, *words, "--config", str(config)], stdout=out, stderr=subprocess.DEVNULL
         )
-        peak, cost = watched(process.pid)
+        peak, cost = watch_memory(process.pid)
         out.seek(0)
         counted = json.loads(out.read().splitlines()[-1])
     if counted["unsettled"]:
@@ -112,7 +112,7 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
     return cost.ru_utime + cost.ru_stime, peak
 
 
-def watched(pid: int) -> tuple[float, resource.struct_rusage]:
+def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
     """Return the peak resident memory [MB] of a process, sampled until it ends, and its resource
     usage.
 
@@ -134,11 +134,11 @@ def watched(pid: int) -> tuple[float, resource.struct_rusage]:
     return peak, cost
 
 
-def live(folder: Path, endpoint: str) -> list[Figure]:
+def measure_live(folder: Path, endpoint: str) -> list[Figure]:
     """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not
     count.
     """
-    log, vehicle = drive(folder, "live", 0, START_S + LIVE_S + 1.0)
+    log, vehicle = simulate_drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (
         "run",
         "--source",
@@ -150,22 +150,22 @@ def live(folder: Path, endpoint: str) -> list[Figure]:
         "bench-car",
         "--duration",
     )
-    used(folder, endpoint, *words, str(WARM_S))
-    short, _ = used(folder, endpoint, *words, str(START_S))
-    long, memory = used(folder, endpoint, *words, str(START_S + LIVE_S))
+    measure_usage(folder, endpoint, *words, str(WARM_S))
+    short, _ = measure_usage(folder, endpoint, *words, str(START_S))
+    long, memory = measure_usage(folder, endpoint, *words, str(START_S + LIVE_S))
     return [
         Figure("bench.agent.core_share", (long - short) / LIVE_S, "of a core, 100 Hz", 0.03),
         Figure("bench.agent.resident_mb", memory, "MB", 280),
     ]
 
 
-def fleet(folder: Path, endpoint: str) -> list[Figure]:
+def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
     """Measure how many vehicles a core carries in real time: plant, estimator, publishing; from the
     CPU of a whole fleet."""
     words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
-    used(folder, endpoint, *words, str(WARM_S))
-    short, _ = used(folder, endpoint, *words, str(START_S))
-    long, _ = used(folder, endpoint, *words, str(START_S + FLEET_S))
+    measure_usage(folder, endpoint, *words, str(WARM_S))
+    short, _ = measure_usage(folder, endpoint, *words, str(START_S))
+    long, _ = measure_usage(folder, endpoint, *words, str(START_S + FLEET_S))
     return [
         Figure(
             "bench.fleet.vehicles",
@@ -177,11 +177,11 @@ def fleet(folder: Path, endpoint: str) -> list[Figure]:
     ]
 
 
-def replay(folder: Path) -> list[Figure]:
+def measure_replay(folder: Path) -> list[Figure]:
     """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet
     included.
     """
-    logs = [drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
+    logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])
     vehicle = load_vehicle(logs[0][1])
     block = next(log.blocks(0))

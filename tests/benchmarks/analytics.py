@@ -40,7 +40,7 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.contract import size_of
-from tests.benchmarks.past import past
+from tests.benchmarks.past import measure_past
 from tests.fleet_service.analytics.agreement import differs, roads_along
 from tests.fleet_service.archive.readers import READERS, by_spark
 
@@ -56,7 +56,7 @@ PART = Extract(START_NS, START_NS + DAYS * DAY_S * 10**9)
 HALF = START_NS + DAY_S * 10**9
 
 
-def tell(line: str) -> None:
+def print_progress(line: str) -> None:
     """Progress."""
     print(f"  {line}", flush=True)
 
@@ -71,7 +71,7 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
     return float(np.median(spent))
 
 
-def stations(folder: Path) -> Path:
+def write_stations(folder: Path) -> Path:
     """Hourly readings of five stations."""
     hours = np.arange(DAYS * 24)
     names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
@@ -89,15 +89,15 @@ def stations(folder: Path) -> Path:
     return path
 
 
-def archive(root: Path, rows: int) -> list[Figure]:
+def measure_archive(root: Path, rows: int) -> list[Figure]:
     """Rows per second of compaction, bytes of an observation."""
-    tell(f"writing {rows:,} observations")
+    print_progress(f"writing {rows:,} observations")
     synthetic.write(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.paths(root, Kind.OBSERVATION))
     began = time.process_time()
     done = compact(root)
     spent = time.process_time() - began
-    tell(f"compacted into {done.files} files")
+    print_progress(f"compacted into {done.files} files")
     size = size_of((root / "observations").rglob("*.parquet"))
     return [
         Figure(
@@ -112,20 +112,20 @@ def archive(root: Path, rows: int) -> list[Figure]:
     ]
 
 
-def _ask(name: str, root: Path, options: Options) -> pa.Table:
+def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
     """A question to an engine of its own."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
-def questions(root: Path, readings: Path) -> list[Figure]:
+def measure_questions(root: Path, readings: Path) -> list[Figure]:
     """Seconds of four questions on all rows; milliseconds of the history of one cell."""
     found = []
     for name in TIMED:
         options = Options(stations=readings, report=lambda _: None)
         began = time.process_time()
-        spent = median_s(partial(_ask, name, root, options))
+        spent = median_s(partial(_ask_question, name, root, options))
         busy = (time.process_time() - began) / ROUNDS
-        tell(f"{name}: {spent:.2f} s, {busy:.2f} s of CPU")
+        print_progress(f"{name}: {spent:.2f} s, {busy:.2f} s of CPU")
         found += [
             Figure(f"analytics.{name}_s", spent, "s", 5),
             Figure(f"analytics.{name}_cpu_s", busy, "s of CPU"),
@@ -135,14 +135,14 @@ def questions(root: Path, readings: Path) -> list[Figure]:
     chosen = np.random.default_rng(SEED).choice(cells, CELLS_ASKED)
     columns = ("time", "vehicle", "mu", "mu_lower", "mu_upper", "mu_utilised")
 
-    def history(cell: int) -> None:
+    def query_history(cell: int) -> None:
         t.filter(t.cell == cell).select(*columns).order_by("time").to_pyarrow()
 
-    spent = np.median([median_s(lambda cell=int(cell): history(cell), 1) for cell in chosen])  # type: ignore[misc]
+    spent = np.median([median_s(lambda cell=int(cell): query_history(cell), 1) for cell in chosen])  # type: ignore[misc]
     return [*found, Figure("analytics.one_cell_ms", float(spent) * 1e3, "ms", 50)]
 
 
-def small(root: Path) -> dict[int, pa.Table]:
+def write_small_archive(root: Path) -> dict[int, pa.Table]:
     """A small archive with snapshots; returns them by time."""
     synthetic.write(root, SMALL, 4000)
     compact(root)
@@ -159,16 +159,16 @@ def small(root: Path) -> dict[int, pa.Table]:
     return maps
 
 
-def agreement(root: Path, readings: Path) -> list[Figure]:
+def measure_agreement(root: Path, readings: Path) -> list[Figure]:
     """Files that a validator refuses, readers that fail, questions that engines answer
     differently.
     """
-    invalid = sum(bool(_refused(path)) for path in _geo_files(root))
+    invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
     readers = READERS | ({"spark": by_spark} if find_spec("pyspark") else {})
-    failed = sum(not _reads(reader, root, expected) for reader in readers.values())
-    tell(f"readers: {', '.join(readers)}")
-    different = _different(root, readings) if find_spec("pyspark") else float("nan")
+    failed = sum(not _can_read(reader, root, expected) for reader in readers.values())
+    print_progress(f"readers: {', '.join(readers)}")
+    different = _count_differences(root, readings) if find_spec("pyspark") else float("nan")
     return [
         Figure("archive.geoparquet_invalid", invalid, "files", 0),
         Figure("archive.readers_failed", failed, f"of {len(readers)} tools", 0),
@@ -187,7 +187,7 @@ def _geo_files(root: Path) -> Iterator[Path]:
         yield path
 
 
-def _refused(path: Path) -> list[str]:
+def _find_refusals(path: Path) -> list[str]:
     report = geoparquet_validator.check(str(path))
     return [
         *geoparquet_validator.failed(report, "core"),
@@ -195,15 +195,15 @@ def _refused(path: Path) -> list[str]:
     ]
 
 
-def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: int) -> bool:
+def _can_read(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: int) -> bool:
     try:
         return reader(root)[0] == expected
     except Exception as error:  # noqa: BLE001 whatever a tool of others raises is what is counted
-        tell(f"{reader.__name__}: {error}")
+        print_progress(f"{reader.__name__}: {error}")
         return False
 
 
-def _different(root: Path, readings: Path) -> int:
+def _count_differences(root: Path, readings: Path) -> int:
     count = 0
     roads = root.parent / "roads.parquet"
     pq.write_table(
@@ -224,13 +224,13 @@ def _different(root: Path, readings: Path) -> int:
             question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark")
         )
         said = differs(one, other, question)
-        tell(f"{question.name}: {said or 'the engines agree'}")
+        print_progress(f"{question.name}: {said or 'the engines agree'}")
         count += said is not None
     return count
 
 
 @contextmanager
-def folder() -> Iterator[Path]:
+def open_folder() -> Iterator[Path]:
     """An empty folder for the archives; they are gone afterwards, the figures stay."""
     FOLDER.mkdir(exist_ok=True)
     work = FOLDER / "work"
@@ -249,13 +249,13 @@ def main() -> int:
     )
     parser.add_argument("--rows", type=int, default=ROWS, help="observations (default ten million)")
     rows = parser.parse_args().rows
-    with folder() as work:
-        readings = stations(work)
-        found = archive(work / "large", rows)
-        found += questions(work / "large", readings)
-        small(work / "small")
-        found += agreement(work / "small", readings)
-        found += past(work / "past", tell)
+    with open_folder() as work:
+        readings = write_stations(work)
+        found = measure_archive(work / "large", rows)
+        found += measure_questions(work / "large", readings)
+        write_small_archive(work / "small")
+        found += measure_agreement(work / "small", readings)
+        found += measure_past(work / "past", print_progress)
     figures.write(FOLDER / "figures.json", "analytics", [SEED], found)
     print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json")
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1

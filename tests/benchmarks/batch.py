@@ -17,11 +17,13 @@ from tests.structure import ROOT
 FOLDER: Final = ROOT / ".batch"
 
 
-def measured(folder: Path) -> list[Figure]:
+def measure_all(folder: Path) -> list[Figure]:
     """Return all figures; the files made for them go into a folder."""
-    logs = spread.drives(folder / "drives")
+    logs = spread.simulate_drives(folder / "drives")
     return [
-        Figure("iceberg.rows_different", iceberg.measured(folder / "iceberg"), "rows", 0.0),
+        Figure(
+            "iceberg.rows_different", iceberg.count_different_rows(folder / "iceberg"), "rows", 0.0
+        ),
         Figure(
             "spark.replay.difference",
             spread.replay_difference(logs, folder / "replay"),
@@ -39,7 +41,7 @@ def main() -> int:
     """Measure; 1 where a bar does not hold."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        rows = measured(Path(folder))
+        rows = measure_all(Path(folder))
     figures.write(FOLDER / "figures.json", "batch", (*iceberg.SEEDS, *spread.SEEDS), rows)
     print(figures.markdown(rows))
     return 0 if all(row.holds for row in rows) else 1

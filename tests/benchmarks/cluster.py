@@ -19,7 +19,7 @@ from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
-from tests.benchmarks.service import ack_delays_s, process, until
+from tests.benchmarks.service import ack_delays_s, poll_until, run_process
 from tests.buckets import bucket_server
 
 TURNS = 3  # of each, so that what else the machine does hits both
@@ -33,11 +33,13 @@ def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
         stack.enter_context(router)
         config = folder / "service.json"
         config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}, "archive": archive}))
-        stack.enter_context(process("-m", "fleet_service.cli", "run", "--config", str(config)))
+        stack.enter_context(run_process("-m", "fleet_service.cli", "run", "--config", str(config)))
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
-        until(lambda: [reply for reply in client.liveliness().get(keys.shard_key("*")) if reply.ok])
+        poll_until(
+            lambda: [reply for reply in client.liveliness().get(keys.shard_key("*")) if reply.ok]
+        )
         return ack_delays_s(client)
 
 
@@ -51,7 +53,7 @@ def cluster() -> list[Figure]:
             alone += delays_s(folder, {"path": str(folder / f"alone-{turn}")})
             with bucket_server(folder / f"objects-{turn}") as bucket:
                 both += delays_s(folder, {"path": str(folder / f"both-{turn}"), **bucket.settings})
-                objects = sum(name.startswith("inbox/") for name in bucket.objects())
+                objects = sum(name.startswith("inbox/") for name in bucket.read_objects())
             if not objects:
                 raise RuntimeError("nothing was put into the bucket")
     least = statistics.median(alone)

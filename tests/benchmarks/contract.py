@@ -15,7 +15,7 @@ from schemas import wire
 from schemas.runtime.batch_decoder import decode_many
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
-from tests.benchmarks.fabricated import visits
+from tests.benchmarks.fabricated import make_visits
 from tests.benchmarks.measure import SEED, median_s
 
 WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
@@ -24,7 +24,7 @@ WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
 def contract() -> list[Figure]:
     """Cost and size of an observation on the wire, ten to a message, and in Parquet."""
     rows = 10
-    columns = visits(10, 1, 10)
+    columns = make_visits(10, 1, 10)
     names = wire.column_types(Kind.OBSERVATION)
     batch = Batch(
         Kind.OBSERVATION, "bench", 1, 1, 1, 1, {name: columns[name] for name in names}, "aco-fckf"

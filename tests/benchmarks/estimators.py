@@ -22,7 +22,7 @@ def estimators() -> list[Figure]:
     ]
     t: FloatArray = log["t"].to_numpy()[:, None]
 
-    def drive(n: int, samples: int) -> float:
+    def run_estimator(n: int, samples: int) -> float:
         block = np.repeat(signals[:samples], n, axis=1)
         times = np.repeat(t[:samples], n, axis=1)
         banks = [
@@ -31,8 +31,8 @@ def estimators() -> list[Figure]:
         seconds = median_s(lambda: banks.pop().advance(times, block))
         return seconds / (n * samples) * 1e6
 
-    one = drive(1, len(t))
-    many = drive(200, 100)
+    one = run_estimator(1, len(t))
+    many = run_estimator(200, 100)
     return [
         Figure("bench.aco_fckf.us", one, "us per vehicle-step of the default, N = 1", 25),
         Figure("bench.aco_fckf.flatness", many / one, "N = 200 over N = 1", 1.2),

@@ -9,7 +9,7 @@ from schemas.wire import Columns, Kind
 from tests.benchmarks.measure import SEED
 
 
-def visits(rows: int, vehicles: int, cells: int) -> Columns:
+def make_visits(rows: int, vehicles: int, cells: int) -> Columns:
     """Columns of observations spread over cells."""
     rng = np.random.default_rng(SEED)
     latitude = 57.0 + rng.integers(0, cells, rows) * 1e-4 / 100

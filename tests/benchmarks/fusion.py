@@ -19,7 +19,7 @@ from schemas import grid, mugrid
 from schemas.numeric import IntArray
 from schemas.runtime.figures import Figure
 from schemas.runtime.process import trim_memory
-from tests.benchmarks.measure import ROUNDS, SEED, paired
+from tests.benchmarks.measure import ROUNDS, SEED, time_in_turn
 
 BATCH = 5_000  # rows of a turn of the service under load
 VEHICLES = 5_000
@@ -36,7 +36,7 @@ resident()
 """
 
 
-def visits(
+def make_visits(
     rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float
 ) -> Observations:
     """Visits to cells of a square, anywhere in `seconds`, in order of time."""
@@ -71,20 +71,22 @@ def visits(
     )
 
 
-def filled(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
+def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
     """A fusion that heard so many visits of each cell, and the generator to go on with."""
     rng = np.random.default_rng(SEED)
     fusion = Fusion(120.0)
     parts = max(cells * per_cell // 100_000, 1)
     for part in range(parts):
-        for batch in batches(
-            visits(rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts)
+        for batch in split_batches(
+            make_visits(
+                rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts
+            )
         ):
             fusion.update(batch)
     return fusion, rng
 
 
-def batches(o: Observations) -> Iterator[Observations]:
+def split_batches(o: Observations) -> Iterator[Observations]:
     """Turns of the service."""
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)
@@ -94,10 +96,12 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
     """Processor seconds per observation in a fusion of so many cells: median over ROUNDS
     minutes.
     """
-    fusion, rng = filled(cells, 1, 600.0)
+    fusion, rng = fill_fusion(cells, 1, 600.0)
     spent = []
     for minute in range(ROUNDS + 3):  # until the window is full
-        parts = list(batches(visits(rng, 60 * per_s, cells, 660.0 + 60.0 * minute, 60.0)))
+        parts = list(
+            split_batches(make_visits(rng, 60 * per_s, cells, 660.0 + 60.0 * minute, 60.0))
+        )
         began = time.process_time()
         for part in parts:
             fusion.update(part)
@@ -114,22 +118,22 @@ def table_vs_dict() -> float:
     store = Store()
     known = Dict.empty(types.int64, types.int64)
     store.slots_for(keys)
-    _fill(known, keys)
+    _fill_dict(known, keys)
 
-    def table() -> None:
+    def look_up_in_table() -> None:
         for turn in turns:
             store.slots_of(turn)
 
-    def dictionary() -> None:
+    def look_up_in_dict() -> None:
         for turn in turns:
             _look_up(known, turn)
 
-    ours, other = paired(table, dictionary)
+    ours, other = time_in_turn(look_up_in_table, look_up_in_dict)
     return other / ours
 
 
 @njit
-def _fill(known: Any, keys: IntArray) -> None:  # noqa: ANN401 numba's own type
+def _fill_dict(known: Any, keys: IntArray) -> None:  # noqa: ANN401 numba's own type
     for slot in range(len(keys)):
         known[keys[slot]] = slot
 
@@ -149,7 +153,7 @@ def resident() -> None:
     import fleet_service.app.service  # noqa: F401 what a service has loaded
     from fleet_service.serve.map_state import MapState
 
-    fusion, _ = filled(CELLS, 3, 86_400.0)
+    fusion, _ = fill_fusion(CELLS, 3, 86_400.0)
     MapState(fusion).tiles()
     trim_memory()  # as upkeep does
     with open("/proc/self/status") as status:  # noqa: PTH123

@@ -23,7 +23,7 @@ from fleet_service.fusion.constants import EPOCH_NS
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
-from tests.benchmarks.ingest import messages
+from tests.benchmarks.ingest import make_messages
 
 RATES: Final = {
     1_000: 24,
@@ -63,7 +63,7 @@ def second_s(rate: int, seconds: int) -> float:
         gc.freeze()  # as the service does when it starts
         for second in range(WARM_S + seconds):
             now = begin + second * SECOND
-            sent = messages(vehicles, ROWS, now, vehicles, second * vehicles)
+            sent = make_messages(vehicles, ROWS, now, vehicles, second * vehicles)
             began = time.process_time()
             for at in range(0, len(sent), TURN):
                 engine.intake.ingest(sent[at : at + TURN], now)

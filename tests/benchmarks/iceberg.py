@@ -42,19 +42,19 @@ def rows_different(root: Path, uri: str) -> int:
         ]
         there = pa.concat_tables(files)
         seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
-        ours = _counted(there)
-        theirs = _counted(seen)
+        ours = _count_rows(there)
+        theirs = _count_rows(seen)
         different += (ours - theirs).total() + (theirs - ours).total()
     return different
 
 
-def _counted(table: pa.Table) -> Counter[str]:
+def _count_rows(table: pa.Table) -> Counter[str]:
     return Counter(
         repr(row) for row in zip(*(column.to_pylist() for column in table.columns), strict=True)
     )
 
 
-def measured(folder: Path) -> float:
+def count_different_rows(folder: Path) -> float:
     """Rows that differ over four rounds of compaction and registration, and after a day has gone
     by retention.
     """

@@ -44,8 +44,8 @@ def ingest() -> list[Figure]:
     """Return observations per second, ten and one to a message, and CPU time compared with decoding
     alone.
     """
-    ten, bare, own = rates(10)
-    one, *_ = rates(1)
+    ten, bare, own = measure_rates(10)
+    one, *_ = measure_rates(1)
     return [
         Figure("bench.ingest.batch10_per_s", ten[0], "observations/s", 150_000, "more"),
         Figure("bench.ingest.batch10_per_cpu_s", ten[1], "observations per CPU second"),
@@ -63,21 +63,21 @@ def ingest() -> list[Figure]:
     ]
 
 
-def rates(records: int) -> tuple[tuple[float, float], float, float]:
+def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
     """Observations per second and per CPU second; per CPU second of decoding alone, the module's
     and ours.
 
     Medians after a warm-up.
     """
-    sent = messages(COUNTS[records], records, time.time_ns())
-    taken = [_take(sent, records) for _ in range(ROUNDS + 1)][1:]
+    sent = make_messages(COUNTS[records], records, time.time_ns())
+    taken = [_time_ingest(sent, records) for _ in range(ROUNDS + 1)][1:]
     rate = statistics.median(t[0] for t in taken), statistics.median(t[1] for t in taken)
     bare, own = (
         len(sent)
         * records
         / statistics.median([_decoding_s(sent, decode) for _ in range(ROUNDS + 1)][1:])
         for decode in (
-            _bare,
+            _decode_messages,
             lambda part: decode_many(Kind.OBSERVATION, [(m.payload, m.encoding) for m in part]),
         )
     )
@@ -97,7 +97,7 @@ def turn_of(sent: list[Message]) -> int:
     return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
 
-def _bare(sent: list[Message]) -> list[NDArray[Any]]:
+def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
     """The columns of messages, by the generated module."""
     read = [MESSAGE.FromString(message.payload) for message in sent]
     out: list[NDArray[Any]] = []
@@ -110,7 +110,7 @@ def _bare(sent: list[Message]) -> list[NDArray[Any]]:
     return out
 
 
-def messages(
+def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
     """So many messages of visits that ended `now` [ns], in one region, or one further `east`.
@@ -144,7 +144,7 @@ def messages(
     return out
 
 
-def _take(sent: list[Message], records: int) -> tuple[float, float]:
+def _time_ingest(sent: list[Message], records: int) -> tuple[float, float]:
     with (
         tempfile.TemporaryDirectory() as folder,
         closing(Engine(ServiceConfig(), Path(folder))) as engine,

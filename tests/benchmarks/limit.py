@@ -35,7 +35,7 @@ VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 
 @cache
-def library(source: str, *options: str) -> ctypes.CDLL:
+def compile_library(source: str, *options: str) -> ctypes.CDLL:
     """A kernel, by gcc -O3 -march=native and `options`.
 
     Raises:
@@ -94,7 +94,7 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
     return memory
 
 
-def pointer(array: FloatArray) -> ctypes.c_void_p:
+def pointer_to(array: FloatArray) -> ctypes.c_void_p:
     """Where an array lies."""
     return ctypes.c_void_p(array.ctypes.data)
 
@@ -108,7 +108,7 @@ class Limit:
         """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample;
         speed [m/s].
         """
-        self._library = library("kernel.c", "-fopenmp")
+        self._library = compile_library("kernel.c", "-fopenmp")
         self._parameters = np.ascontiguousarray(parameters)
         self._setting = setting_row(memberships)
         self._memory = first_memory(first, speed)
@@ -118,14 +118,14 @@ class Limit:
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
         self._library.drive(
-            pointer(self._memory),
-            pointer(self._parameters),
-            pointer(self._setting),
-            pointer(readings),
+            pointer_to(self._memory),
+            pointer_to(self._parameters),
+            pointer_to(self._setting),
+            pointer_to(readings),
             ctypes.c_double(gone),
             samples,
             vehicles,
-            pointer(out),
+            pointer_to(out),
         )
         return out
 
@@ -137,7 +137,7 @@ class VectorLimit:
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
         """Arguments as of `Limit`."""
-        self._library = library("kernel_simd.c", *VECTORS)
+        self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)
         self._parameters, self._memory = (
@@ -151,7 +151,7 @@ class VectorLimit:
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(
             -1, -2
         )
-        out = aligned(*turned.shape)
+        out = allocate_aligned(*turned.shape)
         out[...] = turned
         return out
 
@@ -160,21 +160,21 @@ class VectorLimit:
         apart.
         """
         samples, blocks, _, lanes = readings.shape
-        out = aligned(samples, blocks, STATES, lanes)
+        out = allocate_aligned(samples, blocks, STATES, lanes)
         self._library.drive(
-            pointer(self._memory),
-            pointer(self._parameters),
-            pointer(self._setting),
-            pointer(readings),
+            pointer_to(self._memory),
+            pointer_to(self._parameters),
+            pointer_to(self._setting),
+            pointer_to(readings),
             ctypes.c_double(gone),
             samples,
             blocks,
-            pointer(out),
+            pointer_to(out),
         )
         return out
 
 
-def aligned(*shape: int, to: int = 64) -> FloatArray:
+def allocate_aligned(*shape: int, to: int = 64) -> FloatArray:
     """An empty array whose memory begins at a multiple of `to` bytes."""
     count = math.prod(shape)
     raw = np.empty(8 * count + to, np.uint8)

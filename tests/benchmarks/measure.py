@@ -21,7 +21,7 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
     return statistics.median(spent)
 
 
-def paired(
+def time_in_turn(
     ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
 ) -> tuple[float, float]:
     """Median durations [s] of two works in turn, after a warm-up of each, so that both see the

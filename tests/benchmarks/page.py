@@ -39,11 +39,11 @@ from schemas.runtime.palette import FOUR, GROUND, LITTLE, TWO
 from schemas.thresholds import NS
 from tests import browser, npm
 from tests.benchmarks import page_stage
-from tests.benchmarks.page_outside import outside
-from tests.benchmarks.page_stage import CELLS, Stage, pinned, seen_town, stage
+from tests.benchmarks.page_outside import measure_outside
+from tests.benchmarks.page_stage import CELLS, Stage, open_stage, pin_to_core, seen_town
 from tests.browser import Opened
 from tests.fleet_service.page import scan
-from tests.sight import SIGHTS, difference, lab
+from tests.sight import SIGHTS, colour_difference, to_lab
 from tests.waiting import until
 
 T = TypeVar("T")
@@ -119,9 +119,9 @@ map.once("idle", () => { globalThis.shown = performance.now(); });
 
 
 @contextmanager
-def opened(address: str) -> Iterator[Opened]:
+def open_window(address: str) -> Iterator[Opened]:
     """An address in a large window, that notes when all was painted."""
-    with browser.opened("about:blank", unbound=True) as seen:
+    with browser.open_page("about:blank", unbound=True) as seen:
         size: Any = VIEWPORT
         seen.page.set_viewport_size(size)
         seen.page.add_init_script(_WATCH)
@@ -130,7 +130,7 @@ def opened(address: str) -> Iterator[Opened]:
         yield seen
 
 
-def drawn(on: Stage) -> dict[str, float]:
+def measure_drawing(on: Stage) -> dict[str, float]:
     """Return first picture and frames, ours and MapLibre's in turn; requests of the page to other
     hosts, and its errors.
     """
@@ -138,9 +138,9 @@ def drawn(on: Stage) -> dict[str, float]:
     theirs: list[tuple[float, float]] = []
     errors = list[str]()
     foreign = list[str]()
-    with maplibre(on) as other:
+    with serve_maplibre(on) as other:
         for _ in range(ROUNDS):
-            with opened(seen_town(on.address, on.town)) as seen:
+            with open_window(seen_town(on.address, on.town)) as seen:
                 first = float(seen.page.evaluate("shown / 1000"))
                 seen.page.evaluate(_OURS)
                 ours.append((first, float(seen.page.evaluate(_MOVES))))
@@ -151,7 +151,7 @@ def drawn(on: Stage) -> dict[str, float]:
                     if not url.startswith((on.address, "data:", "about:"))
                 ]
             if other is not None:
-                with opened(other) as seen:
+                with open_window(other) as seen:
                     first = float(seen.page.evaluate("shown / 1000"))
                     seen.page.evaluate(_THEIRS)
                     theirs.append((first, float(seen.page.evaluate(_MOVES))))
@@ -171,7 +171,7 @@ def drawn(on: Stage) -> dict[str, float]:
 
 
 @contextmanager
-def maplibre(on: Stage) -> Iterator[str | None]:
+def serve_maplibre(on: Stage) -> Iterator[str | None]:
     """The address of MapLibre with the town as GeoJSON, from a server of this process; None
     where npm has none.
     """
@@ -184,7 +184,7 @@ def maplibre(on: Stage) -> Iterator[str | None]:
         for file in files:
             assert file is not None
             (Path(folder) / file.name).write_bytes(file.read_bytes())
-        town = pa.Table.from_batches([on.town.table(tile) for tile in on.town.tiles]).select(
+        town = pa.Table.from_batches([on.town.make_batch(tile) for tile in on.town.tiles]).select(
             ["cell", "mu"]
         )
         extract.write(geo.with_cells(town), Path(folder) / "town.geojson")
@@ -209,17 +209,18 @@ def pushed_ms(on: Stage) -> float:
     """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed
     cells a second.
     """
-    with opened(seen_town(on.address, on.town)) as seen:
+    with open_window(seen_town(on.address, on.town)) as seen:
         tiles = list(on.town.tiles)
         put = dict[int, float]()
         seen.page.evaluate(
-            "all => { globalThis.markers = all }", [[tile, on.town.local(tile)] for tile in tiles]
+            "all => { globalThis.markers = all }",
+            [[tile, on.town.local_marker(tile)] for tile in tiles],
         )
         due = time.monotonic()
         for k in range(PUSHES):
             tile = tiles[k % len(tiles)]
             number = FIRST + k
-            payload = on.town.change(tile, int(CHANGED_HZ * PUT_S), number)
+            payload = on.town.change_cells(tile, int(CHANGED_HZ * PUT_S), number)
             put[number] = 1000.0 * time.time()
             on.session.put(keys.map_key(tile), payload)
             due += PUT_S
@@ -255,16 +256,16 @@ def bytes_per_cell(on: Stage) -> float:
         return len(answer.read()) / CELLS
 
 
-async def _watched(on: Stage, count: int) -> float:
+async def _measure_pushes(on: Stage, count: int) -> float:
     """95 % of the times [s] from a put to each of so many watchers; infinite where one heard
     less than all.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
-    local = on.town.local(on.town.marker)
+    local = on.town.local_marker(on.town.marker)
     begins = base64.b64encode(struct.pack("<I", on.town.marker))[:5]
 
-    async def watch(own: dict[int, float]) -> None:
+    async def watch_events(own: dict[int, float]) -> None:
         reader, writer = await asyncio.open_connection(host, int(port), limit=1 << 22)
         writer.write(f"GET /events HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
         while line := await reader.readline():
@@ -276,12 +277,14 @@ async def _watched(on: Stage, count: int) -> float:
                 for number in vehicles[place >> 2 == local].tolist():
                     own[number] = time.time()
 
-    tasks = [asyncio.create_task(watch(own)) for own in heard]
-    while json.loads(await asyncio.to_thread(_get, f"{on.address}health"))["watchers"] < count:
+    tasks = [asyncio.create_task(watch_events(own)) for own in heard]
+    while (
+        json.loads(await asyncio.to_thread(_fetch_page, f"{on.address}health"))["watchers"] < count
+    ):
         await asyncio.sleep(0.2)
     put = {}
     for number in range(1, WATCHED_PUSHES + 1):
-        payload = await asyncio.to_thread(on.town.change, on.town.marker, 250, number)
+        payload = await asyncio.to_thread(on.town.change_cells, on.town.marker, 250, number)
         put[number] = time.time()
         on.session.put(keys.map_key(on.town.marker), payload)
         await asyncio.sleep(0.5)
@@ -293,31 +296,31 @@ async def _watched(on: Stage, count: int) -> float:
     return float(np.quantile(late, 0.95, method="higher"))
 
 
-def _get(address: str) -> bytes:
+def _fetch_page(address: str) -> bytes:
     with urllib.request.urlopen(address, timeout=30) as answer:
         found: bytes = answer.read()
         return found
 
 
-def watchers(on: Stage) -> float:
+def count_watchers(on: Stage) -> float:
     """Return how many watchers get 95 % of the pushes within a second, the page on one core; 0 if
     fewer than the least tried."""
-    pinned(on.process, 0)
+    pin_to_core(on.process, 0)
     for count in WATCHERS:
-        late = asyncio.run(_watched(on, count))
+        late = asyncio.run(_measure_pushes(on, count))
         print(f"  {count} watchers: p95 {late:.3f} s", file=sys.stderr)
-        until(lambda: json.loads(_get(f"{on.address}health"))["watchers"] == 0, 60.0)
+        until(lambda: json.loads(_fetch_page(f"{on.address}health"))["watchers"] == 0, 60.0)
         if late <= 1.0:
             return float(count)
     return 0.0
 
 
-def accessible(on: Stage) -> float:
+def count_findings(on: Stage) -> float:
     """Serious findings of axe-core in all panels; NaN where it is not there."""
-    with opened(seen_town(on.address, on.town)) as seen:
+    with open_window(seen_town(on.address, on.town)) as seen:
         seen.page.evaluate(
             "([tile, local]) => gripmap.choose(tile, local)",
-            [on.town.marker, on.town.local(on.town.marker)],
+            [on.town.marker, on.town.local_marker(on.town.marker)],
         )
         found = scan.findings(seen)
     for line in found or ():
@@ -328,17 +331,19 @@ def accessible(on: Stage) -> float:
 def colour_distance() -> float:
     """The least between any two classes and the ground, of all kinds of sight (CIEDE2000)."""
     pairs = [(a, b) for k, a in enumerate(ALL) for b in ALL[:k]]
-    return min(difference(lab(a, sight), lab(b, sight)) for sight in SIGHTS for a, b in pairs)
+    return min(
+        colour_difference(to_lab(a, sight), to_lab(b, sight)) for sight in SIGHTS for a, b in pairs
+    )
 
 
-def measured() -> list[Figure]:
+def measure_all() -> list[Figure]:
     """All figures, in the order of their table."""
-    with stage(SEED) as on:
-        found = _said("drawn", lambda: drawn(on))
-        found["push_p95_ms"] = _said("pushed", lambda: pushed_ms(on))
+    with open_stage(SEED) as on:
+        found = _time_part("drawn", lambda: measure_drawing(on))
+        found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))
         found["bytes_per_cell"] = bytes_per_cell(on)
-        found["axe_serious"] = _said("scanned", lambda: accessible(on))
-        found["watchers"] = _said("watched", lambda: watchers(on))
+        found["axe_serious"] = _time_part("scanned", lambda: count_findings(on))
+        found["watchers"] = _time_part("watched", lambda: count_watchers(on))
     found["colour_distance"] = colour_distance()
     rows: list[tuple[str, str, float | None, Any]] = [
         ("first_picture_s", f"s, {CELLS} cells, the middle of {ROUNDS}", 0.5, "less"),
@@ -357,10 +362,10 @@ def measured() -> list[Figure]:
     own = [
         Figure(f"page.{name}", found[name], unit, bar, better) for name, unit, bar, better in rows
     ]
-    return own + _said("what leaves the house", outside)
+    return own + _time_part("what leaves the house", measure_outside)
 
 
-def _said(what: str, measure: Callable[[], T]) -> T:
+def _time_part(what: str, measure: Callable[[], T]) -> T:
     began = time.monotonic()
     found = measure()
     print(f"  {what}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
@@ -370,7 +375,7 @@ def _said(what: str, measure: Callable[[], T]) -> T:
 def main() -> int:
     """Measure and write; 1 where a bar does not hold."""
     began = time.time_ns()
-    rows = measured()
+    rows = measure_all()
     OUT.mkdir(exist_ok=True)
     figures.write(OUT / "figures.json", "page", [SEED], rows)
     print(figures.markdown(rows))

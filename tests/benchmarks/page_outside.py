@@ -62,7 +62,7 @@ _COUNT: Final = (
 )
 
 
-def records(document: bytes) -> list[ET.Element]:
+def list_records(document: bytes) -> list[ET.Element]:
     """The records of a publication."""
     return list(ET.fromstring(document).iterfind(".//sit:situationRecord", _SPACES))
 
@@ -130,7 +130,7 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
             )
         stretches.take_changes()
         before = make_publication(OURS, stretches.standing, now, before)
-        told = records(before)
+        told = list_records(before)
         ended |= {f"{one.get('id')}" for one in told if is_over(one)}
         unended += abs(sum(not is_over(one) for one in told) - len(stretches.standing))
         invalid += valid is not None and not valid(before)
@@ -140,7 +140,7 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
     )
 
 
-def driven() -> dict[str, float]:
+def measure_publication() -> dict[str, float]:
     """Return figures of a service, the page and six cars on ice that melts: the page's publication
     and its features.
 
@@ -170,11 +170,14 @@ def driven() -> dict[str, float]:
                 until(lambda: lines)
                 address = lines[0].removeprefix("page: ")
                 seq = street.put(session, ("ice", "passed", "wet"), time.time_ns() - ICE_NS)
-                until(lambda: records(pulled(address)), PATIENCE_S)
-                until(lambda: count(address) == street.known("ice", "passed", "wet"), PATIENCE_S)
+                until(lambda: list_records(fetch_publication(address)), PATIENCE_S)
+                until(
+                    lambda: count_features(address) == street.count_known("ice", "passed", "wet"),
+                    PATIENCE_S,
+                )
                 table = map_client.served_table(map_client.query_map(settings, {}))
-                leaked = len(cells_of(pulled(address)) - measured_cells(table))
-                failed = sum(not opens(reader, address) for reader in READERS)
+                leaked = len(cells_of(fetch_publication(address)) - measured_cells(table))
+                failed = sum(not can_open(reader, address) for reader in READERS)
                 failed += shutil.which("ogrinfo") is not None and not ogrinfo_opens(address)
                 for _ in range(12):
                     if not standing_alerts(session):
@@ -183,14 +186,14 @@ def driven() -> dict[str, float]:
                     seq = street.put(session, ("melted",), time.time_ns(), seq)
                 until(lambda: not standing_alerts(session), PATIENCE_S)
                 time.sleep(1.0)  # a pull
-                unended = sum(not is_over(one) for one in records(pulled(address)))
+                unended = sum(not is_over(one) for one in list_records(fetch_publication(address)))
         finally:
             stop.set()
             page.join(10.0)
     return {"leaked": float(leaked), "unended": float(unended), "readers_failed": float(failed)}
 
 
-def pulled(address: str) -> bytes:
+def fetch_publication(address: str) -> bytes:
     """The publication; an empty one while there is none."""
     try:
         with urllib.request.urlopen(f"{address}datex2/situation.xml", timeout=30) as answer:
@@ -200,7 +203,7 @@ def pulled(address: str) -> bytes:
         return b"<none/>"
 
 
-def count(address: str) -> int:
+def count_features(address: str) -> int:
     """Features that there are."""
     try:
         with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:
@@ -212,7 +215,7 @@ def count(address: str) -> int:
 def cells_of(document: bytes) -> set[int]:
     """Cells on which situations lie."""
     found = set[int]()
-    for record in records(document):
+    for record in list_records(document):
         words = record.findtext(".//loc:posList", "", _SPACES).split()
         point = record.find(".//loc:pointCoordinates", _SPACES)
         if point is not None:
@@ -228,14 +231,14 @@ def measured_cells(table: pa.Table) -> set[int]:
     return set(table["cell"].to_numpy()[is_measured].tolist())
 
 
-def opens(reader: str, address: str) -> bool:
+def can_open(reader: str, address: str) -> bool:
     """Return True if a reader has all features, the bounds among them without a value."""
     script = READERS[reader].format(address=address) + _COUNT
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
     )
-    whole = street.known("ice", "passed", "wet")
-    bounds = street.known("passed")
+    whole = street.count_known("ice", "passed", "wet")
+    bounds = street.count_known("passed")
     held = done.stdout.split() == [str(whole), str(bounds), str(whole - bounds)]
     if not held:
         print(f"  {reader}: {done.stdout} {done.stderr[-500:]}", file=sys.stderr)
@@ -246,7 +249,7 @@ def ogrinfo_opens(address: str) -> bool:
     """Return True if GDAL's program lists all features."""
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    held = done.stdout.count("OGRFeature(grip)") == street.known("ice", "passed", "wet")
+    held = done.stdout.count("OGRFeature(grip)") == street.count_known("ice", "passed", "wet")
     if not held:
         print(f"  ogrinfo: {done.stdout[:300]} {done.stderr[-500:]}", file=sys.stderr)
     return held
@@ -266,11 +269,11 @@ def join_right() -> float:
     return next(float(row["value"]) for row in rows if row.get("name") == "roads.join_right")
 
 
-def outside() -> list[Figure]:
+def measure_outside() -> list[Figure]:
     """All figures of what leaves the house."""
     invalid, unended = made_up(is_valid())
     try:
-        found = driven()
+        found = measure_publication()
     except (TimeoutError, subprocess.TimeoutExpired) as error:
         print(f"  no figures of the drive: {error}", file=sys.stderr)
         found = dict.fromkeys(("leaked", "unended", "readers_failed"), math.nan)

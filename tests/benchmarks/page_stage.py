@@ -46,16 +46,16 @@ class Town:
             cells = np.sort(
                 (tile << 14) + self.rng.choice(1 << 14, CELLS // SIDE**2, replace=False)
             )
-            self.tiles[tile] = self._columns(cells)
+            self.tiles[tile] = self._draw_columns(cells)
         self.marker = next(iter(self.tiles))
 
-    def local(self, tile: int) -> int:
+    def local_marker(self, tile: int) -> int:
         """Place of a tile's marker, within it: the first cell, whose count of vehicles is a
         put's number.
         """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
-    def _columns(self, cells: IntArray) -> dict[str, Any]:
+    def _draw_columns(self, cells: IntArray) -> dict[str, Any]:
         n = len(cells)
         latitude, longitude = grid.centre(cells)
         west, south, east, north = grid.bounds(cells)
@@ -88,7 +88,7 @@ class Town:
             "safe_deceleration": GRAVITY * lower,
         }
 
-    def table(self, tile: int) -> pa.RecordBatch:
+    def make_batch(self, tile: int) -> pa.RecordBatch:
         """A tile in the schema of the map."""
         columns = ((self.tiles[tile][f.name], f.type) for f in tables.MAP_SCHEMA)
         arrays = [
@@ -97,14 +97,14 @@ class Town:
         ]
         return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
-    def change(self, tile: int, cells: int, number: int) -> bytes:
+    def change_cells(self, tile: int, cells: int, number: int) -> bytes:
         """Change so many cells of a tile, and its marker; the tile as it is put."""
         columns = self.tiles[tile]
         which = self.rng.choice(len(columns["cell"]) - 1, cells, replace=False) + 1
         columns["vehicles"][which] = self.rng.integers(1, 250, cells)
         columns["last_time"][which] = time.time_ns()
         columns["vehicles"][0] = number
-        return arrow_stream(self.table(tile))
+        return arrow_stream(self.make_batch(tile))
 
 
 class Stage(NamedTuple):
@@ -118,7 +118,7 @@ class Stage(NamedTuple):
 
 
 @contextmanager
-def stage(seed: int) -> Iterator[Stage]:
+def open_stage(seed: int) -> Iterator[Stage]:
     """Everything up; the page as its command, in a process of its own."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
@@ -127,13 +127,13 @@ def stage(seed: int) -> Iterator[Stage]:
     assert session is not None
     with router, session:
 
-        def answer(asked: zenoh.Query) -> None:
+        def answer_query(asked: zenoh.Query) -> None:
             with asked:
                 for tile in town.tiles:
                     if asked.key_expr.intersects(zenoh.KeyExpr(keys.map_key(tile))):
-                        asked.reply(keys.map_key(tile), arrow_stream(town.table(tile)))
+                        asked.reply(keys.map_key(tile), arrow_stream(town.make_batch(tile)))
 
-        session.declare_queryable(f"{keys.ROOT}/map/*/*/*/*", answer, complete=True)
+        session.declare_queryable(f"{keys.ROOT}/map/*/*/*/*", answer_query, complete=True)
         words = ["page", "--port", "0", "--connect", endpoints[0]]
         command = [sys.executable, "-m", "fleet_service.cli", *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as page:
@@ -162,7 +162,7 @@ def seen_town(address: str, town: Town) -> str:
     return f"{address}#x={x / 2**14:.8f}&y={y / 2**14:.8f}&zoom={ZOOM}"
 
 
-def pinned(process: subprocess.Popen[str], core: int) -> None:
+def pin_to_core(process: subprocess.Popen[str], core: int) -> None:
     """Keep a process on one core."""
     for thread in Path(f"/proc/{process.pid}/task").iterdir():
         os.sched_setaffinity(int(thread.name), {core})

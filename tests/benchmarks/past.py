@@ -32,7 +32,7 @@ SIDE = 320
 QUERIES = 15
 
 
-def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
+def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a
     restart.
     """
@@ -40,12 +40,12 @@ def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     compact(root)
     synthetic.write(root, SyntheticFleet(20_000, 1, seed=1))  # rows that are not compacted yet
     with closing(Engine(ServiceConfig(), root)) as engine:
-        before = _beliefs(engine)
+        before = _read_beliefs(engine)
     with closing(Engine(ServiceConfig(), root)) as engine:
-        after = _beliefs(engine)
-    difference = _largest(before, after)
+        after = _read_beliefs(engine)
+    difference = _find_largest_change(before, after)
     tell(f"restart: {len(before[0])} cells, {difference:.1e}")
-    spent, cells = _asked(root)
+    spent, cells = _time_queries(root)
     tell(f"at=: {np.round(np.array(spent) * 1e3)} ms, {cells} cells")
     return [
         Figure("archive.at_query_p50_ms", float(np.median(spent)) * 1e3, f"ms, {cells} cells", 500),
@@ -53,7 +53,7 @@ def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     ]
 
 
-def _beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
+def _read_beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
     fusion = engine.state.fusion
     slots = np.arange(fusion.size)
     order = np.lexsort((fusion.sector[slots], fusion.cell[slots]))
@@ -65,14 +65,16 @@ def _beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
 END = START_NS + WORLD.days * DAY_S * 10**9
 
 
-def _largest(before: tuple[IntArray, FloatArray], after: tuple[IntArray, FloatArray]) -> float:
+def _find_largest_change(
+    before: tuple[IntArray, FloatArray], after: tuple[IntArray, FloatArray]
+) -> float:
     if len(before[0]) != len(after[0]) or (before[0] != after[0]).any():
         return 1.0
     return float(np.abs(before[1] - after[1]).max())
 
 
 @contextmanager
-def _service(root: Path) -> Iterator[zenoh.Session]:
+def _open_service(root: Path) -> Iterator[zenoh.Session]:
     """A client of a running service on the archive."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
@@ -95,7 +97,7 @@ def _service(root: Path) -> Iterator[zenoh.Session]:
             thread.join()
 
 
-def _answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
+def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
     """Seconds of an answer, and its tiles; asks again while the past before is being put away."""
     while True:
         began = time.perf_counter()
@@ -109,13 +111,13 @@ def _answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table
             raise RuntimeError(refused[0])
 
 
-def _asked(root: Path) -> tuple[list[float], int]:
+def _time_queries(root: Path) -> tuple[list[float], int]:
     """Seconds of each query, and cells of the answers."""
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)
     spent = []
     cells = 0
-    with _service(root) as session:
+    with _open_service(root) as session:
         for _ in range(QUERIES):
             row = int(rng.integers(0, 8)) * 2
             column = int(rng.integers(0, 8))
@@ -131,7 +133,7 @@ def _asked(root: Path) -> tuple[list[float], int]:
                 START_NS // 10**9 + int(rng.integers(DAY_S, WORLD.days * DAY_S)), UTC
             )
             selector = f"{keys.ROOT}/map/**?bbox={','.join(f'{v:.6f}' for v in box)};at={at:%Y-%m-%dT%H:%M:%SZ}"
-            seconds, tables = _answer(session, selector)
+            seconds, tables = _time_answer(session, selector)
             spent.append(seconds)
             cells += sum(table.num_rows for table in tables)
     return spent, cells // QUERIES

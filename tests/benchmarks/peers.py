@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_agent.estimators.paper_aco_fckf import STEP_S, Setting
 from schemas.numeric import FloatArray
-from tests.benchmarks.reference import measured, move
+from tests.benchmarks.reference import move, predict_measurement
 
 PYTHON_STEPS = 300  # enough for a median: these are slow
 
@@ -50,7 +50,7 @@ def by_numpy(problem: Problem) -> FloatArray:
         mean = points.mean(0)
         cov = (points - mean).T @ (points - mean) / len(xi) + noise
         points = mean + xi @ np.linalg.cholesky(cov).T
-        outcomes = measured(points)
+        outcomes = predict_measurement(points)
         expected = outcomes.mean(0)
         S = (outcomes - expected).T @ (outcomes - expected) / len(xi) + R
         K = np.linalg.solve(S, (outcomes - expected).T @ (points - mean) / len(xi)).T
@@ -71,7 +71,7 @@ def by_filterpy(problem: Problem) -> FloatArray:
         )
 
     def h(x: FloatArray) -> FloatArray:
-        return measured(x.reshape(1, -1)).reshape(3, *x.shape[1:])
+        return predict_measurement(x.reshape(1, -1)).reshape(3, *x.shape[1:])
 
     made = CubatureKalmanFilter(6, 3, problem.gone, h, f)
     mean, made.P, made.Q, made.R = problem.start()

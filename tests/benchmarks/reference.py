@@ -26,21 +26,21 @@ def move(
     ax = points[:, 2]
     ay = points[:, 3]
     rate = points[:, 4]
-    _, _, turn = respond(row, vx, vy, rate, ax, ay, before, mu)
+    _, _, turn = compute_response(row, vx, vy, rate, ax, ay, before, mu)
     slope_x = ax + rate * vy
     slope_y = ay - rate * vx
     x = vx + gone * slope_x
     y = vy + gone * slope_y
     r = rate + gone * turn
-    bx, by, again = respond(row, x, y, r, ax, ay, now, mu)
+    bx, by, again = compute_response(row, x, y, r, ax, ay, now, mu)
     new_x = vx + 0.5 * gone * (slope_x + bx + r * y)
     new_y = vy + 0.5 * gone * (slope_y + by - r * x)
     new_rate = rate + 0.5 * gone * (turn + again)
-    felt_x, felt_y, _ = respond(row, new_x, new_y, new_rate, ax, ay, now, mu)
+    felt_x, felt_y, _ = compute_response(row, new_x, new_y, new_rate, ax, ay, now, mu)
     return np.stack([new_x, new_y, felt_x, felt_y, new_rate, points[:, 5]], axis=1)
 
 
-def respond(
+def compute_response(
     row: FloatArray,
     vx: FloatArray,
     vy: FloatArray,
@@ -96,6 +96,6 @@ def respond(
     )
 
 
-def measured(points: FloatArray) -> FloatArray:
+def predict_measurement(points: FloatArray) -> FloatArray:
     """h: a_x, a_y and yaw rate (P, 3) of states (P, 6)."""
     return points[:, 2:5]

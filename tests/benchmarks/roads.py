@@ -39,17 +39,17 @@ class Traffic(NamedTuple):
     way: list[str]
 
 
-def drive(sumo: Sumo, seed: int) -> Traffic:
+def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
     """Random trips through the town for SECONDS, a fix a second of each vehicle that moves."""
-    sumo.trips(SECONDS, 0.7, seed)
-    rows = pd.read_parquet(sumo.fixes(SECONDS + 300, 1, seed))
+    sumo.draw_trips(SECONDS, 0.7, seed)
+    rows = pd.read_parquet(sumo.drive_trips(SECONDS + 300, 1, seed))
     rows = rows[(rows.vehicle_speed > 1.0) & ~rows.vehicle_lane.str.startswith(":")]
     way = rows.vehicle_lane.str.rpartition("_")[0].str.partition("#")[0].str.lstrip("-")
     yaw = np.radians(90.0 - rows.vehicle_angle.to_numpy(float))
     return Traffic(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy(), yaw, way.tolist())
 
 
-def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
+def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
     """Shares of fixes for which the join is right."""
     rng = np.random.default_rng(seed)
     east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))
@@ -80,7 +80,7 @@ def main() -> int:
     """Drive, join, judge; 1 where a bar does not hold."""
     sumo = Sumo(FOLDER)
     network = read_network(sumo.extract)
-    found = [judged(network, drive(sumo, seed), seed) for seed in SEEDS]
+    found = [judge_join(network, simulate_traffic(sumo, seed), seed) for seed in SEEDS]
     least = {name: min(one[name] for one in found) for name in found[0]}
     most = {name: max(one[name] for one in found) for name in found[0]}
     rows = [

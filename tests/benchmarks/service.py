@@ -49,7 +49,7 @@ _X, _Y = (
 )
 
 
-def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
+def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
     """Return visits to cells of the tile, dated now: grip used, or ice."""
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
@@ -84,7 +84,7 @@ def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool
     )
 
 
-def publish(session: zenoh.Session, one: Batch) -> None:
+def put_batch(session: zenoh.Session, one: Batch) -> None:
     """Put a batch on its vehicle's key."""
     session.put(
         keys.observation_key(one.region, one.vehicle),
@@ -105,7 +105,7 @@ def load(endpoint: str) -> None:
         seq += 1
         for vehicle in range(VEHICLES):
             at = rng.integers(0, COLUMNS, ROWS), rng.integers(0, LINES, ROWS)
-            publish(session, batch(f"load-{vehicle:04d}", seq, *at, False))
+            put_batch(session, make_batch(f"load-{vehicle:04d}", seq, *at, False))
             sent += ROWS
             time.sleep(max(began + sent / RATE - time.monotonic(), 0.0))
 
@@ -115,7 +115,7 @@ def bare(endpoint: str, folder: str) -> None:
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
 
-    def replier(key: str) -> Callable[[zenoh.Query], None]:
+    def make_replier(key: str) -> Callable[[zenoh.Query], None]:
         data = (Path(folder) / Path(key).name).read_bytes()
 
         def reply(asked: zenoh.Query) -> None:
@@ -125,12 +125,12 @@ def bare(endpoint: str, folder: str) -> None:
         return reply
 
     for key in (BARE, BARE_BOX):
-        session.declare_queryable(key, replier(key), complete=True)
+        session.declare_queryable(key, make_replier(key), complete=True)
     sys.stdin.read()
 
 
 @contextmanager
-def process(*words: str) -> Iterator[None]:
+def run_process(*words: str) -> Iterator[None]:
     """A command that runs as long as the block."""
     running = subprocess.Popen(
         [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
@@ -142,12 +142,12 @@ def process(*words: str) -> Iterator[None]:
         running.wait()
 
 
-def ask(session: zenoh.Session, selector: str) -> bytes:
+def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
     """The one reply to a query; empty without one."""
     return b"".join(reply.ok.payload.to_bytes() for reply in session.get(selector) if reply.ok)
 
 
-def until(something: Callable[[], object]) -> None:
+def poll_until(something: Callable[[], object]) -> None:
     """Ask again until there is something."""
     deadline = time.monotonic() + 120.0
     while not something():
@@ -175,20 +175,20 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
-    def hear(sample: zenoh.Sample) -> None:
+    def record_alert(sample: zenoh.Sample) -> None:
         now = time.perf_counter()
         heard.put((wire.decode_alert(sample.payload.to_bytes()).cell, now))
 
-    session.declare_subscriber(f"{keys.ROOT}/alert/**", hear)
+    session.declare_subscriber(f"{keys.ROOT}/alert/**", record_alert)
     out = []
     for k in range(ALERTS):
         at = np.array([60 + APART * (k % 15)]), np.array([1 + APART * (k // 15)])
-        publish(session, batch("ice-0", k + 1, *at, True))
+        put_batch(session, make_batch("ice-0", k + 1, *at, True))
         time.sleep(0.05)
-        second = batch("ice-1", k + 1, *at, True)
+        second = make_batch("ice-1", k + 1, *at, True)
         cell = int(second.columns["cell"][0])
         began = time.perf_counter()
-        publish(session, second)
+        put_batch(session, second)
         when = next(
             when for found, when in iter(lambda: heard.get(timeout=30.0), None) if found == cell
         )
@@ -206,21 +206,23 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
-    def hear(sample: zenoh.Sample) -> None:
+    def record_ack(sample: zenoh.Sample) -> None:
         now = time.perf_counter()
         for stream in wire.decode_ack(sample.payload.to_bytes())[1]:
             for first, last in stream.durable:
                 for seq in range(first, last + 1):
                     heard.put((seq, now))
 
-    session.declare_subscriber(keys.ack_key("acked-0"), hear)
+    session.declare_subscriber(keys.ack_key("acked-0"), record_ack)
     rng = np.random.default_rng(0)
     sent = {}
     for seq in range(1, ACKS + 1):
         sent[seq] = time.perf_counter()
-        publish(
+        put_batch(
             session,
-            batch("acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False),
+            make_batch(
+                "acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False
+            ),
         )
         time.sleep(rng.uniform(0.0, 0.3))
     out = []
@@ -256,27 +258,27 @@ def service() -> list[Figure]:
             "--config",
             str(config),
         )
-        stack.enter_context(process(*words))
+        stack.enter_context(run_process(*words))
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
         stack.enter_context(
-            process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
+            run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
         )
-        until(lambda: len(ask(client, f"{keys.ROOT}/map/**")))
+        poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
         time.sleep(10.0)  # the window fills
         asked = (tile, f"{tile}?bbox={box}")
         for key, selector in zip((BARE, BARE_BOX), asked, strict=True):
-            (folder / Path(key).name).write_bytes(ask(client, selector))
+            (folder / Path(key).name).write_bytes(fetch_reply(client, selector))
         cells = [
             decode_tile((folder / Path(key).name).read_bytes()).num_rows for key in (BARE, BARE_BOX)
         ]
         nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(folder)!r})"
-        stack.enter_context(process("-c", nothing))
-        until(lambda: len(ask(client, BARE)))
+        stack.enter_context(run_process("-c", nothing))
+        poll_until(lambda: len(fetch_reply(client, BARE)))
         ours, boxed, *least = durations_ms(
             *(
-                lambda selector=selector: ask(client, selector)
+                lambda selector=selector: fetch_reply(client, selector)
                 for selector in (*asked, BARE, BARE_BOX)
             )
         )

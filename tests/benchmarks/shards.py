@@ -30,7 +30,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
-from tests.benchmarks.ingest import messages
+from tests.benchmarks.ingest import make_messages
 from tests.faults.processes import Part
 from tests.waiting import matched
 
@@ -46,7 +46,7 @@ def shards() -> list[Figure]:
     """A burst into one service, and into two that share its regions: engines alone, and whole
     over Zenoh.
     """
-    sent = [_burst(k) for k in range(ROUNDS + 1)]
+    sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
     whole = [statistics.median(services_s(sent, split)) for split in (1, 2)]
     rates = [2 * BURST * ROWS / seconds for seconds in (alone[0], whole[0])]
@@ -87,10 +87,10 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
                     )
                 )
             )
-        return [_round(running) for _ in range(len(bursts) + 1)][2:]
+        return [_time_round(running) for _ in range(len(bursts) + 1)][2:]
 
 
-def _round(running: Sequence[subprocess.Popen[str]]) -> float:
+def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
     """Tell all to go on, and wait until all have said that they did; the first round is their
     start.
     """
@@ -121,14 +121,16 @@ def engine(root: str) -> None:
         assert there.counts[Kind.OBSERVATION] == sum(map(len, bursts)) * ROWS, there.counts
 
 
-def _burst(number: int) -> list[Message]:
+def _make_burst(number: int) -> list[Message]:
     """Messages of both regions in turn."""
     now = time.time_ns()
-    west, east = (messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1))
+    west, east = (
+        make_messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1)
+    )
     return [message for pair in zip(west, east, strict=True) for message in pair]
 
 
-def regions(burst: Sequence[Message]) -> list[str]:
+def list_regions(burst: Sequence[Message]) -> list[str]:
     """The two region expressions of a burst."""
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 
@@ -140,7 +142,7 @@ def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
         parts = [
-            _part(folder, endpoint, number, regions(bursts[0])[number::services])
+            _start_part(folder, endpoint, number, list_regions(bursts[0])[number::services])
             for number in range(services)
         ]
         for part in parts:
@@ -151,10 +153,10 @@ def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float
         session = open_session(ZenohSettings(connect=[endpoint]))
         assert session is not None
         stack.enter_context(session)
-        return [_send(session, burst) for burst in bursts][1:]
+        return [_send_burst(session, burst) for burst in bursts][1:]
 
 
-def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
+def _start_part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
     name = f"shard-{number}"
     config = ServiceConfig(
         name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(connect=[endpoint])
@@ -173,18 +175,18 @@ def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
     return Part(name, [sys.executable, *words], folder)
 
 
-def _send(session: zenoh.Session, burst: Sequence[Message]) -> float:
+def _send_burst(session: zenoh.Session, burst: Sequence[Message]) -> float:
     settled = 0
     done = threading.Event()
 
-    def hear(sample: zenoh.Sample) -> None:
+    def count_settled(sample: zenoh.Sample) -> None:
         nonlocal settled
         _, streams = wire.decode_ack(sample.payload.to_bytes())
         settled += sum(last - first + 1 for stream in streams for first, last in stream.durable)
         if settled >= len(burst):
             done.set()
 
-    subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", hear)
+    subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", count_settled)
     for key in {message.key for message in burst}:
         publisher = session.declare_publisher(key)
         matched(publisher)

@@ -28,7 +28,7 @@ COPIES: Final = 6
 ROUNDS: Final = 3
 
 
-def drives(folder: Path) -> list[Path]:
+def simulate_drives(folder: Path) -> list[Path]:
     """Signal logs, each with its vehicle file, made with the seeds."""
     folder.mkdir()
     for seed in SEEDS:
@@ -57,14 +57,14 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     tries = folder / "tries"
     there.mkdir(parents=True)
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
-    with spark_sessions.cores(2) as session:
+    with spark_sessions.spark_session(2) as session:
         dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
         told = spark.spread(session, tasks_of(logs, None, there), dying)
     ours = list(backfill(tasks_of(logs, None, here), ESTIMATOR, 1))
     if len(list(tries.iterdir())) != len(logs) or any(outcome.error for outcome in (*told, *ours)):
         raise RuntimeError("a drive was not estimated, or its task was not killed")
     names = {path.name for folder in (here, there) for path in folder.iterdir()}
-    return float(sum(_content(here / name) != _content(there / name) for name in names))
+    return float(sum(_read_content(here / name) != _read_content(there / name) for name in names))
 
 
 def rebuild_difference(folder: Path) -> float:
@@ -76,7 +76,7 @@ def rebuild_difference(folder: Path) -> float:
     here.mkdir()
     there.mkdir()
     zones = zones_of(archive)
-    with spark_sessions.cores(2) as session:
+    with spark_sessions.spark_session(2) as session:
         spark.spread(
             session,
             zones,
@@ -100,11 +100,13 @@ def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
         for copy in range(COPIES)
         for log in logs
     ]
-    return statistics.median(_spent(tasks, 1) / _spent(tasks, 2) for _ in range(ROUNDS))
+    return statistics.median(
+        _time_backfill(tasks, 1) / _time_backfill(tasks, 2) for _ in range(ROUNDS)
+    )
 
 
-def _spent(tasks: Sequence[Task], cores: int) -> float:
-    with spark_sessions.cores(cores):
+def _time_backfill(tasks: Sequence[Task], cores: int) -> float:
+    with spark_sessions.spark_session(cores):
         for _ in range(2):  # each worker starts and loads the kernels in the first
             began = time.perf_counter()
             outcomes = list(backfill_on_spark(tasks, ESTIMATOR))
@@ -114,5 +116,5 @@ def _spent(tasks: Sequence[Task], cores: int) -> float:
     return spent
 
 
-def _content(path: Path) -> bytes | None:
+def _read_content(path: Path) -> bytes | None:
     return path.read_bytes() if path.exists() else None

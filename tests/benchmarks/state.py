@@ -26,8 +26,8 @@ from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.restart import image_of
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
-from tests.benchmarks.fusion import CELLS, START, filled
-from tests.benchmarks.ingest import messages
+from tests.benchmarks.fusion import CELLS, START, fill_fusion
+from tests.benchmarks.ingest import make_messages
 from tests.faults.processes import Part
 
 SPAN_S: Final = 86_400.0  # in which every cell was visited three times
@@ -43,11 +43,11 @@ def state() -> list[Figure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         root = folder / "archive"
-        fusion, _ = filled(CELLS, 3, SPAN_S)
+        fusion, _ = fill_fusion(CELLS, 3, SPAN_S)
         checkpoints.save(root, Taken(image_of(fusion, [], SequenceTrackers()), Cut(0, 0)))
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
-            took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
+            took, held = checkpoint_s(engine, root, make_messages(SINCE, 10, now), now)
             cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
     told = (
@@ -75,7 +75,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     turns: list[float] = []
     saved = threading.Event()
 
-    def work() -> None:
+    def ingest_parts() -> None:
         for number, part in enumerate(parts):
             began = time.perf_counter()
             engine.intake.ingest(part, now)
@@ -84,7 +84,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
             if number == len(parts) // 2:
                 saved.wait()
 
-    worker = threading.Thread(target=work)
+    worker = threading.Thread(target=ingest_parts)
     for part in parts[:2]:  # warm
         engine.intake.ingest(part, now)
     worker.start()

@@ -20,7 +20,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS, S
 from tests.benchmarks.limit import Limit, VectorLimit
-from tests.benchmarks.measure import SEED, median_s, paired
+from tests.benchmarks.measure import SEED, median_s, time_in_turn
 from tests.benchmarks.peers import PEERS, PYTHON_STEPS, Problem
 
 NAME = "paper-aco-fckf"
@@ -53,7 +53,9 @@ class Drive:
             ]
         )
 
-    def repeated(self, samples: int, vehicles: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def repeat_samples(
+        self, samples: int, vehicles: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """t (T, N), signals (T, N, 18) and readings (T, N, 11)."""
         index = np.arange(samples) % len(self.t)
         t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
@@ -67,7 +69,7 @@ class Drive:
 Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
-def limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
+def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
     """C filters at the first sample."""
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped(TUNED[NAME]))
@@ -79,10 +81,10 @@ def same_filter(drive: Drive) -> float:
     Raises:
         ArithmeticError: they do not.
     """
-    t, signals, readings = drive.repeated(len(drive.t), 1)
+    t, signals, readings = drive.repeat_samples(len(drive.t), 1)
     said: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
     speed = float(said.vx[0, 0])
-    means = limit(Limit, drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
+    means = make_limit(Limit, drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
     ours = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)[1:, 0]
     apart = float(np.abs(ours - means[:, [0, 1, 4]]).max())
     if not apart < AGREE:
@@ -94,10 +96,10 @@ def step() -> list[Figure]:
     """One filter step: against C, against filter libraries, and the price of a call."""
     drive = Drive()
     speed = same_filter(drive)
-    t, signals, readings = drive.repeated(SAMPLES, 1)
-    ours, scalar = paired(
+    t, signals, readings = drive.repeat_samples(SAMPLES, 1)
+    ours, scalar = time_in_turn(
         lambda: bank_of(NAME, [drive.vehicle]).advance(t, signals),
-        lambda: limit(Limit, drive, 1, speed).drive(readings, drive.gone),
+        lambda: make_limit(Limit, drive, 1, speed).drive(readings, drive.gone),
     )
     per_call = call_s(bank_of(NAME, [drive.vehicle]), t, signals)
     per_step = ours / SAMPLES
@@ -145,11 +147,11 @@ def bank() -> list[Figure]:
     found = []
     cost = {}
     for vehicles, samples in ((100, 1000), (1000, 200), (100_000, 4)):
-        t, signals, readings = drive.repeated(samples, vehicles)
+        t, signals, readings = drive.repeat_samples(samples, vehicles)
         fleet = [drive.vehicle] * vehicles
-        ours, threaded = paired(
+        ours, threaded = time_in_turn(
             lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023 called at once
-            lambda: limit(Limit, drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
+            lambda: make_limit(Limit, drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
         )
         cost[vehicles] = ours / (vehicles * samples)
         if vehicles > 100:
@@ -184,21 +186,23 @@ def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200
     Raises:
         ArithmeticError: C is not the same filter.
     """
-    t, signals, readings = drive.repeated(samples, vehicles)
+    t, signals, readings = drive.repeat_samples(samples, vehicles)
     noise = np.random.default_rng(SEED).normal(0.0, 0.01, (samples, vehicles, 3))
     noise[0] = 0.0
     signals[..., [S.AX, S.AY, S.YAW_RATE]] += noise
     readings[..., :3] += noise
     fleet = [drive.vehicle] * vehicles
-    turned = limit(VectorLimit, drive, vehicles, speed).side_by_side(readings[1:])
+    turned = make_limit(VectorLimit, drive, vehicles, speed).side_by_side(readings[1:])
     ours = bank_of(NAME, fleet).advance(t, signals)
-    means = limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone).swapaxes(-1, -2)
+    means = (
+        make_limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone).swapaxes(-1, -2)
+    )
     found = np.stack([ours.vx, ours.vy, ours.yaw_rate], axis=-1)[1:]
     apart = float(np.abs(found - means.reshape(samples - 1, vehicles, -1)[..., [0, 1, 4]]).max())
     if not apart < AGREE:
         raise ArithmeticError(f"C in vectors and {NAME} are {apart:g} apart: not the same filter")
-    bank, vectors = paired(
+    bank, vectors = time_in_turn(
         lambda: bank_of(NAME, fleet).advance(t, signals),
-        lambda: limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone),
+        lambda: make_limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone),
     )
     return bank / vectors * (samples - 1) / samples

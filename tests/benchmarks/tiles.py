@@ -28,7 +28,14 @@ from schemas.proto import gripmap_pb2 as pb
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Batch, Kind
-from tests.benchmarks.service import LATITUDE, LONGITUDE, SECOND, ask, process, until
+from tests.benchmarks.service import (
+    LATITUDE,
+    LONGITUDE,
+    SECOND,
+    fetch_reply,
+    poll_until,
+    run_process,
+)
 from tests.fleet_service.examples import batch
 
 RATE = 1500  # visits/s of all vehicles
@@ -54,7 +61,7 @@ _ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles of a region's side
 _ROWS = _ACROSS // ROW
 
 
-def visit(vehicle: int, turn: int) -> Batch:
+def make_visit(vehicle: int, turn: int) -> Batch:
     """One vehicle's visit to the middle of one of its tiles."""
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))
@@ -85,9 +92,9 @@ class Acks:
     def __init__(self, session: zenoh.Session) -> None:
         self.put: dict[tuple[str, int], float] = {}
         self.waits: dict[tuple[str, int], float] = {}
-        self._subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", self._hear)
+        self._subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", self._record_ack)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _record_ack(self, sample: zenoh.Sample) -> None:
         now = time.perf_counter()
         (vehicle, streams) = wire.decode_ack(sample.payload.to_bytes())
         for stream in streams:
@@ -95,7 +102,7 @@ class Acks:
                 for seq in range(first, last + 1):
                     self.waits[vehicle, seq] = now - self.put[vehicle, seq]
 
-    def of(self, since: float) -> list[float]:
+    def waits_since(self, since: float) -> list[float]:
         """Return the waits of batches that were put since then; infinite where nothing came."""
         return [
             self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since
@@ -112,7 +119,7 @@ def drive(endpoint: str) -> None:
     encoding = wire.ENCODING[Kind.OBSERVATION]
     cars = []
     for vehicle in range(VEHICLES):
-        turns = [visit(vehicle, turn) for turn in range(len(TURNS))]
+        turns = [make_visit(vehicle, turn) for turn in range(len(TURNS))]
         messages = [pb.ObservationBatch.FromString(wire.encode(one)) for one in turns]
         cars.append(
             (turns[0].vehicle, keys.observation_key(turns[0].region, turns[0].vehicle), messages)
@@ -139,7 +146,7 @@ def drive(endpoint: str) -> None:
     deadline = time.perf_counter() + PATIENCE_S
     while len(acks.waits) < sent and time.perf_counter() < deadline:
         time.sleep(0.05)
-    waits = acks.of(since)
+    waits = acks.waits_since(since)
     found = {
         "p50": statistics.median(waits),
         "p99": float(np.quantile(waits, 0.99)),
@@ -159,7 +166,7 @@ def read(endpoint: str) -> None:
             print(len(replies), flush=True)
 
 
-def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
+def _time_answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
     """Return the times [ms] of queries for one tile while READERS query everything, until each
     has an answer.
     """
@@ -167,7 +174,8 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
     got: list[list[int]] = [[] for _ in readers]
     threads = [
-        threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)
+        threading.Thread(target=_collect_counts, args=pair)
+        for pair in zip(readers, got, strict=True)
     ]
     for thread in threads:
         thread.start()
@@ -177,7 +185,7 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     try:
         while (len(waits) < QUESTIONS or not all(got)) and time.monotonic() < deadline:
             began = time.perf_counter()
-            known = ask(client, tile)
+            known = fetch_reply(client, tile)
             waits.append(1e3 * (time.perf_counter() - began) if known else float("inf"))
             pause.wait(0.02)
     finally:
@@ -189,7 +197,7 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     return waits, min(map(sum, got))
 
 
-def _count(reader: subprocess.Popen[str], got: list[int]) -> None:
+def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
     got.extend(int(line) for line in reader.stdout or ())
 
 
@@ -199,7 +207,7 @@ def tiles() -> list[Figure]:
     """
     puts: dict[str, int] = {}
 
-    def hear(sample: zenoh.Sample) -> None:
+    def count_put(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         puts[key] = puts.get(key, 0) + 1
 
@@ -218,12 +226,12 @@ def tiles() -> list[Figure]:
             "--config",
             str(config),
         )
-        stack.enter_context(process(*words))
+        stack.enter_context(run_process(*words))
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
-        until(lambda: list(client.liveliness().get(f"{keys.ROOT}/shard/*")))
-        client.declare_subscriber(f"{keys.ROOT}/map/**", hear)
+        poll_until(lambda: list(client.liveliness().get(f"{keys.ROOT}/shard/*")))
+        client.declare_subscriber(f"{keys.ROOT}/map/**", count_put)
         command = [
             sys.executable,
             "-c",
@@ -231,8 +239,8 @@ def tiles() -> list[Figure]:
         ]
         done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
         found = json.loads(done.stdout.splitlines()[-1])
-        small, got = _answers(
-            endpoint, client, keys.map_key(int(grid.tile_of(visit(0, 0).columns["cell"][0])))
+        small, got = _time_answers(
+            endpoint, client, keys.map_key(int(grid.tile_of(make_visit(0, 0).columns["cell"][0])))
         )
     return [
         Figure(

@@ -48,14 +48,14 @@ START_S: Final = 300.0  # kernels may have to be compiled, on a machine that is 
 Manifest = dict[str, Any]
 
 
-def built(overlay: str) -> list[Manifest]:
+def build_overlay(overlay: str) -> list[Manifest]:
     """The objects that `kubectl apply -k` would send."""
     words = ["kubectl", "kustomize", str(FOLDER / overlay)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     return [dict(one) for one in YAML(typ="safe").load_all(done.stdout) if one]
 
 
-def invalid(objects: list[Manifest]) -> list[str]:
+def find_schema_errors(objects: list[Manifest]) -> list[str]:
     """Return the errors by Kubernetes' schemas, strictly: unknown fields too."""
     import kubernetes_validate
 
@@ -95,13 +95,13 @@ class Pod:
         """Return the termination grace period [s]."""
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
 
-    def port(self, container: Manifest, named: str | int) -> int:
+    def port_of(self, container: Manifest, named: str | int) -> int:
         """A container's port, by name or number, on this machine."""
         numbers = {one["name"]: one["containerPort"] for one in container.get("ports", [])}
         return self.ports[numbers.get(named, named)]
 
 
-def pods(objects: list[Manifest], root: Path) -> list[Pod]:
+def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
     """Every pod of every StatefulSet, with free ports."""
     found = []
     for one in of_kind(objects, "StatefulSet"):
@@ -134,8 +134,8 @@ class Cluster:
     def __init__(self, overlay: str, root: Path) -> None:
         self.overlay = overlay
         self.root = root
-        self.objects = built(overlay)
-        self.pods = pods(self.objects, root)
+        self.objects = build_overlay(overlay)
+        self.pods = make_pods(self.objects, root)
         self.failed: list[str] = []
         self._configs = {
             one["metadata"]["name"]: dict(one["data"]) for one in of_kind(self.objects, "ConfigMap")
@@ -144,7 +144,7 @@ class Cluster:
         self.certificates = root / "certs"
         for data in self._configs.values():
             for name, text in data.items():
-                data[name] = self._here(name, text)
+                data[name] = self._localize_addresses(name, text)
         fleet = next(
             (data["fleet.json"] for data in self._configs.values() if "fleet.json" in data), None
         )
@@ -160,7 +160,7 @@ class Cluster:
             ]
             assert fleet_service(["certs", *words]) == 0
 
-    def _here(self, name: str, text: str) -> str:
+    def _localize_addresses(self, name: str, text: str) -> str:
         """A file's text with the addresses of this machine."""
         for pod in self.pods:
             for number, port in pod.ports.items():
@@ -183,49 +183,49 @@ class Cluster:
                 break
         return text.replace('"metrics_host": "0.0.0.0"', '"metrics_host": "127.0.0.1"')
 
-    def _placed(self, pod: Pod, container: Manifest, text: str) -> str:
+    def _localize_paths(self, pod: Pod, container: Manifest, text: str) -> str:
         """A text with the paths of a container's mounts below the pod's folder."""
         for mount in sorted(
             container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])
         ):
             if mount["mountPath"] != "/tmp":
-                text = text.replace(mount["mountPath"], str(self._folder(pod, mount)))
+                text = text.replace(mount["mountPath"], str(self._mount_folder(pod, mount)))
         return text.replace("/var/cache/gripmap", str(self.root / "image-cache"))
 
     @staticmethod
-    def _folder(pod: Pod, mount: Manifest) -> Path:
+    def _mount_folder(pod: Pod, mount: Manifest) -> Path:
         return pod.root / str(mount["name"])
 
-    def _mount(self, pod: Pod) -> None:
+    def _fill_volumes(self, pod: Pod) -> None:
         """Fill the volumes of a pod."""
         volumes = {one["name"]: one for one in pod.template["spec"]["volumes"]}
         for container in [*pod.template["spec"].get("initContainers", []), *pod.containers]:
             for mount in container.get("volumeMounts", []):
-                folder = self._folder(pod, mount)
+                folder = self._mount_folder(pod, mount)
                 folder.mkdir(parents=True, exist_ok=True)
                 volume = volumes.get(mount["name"])
                 if volume is None:
                     assert mount["name"] in pod.claims, f"{pod.name}: no volume {mount['name']}"
                 elif "configMap" in volume:
                     for name, text in self._configs[volume["configMap"]["name"]].items():
-                        (folder / name).write_text(self._placed(pod, container, text))
+                        (folder / name).write_text(self._localize_paths(pod, container, text))
                 elif "secret" in volume:
-                    self._unpack(pod, container, folder)
+                    self._unpack_certificates(pod, container, folder)
 
-    def _unpack(self, pod: Pod, container: Manifest, folder: Path) -> None:
+    def _unpack_certificates(self, pod: Pod, container: Manifest, folder: Path) -> None:
         """Return the files that the documented command puts into a secret of certificates."""
         of = pod.name.rpartition("-")[0]
         for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:
-            (folder / path.name).write_text(self._placed(pod, container, path.read_text()))
+            (folder / path.name).write_text(self._localize_paths(pod, container, path.read_text()))
 
-    def _words(self, pod: Pod, container: Manifest) -> list[str]:
-        given = {one["name"]: self._value(pod, one) for one in container.get("env", [])}
-        words = [self._placed(pod, container, word) for word in container["command"]]
+    def _container_command(self, pod: Pod, container: Manifest) -> list[str]:
+        given = {one["name"]: self._environment_value(pod, one) for one in container.get("env", [])}
+        words = [self._localize_paths(pod, container, word) for word in container["command"]]
         for name, value in given.items():
             words = [word.replace(f"$({name})", value) for word in words]
         return words
 
-    def _value(self, pod: Pod, one: Manifest) -> str:
+    def _environment_value(self, pod: Pod, one: Manifest) -> str:
         if "value" in one:
             return str(one["value"])
         assert one["valueFrom"] == {"fieldRef": {"fieldPath": "metadata.name"}}
@@ -234,15 +234,15 @@ class Cluster:
     def _environment_of(
         self, pod: Pod, container: Manifest, secrets: dict[str, dict[str, str]]
     ) -> dict[str, str]:
-        given = {one["name"]: self._value(pod, one) for one in container.get("env", [])}
+        given = {one["name"]: self._environment_value(pod, one) for one in container.get("env", [])}
         for one in container.get("envFrom", []):
             given |= secrets[one["secretRef"]["name"]]
         return self._environment | {
-            name: self._placed(pod, container, value) for name, value in given.items()
+            name: self._localize_paths(pod, container, value) for name, value in given.items()
         }
 
     @contextmanager
-    def running(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
+    def run_pods(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
         """Every pod started; each probe answers before the block begins, and each leaves well
         after it.
         """
@@ -255,10 +255,13 @@ class Cluster:
         started: list[tuple[Pod, Manifest, subprocess.Popen[bytes]]] = []
         with ExitStack() as stack:
             for pod in self.pods:
-                self._mount(pod)
+                self._fill_volumes(pod)
                 for container in pod.template["spec"].get("initContainers", []):
                     done = subprocess.run(
-                        self._words(pod, container), capture_output=True, text=True, check=False
+                        self._container_command(pod, container),
+                        capture_output=True,
+                        text=True,
+                        check=False,
                     )
                     if done.returncode:
                         self.failed.append(f"{pod.name}: {container['name']}: {done.stderr}")
@@ -266,7 +269,7 @@ class Cluster:
                     log = stack.enter_context((pod.root / f"{container['name']}.log").open("wb"))
                     environment = self._environment_of(pod, container, secrets)
                     process = subprocess.Popen(
-                        self._words(pod, container),
+                        self._container_command(pod, container),
                         cwd=pod.root,
                         env=environment,
                         stdout=log,
@@ -275,7 +278,7 @@ class Cluster:
                     started.append((pod, container, stack.enter_context(process)))
                     stack.callback(process.kill)
             for pod, container, process in started:
-                self._await(pod, container, process)
+                self._await_probes(pod, container, process)
             yield self
             for pod, container, process in reversed(started):
                 process.send_signal(signal.SIGTERM)
@@ -286,7 +289,9 @@ class Cluster:
                 if code:
                     self.failed.append(f"{pod.name}: {container['name']} left with {code}")
 
-    def _await(self, pod: Pod, container: Manifest, process: subprocess.Popen[bytes]) -> None:
+    def _await_probes(
+        self, pod: Pod, container: Manifest, process: subprocess.Popen[bytes]
+    ) -> None:
         """Wait until its probes hold: the one of the start first, as a kubelet would."""
         names = [
             name
@@ -295,7 +300,7 @@ class Cluster:
         ]
         assert "readinessProbe" in names
         for name in names:
-            holds = partial(answers, pod, container, container[name])
+            holds = partial(has_answered, pod, container, container[name])
             try:
                 until(lambda holds=holds: process.poll() is not None or holds(), START_S)  # type: ignore[misc]
             except TimeoutError:
@@ -308,12 +313,12 @@ class Cluster:
                 )
                 return
 
-    def fetch(self, pod: Pod, path: str) -> str:
+    def fetch_page(self, pod: Pod, path: str) -> str:
         """A page of a pod's metrics server; empty while a standby that takes over closes its own
         for the service's.
         """
         (container,) = pod.containers
-        address = f"http://127.0.0.1:{pod.port(container, 'metrics')}{path}"
+        address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"
         try:
             with urllib.request.urlopen(address, timeout=5.0) as page:
                 return str(page.read().decode())
@@ -321,17 +326,18 @@ class Cluster:
             return ""
 
 
-def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
+def has_answered(pod: Pod, container: Manifest, probe: Manifest) -> bool:
     """Return True if a probe succeeds."""
     if "tcpSocket" in probe:
         with socket.socket() as one:
             one.settimeout(1.0)
             return (
-                one.connect_ex(("127.0.0.1", pod.port(container, probe["tcpSocket"]["port"]))) == 0
+                one.connect_ex(("127.0.0.1", pod.port_of(container, probe["tcpSocket"]["port"])))
+                == 0
             )
     asked = probe["httpGet"]
     try:
-        address = f"http://127.0.0.1:{pod.port(container, asked['port'])}{asked['path']}"
+        address = f"http://127.0.0.1:{pod.port_of(container, asked['port'])}{asked['path']}"
         with urllib.request.urlopen(address, timeout=5.0) as page:
             return 200 <= int(page.status) < 400
     except (urllib.error.URLError, OSError):
@@ -350,14 +356,14 @@ def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
 
 
 @contextmanager
-def cluster(overlay: str, root: Path) -> Iterator[Cluster]:
+def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
     """Run an overlay, with a bucket next to it if its pods need one."""
     made = Cluster(overlay, root)
     wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
     with ExitStack() as stack:
         bucket = stack.enter_context(bucket_server(root / "objects")) if wanted else None
         (root / "objects" / BUCKET).mkdir(parents=True, exist_ok=True)
-        yield stack.enter_context(made.running(bucket))
+        yield stack.enter_context(made.run_pods(bucket))
 
 
 def main() -> int:
@@ -367,12 +373,12 @@ def main() -> int:
     objects = 0
     started = 0
     for overlay in OVERLAYS:
-        found = built(overlay)
+        found = build_overlay(overlay)
         objects += len(found)
-        wrong += [f"{overlay}: {line}" for line in invalid(found)]
+        wrong += [f"{overlay}: {line}" for line in find_schema_errors(found)]
         with tempfile.TemporaryDirectory() as folder:
             began = time.monotonic()
-            with cluster(overlay, Path(folder)) as running:
+            with open_cluster(overlay, Path(folder)) as running:
                 started += len(running.pods)
             failed += [f"{overlay}: {line}" for line in running.failed]
             print(

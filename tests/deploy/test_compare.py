@@ -14,12 +14,12 @@ from deploy.demo import compare, page, picture
 from deploy.demo.story import report
 from schemas.runtime.figures import Figure
 from schemas.wire import Alert
-from tests.browser import opened
+from tests.browser import open_page
 
 S = 1_000_000_000
 
 
-def visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
+def make_visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
     """Visits (vehicle, second, cell, mu, utilisation), each half a second long, sector 0."""
     vehicle, at, cell, mu, used = zip(*rows, strict=True)
     enter = np.array([int(second * S) for second in at])
@@ -36,7 +36,7 @@ def visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
     )
 
 
-def tile(cells: list[int], lower: float, upper: float) -> pa.Table:
+def make_tile(cells: list[int], lower: float, upper: float) -> pa.Table:
     n = len(cells)
     return pa.table(
         {
@@ -59,25 +59,27 @@ def tile(cells: list[int], lower: float, upper: float) -> pa.Table:
     )
 
 
-def alert(cell: int) -> Alert:
+def make_alert(cell: int) -> Alert:
     return Alert(cell, 0, True, 0, 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test")
 
 
 def test_the_truth_is_the_friction_after_the_change_where_there_is_one() -> None:
-    road = visits(
+    road = make_visits(
         ("a", 1, 7, 0.9, 0.1), ("a", 11, 7, 0.2, 0.1), ("b", 12, 7, 0.3, 0.1), ("a", 2, 8, 0.6, 0.1)
     )
     assert compare.final_truth(road, 10 * S) == pytest.approx({(7, 0): 0.25, (8, 0): 0.6})
 
 
 def test_a_cell_without_a_truth_is_left_out() -> None:
-    found = compare.compare(tile([7, 99], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1)), 10 * S)
+    found = compare.compare(
+        make_tile([7, 99], 0.1, 0.4), make_visits(("a", 11, 7, 0.2, 0.1)), 10 * S
+    )
     assert found.cells["cell"].to_pylist() == [7]
     assert found.is_covered.tolist() == [True]
 
 
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
-    road = visits(
+    road = make_visits(
         ("z", 1, 7, 0.9, 0.9),
         ("z", 2, 8, 0.9, 0.9),  # it was dry
         ("a", 11, 7, 0.2, 0.9),
@@ -88,13 +90,13 @@ def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
         ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
     )
     patch = compare.newly_slippery(road, 10 * S) & (road["mu"].to_numpy() < 0.4)
-    assert compare.delay_passes(road, patch, [(50 * S, alert(7))], 10 * S) == 3.0
+    assert compare.delay_passes(road, patch, [(50 * S, make_alert(7))], 10 * S) == 3.0
 
 
 def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
-    road = visits(("a", 11, 7, 0.2, 0.9))
+    road = make_visits(("a", 11, 7, 0.2, 0.9))
     patch = np.array([True])
-    assert compare.delay_passes(road, patch, [(50 * S, alert(99))], 10 * S) == float("inf")
+    assert compare.delay_passes(road, patch, [(50 * S, make_alert(99))], 10 * S) == float("inf")
     assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
 
 
@@ -111,13 +113,15 @@ def test_old_snow_and_unvisited_places_are_not_the_new_patch() -> None:
         ("a", 13, 9, 0.39, 0.9),
         ("a", 14, 10, 0.2, 0.9),
     )
-    new = compare.newly_slippery(visits(*before, *after), 10 * S)
+    new = compare.newly_slippery(make_visits(*before, *after), 10 * S)
     assert new.tolist() == [False, False, False, False, False, True, False, False]
 
 
 def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
     found = compare.compare(
-        tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S
+        make_tile([7, 8], 0.1, 0.4),
+        make_visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)),
+        10 * S,
     )
     basis = found.cells.schema.get_field_index("basis")
     hostile = replace(
@@ -139,16 +143,18 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
 
 def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path) -> None:
     found = compare.compare(
-        tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S
+        make_tile([7, 8], 0.1, 0.4),
+        make_visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)),
+        10 * S,
     )
     basis = found.cells.schema.get_field_index("basis")
     found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
     page.write(found, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
-    with opened(tmp_path / "map.html") as shown:
+    with open_page(tmp_path / "map.html") as shown:
         assert shown.errors == []
-        assert shown.drawn == 4
-        assert len(shown.colours(0)) >= 2
-        assert len(shown.colours(1)) > 2, "a colour, and the hatching with its white"
+        assert shown.drawn_count == 4
+        assert len(shown.count_colours(0)) >= 2
+        assert len(shown.count_colours(1)) > 2, "a colour, and the hatching with its white"
         assert shown.page.locator("#unknown").is_visible()
         assert "demo.map.rmse" in shown.page.locator("#table").inner_text()
 
@@ -159,7 +165,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     """Count two warned passes and one unwarned pass since the first alert; earlier ones do not
     count.
     """
-    driven = visits(
+    driven = make_visits(
         ("sim-001", 1.0, 7, 0.9, 0.5),
         ("sim-002", 11.0, 7, 0.2, 1.0),
         ("sim-001", 31.0, 7, 0.2, 0.6),
@@ -187,7 +193,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     }
     assert not any(one.holds for one in nobody.figures())
     assert compare.works(nobody.figures()), "few passes are no failure of the demo"
-    found = compare.MapComparison(tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
+    found = compare.MapComparison(make_tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
     told = report(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
     assert grip.line() in capsys.readouterr().out
     shares = {figure.name: figure.value for figure in told}

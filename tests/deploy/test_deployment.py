@@ -27,7 +27,7 @@ from fleet_service.client.map_client import query_map
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
 from schemas.runtime.zenoh_session import configuration
-from tests.schemas.runtime.test_metrics import fetch
+from tests.schemas.runtime.test_metrics import fetch_page
 from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,13 +61,13 @@ class Site:
         for name in ("etc", "lib", "cache"):
             (root / name).mkdir()
         for file in (DEPLOY / "secure").glob("*.json"):
-            (root / "etc" / file.name).write_text(self.placed(file.read_text()))
+            (root / "etc" / file.name).write_text(self.localize_paths(file.read_text()))
         alone = {"service": {"public_vehicles": 1}, "agent": {"trip_end_m": 0.0, "trip_end_s": 0.0}}
         for name, changed in alone.items():  # one car, which would stay private for ever
             path = root / "etc" / f"{name}.json"
             path.write_text(json.dumps(json.loads(path.read_text()) | changed))
 
-    def placed(self, text: str) -> str:
+    def localize_paths(self, text: str) -> str:
         """A text with the folders and ports of this site."""
         places = {"/etc/gripmap": "etc", "/var/lib/gripmap": "lib", "/var/cache/gripmap": "cache"}
         for place, folder in places.items():
@@ -82,11 +82,11 @@ class Site:
         )  # as EnvironmentFile would have it
         return text.replace("/opt/gripmap/bin", str(BIN))
 
-    def unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
+    def read_unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
         """The service section of a unit."""
         parser = configparser.ConfigParser(strict=False, interpolation=None)
         parser.optionxform = str  # type: ignore[assignment,method-assign]
-        parser.read_string(self.placed(unit.read_text()).replace("%i", instance))
+        parser.read_string(self.localize_paths(unit.read_text()).replace("%i", instance))
         return parser["Service"]
 
     @property
@@ -94,7 +94,7 @@ class Site:
         return f"http://127.0.0.1:{self._ports[2]}"
 
 
-def instances() -> Iterator[tuple[Path, str]]:
+def list_instances() -> Iterator[tuple[Path, str]]:
     for unit in UNITS:
         for instance in INSTANCES[unit.stem]:
             yield unit, instance
@@ -110,9 +110,10 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
     folder = tmp_path / "units"
     folder.mkdir()
     for unit in UNITS:
-        (folder / unit.name).write_text(site.placed(unit.read_text()))
+        (folder / unit.name).write_text(site.localize_paths(unit.read_text()))
     names = [
-        str(folder / unit.name.replace("@.", f"@{instance}.")) for unit, instance in instances()
+        str(folder / unit.name.replace("@.", f"@{instance}."))
+        for unit, instance in list_instances()
     ]
     done = subprocess.run(
         [
@@ -137,9 +138,9 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
     folder = tmp_path / "units"
     (folder / "gripmap-service.service.d").mkdir(parents=True)
     unit = DEPLOY / "systemd" / "gripmap-service.service"
-    (folder / unit.name).write_text(site.placed(unit.read_text()))
+    (folder / unit.name).write_text(site.localize_paths(unit.read_text()))
     standby = folder / "gripmap-service.service.d" / "standby.conf"
-    standby.write_text(site.placed((DEPLOY / "systemd" / "standby.conf").read_text()))
+    standby.write_text(site.localize_paths((DEPLOY / "systemd" / "standby.conf").read_text()))
     done = subprocess.run(
         [
             "systemd-analyze",
@@ -160,7 +161,9 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
         line for line in standby.read_text().splitlines() if line.startswith("ExecStart=")
     ]
     assert emptied == ["ExecStart="]
-    assert started.removeprefix("ExecStart=") == f"{site.unit(unit, '')['ExecStart']} --standby"
+    assert (
+        started.removeprefix("ExecStart=") == f"{site.read_unit(unit, '')['ExecStart']} --standby"
+    )
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
@@ -223,7 +226,7 @@ def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
     started = sorted(part["command"] for name, part in services.items() if name != "certs")
     plain = configparser.ConfigParser(strict=False, interpolation=None)
     commands = []
-    for unit, instance in instances():
+    for unit, instance in list_instances():
         plain.read_string(unit.read_text().replace("%i", instance))
         started_by = (
             plain["Service"]["ExecStart"].replace("${SOURCE}", "simulated").replace("$MORE", "")
@@ -282,9 +285,9 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
     running: list[subprocess.Popen[bytes]] = []
     with ExitStack() as stack:
         for unit, instance in sorted(
-            instances(), key=lambda one: list(INSTANCES).index(one[0].stem)
+            list_instances(), key=lambda one: list(INSTANCES).index(one[0].stem)
         ):
-            section = site.unit(unit, instance)
+            section = site.read_unit(unit, instance)
             Path(section["WorkingDirectory"]).mkdir(parents=True)
             log = stack.enter_context((site.root / f"{unit.stem}{instance}.log").open("wb"))
             process = subprocess.Popen(
@@ -296,28 +299,28 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
             running.append(stack.enter_context(process))
             stack.callback(process.kill)
 
-        def rows() -> float:
-            lines = fetch(f"{site.address}/metrics")[2].splitlines() if listening() else []
+        def count_rows() -> float:
+            lines = fetch_page(f"{site.address}/metrics")[2].splitlines() if is_listening() else []
             return sum(
                 float(line.split()[-1]) for line in lines if line.startswith("gripmap_rows_total")
             )
 
-        def cells() -> int:
+        def count_cells() -> int:
             shown = query_map(
                 load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}
             ).table
             return shown.num_rows if shown else 0
 
-        def listening() -> bool:
+        def is_listening() -> bool:
             assert all(process.poll() is None for process in running), (
                 "a part ended before its time"
             )
             with socket.socket() as probe:
                 return probe.connect_ex(("127.0.0.1", int(site.address.rsplit(":", 1)[1]))) == 0
 
-        until(rows, START_S)
-        assert fetch(f"{site.address}/healthz")[0] == 200
-        until(cells, START_S)
+        until(count_rows, START_S)
+        assert fetch_page(f"{site.address}/healthz")[0] == 200
+        until(count_cells, START_S)
         for process in reversed(running):
             began = time.monotonic()
             process.send_signal(signal.SIGTERM)

@@ -49,7 +49,9 @@ def test_every_page_stands_in_the_contents_of_the_site() -> None:
     generated = DOCS / "reference" / "generated"
     assert not [path for path in listed if not path.exists() and path.parent != generated]
     decisions = set((DOCS / "decisions").glob("0*.md"))  # by a pattern in their own index
-    written = {page for page in results.pages() if page.name == "README.md" or DOCS in page.parents}
+    written = {
+        page for page in results.list_pages() if page.name == "README.md" or DOCS in page.parents
+    }
     written = {page for page in written if page.parent != DOCS / "reference" / "generated"}
     written -= {ROOT / "README.md", DOCS / "index.md"} | decisions
     assert written - set(listed) == set()

@@ -56,7 +56,7 @@ def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
+def serve_ice(folder: Path) -> Iterator[str]:
     """Endpoint of a router whose service knows of the ice that three vehicles found."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
@@ -64,7 +64,7 @@ def served(folder: Path) -> Iterator[str]:
         heard: zenoh.Session | None = open_session(settings)
         assert heard is not None
         with heard:
-            fleet = Fleet(heard).meet()
+            fleet = Fleet(heard).await_services()
             fleet.settle(
                 *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3))
             )
@@ -72,7 +72,7 @@ def served(folder: Path) -> Iterator[str]:
 
 
 def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
-    with served(tmp_path) as endpoint:
+    with serve_ice(tmp_path) as endpoint:
         assert query_map.main(endpoint) == 1
     assert ": 1 cells" in capsys.readouterr().out
 
@@ -80,7 +80,7 @@ def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> 
 def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
     """Router, service, reports, alert and a car that comes along: all of it real."""
     before = LONGITUDE - 60.0 / 111e3 / math.cos(math.radians(LATITUDE))
-    with served(tmp_path) as endpoint:
+    with serve_ice(tmp_path) as endpoint:
         warned = be_warned.main(endpoint, LATITUDE, before)
     assert warned.startswith("my-car: slippery in ")
     assert "an alert stands" in warned or "the map says so" in warned

@@ -19,7 +19,7 @@ from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.runtime import tokens
 from schemas.runtime.zenoh_session import open_session
 from tests.deploy import kubernetes
-from tests.deploy.kubernetes import OVERLAYS, Cluster, Manifest, built, of_kind
+from tests.deploy.kubernetes import OVERLAYS, Cluster, Manifest, build_overlay, of_kind
 from tests.structure import ROOT
 from tests.waiting import until
 
@@ -33,38 +33,38 @@ SECRETS = {  # the documented ones, by overlay
 }
 
 
-def templates(objects: list[Manifest]) -> list[Manifest]:
+def list_templates(objects: list[Manifest]) -> list[Manifest]:
     return [one["spec"]["template"] for one in of_kind(objects, "StatefulSet")]
 
 
 def labels_of(objects: list[Manifest]) -> list[dict[str, str]]:
-    return [template["metadata"]["labels"] for template in templates(objects)]
+    return [template["metadata"]["labels"] for template in list_templates(objects)]
 
 
-def selects(selector: dict[str, str], labels: dict[str, str]) -> bool:
+def does_select(selector: dict[str, str], labels: dict[str, str]) -> bool:
     return selector.items() <= labels.items()
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_the_schemas_of_kubernetes_find_nothing_wrong(overlay: str) -> None:
-    objects = built(overlay)
+    objects = build_overlay(overlay)
     assert len(objects) >= 8
-    assert kubernetes.invalid(objects) == []
+    assert kubernetes.find_schema_errors(objects) == []
     wrong = json.loads(json.dumps(objects))
     (of_kind(wrong, "StatefulSet")[0]["spec"])["replica"] = 1
-    assert len(kubernetes.invalid(wrong)) == 1, "a name that is none is found"
+    assert len(kubernetes.find_schema_errors(wrong)) == 1, "a name that is none is found"
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
-    objects = built(overlay)
+    objects = build_overlay(overlay)
     labels = labels_of(objects)
     secrets = set()
     configs = {one["metadata"]["name"] for one in of_kind(objects, "ConfigMap")}
     services = {one["metadata"]["name"]: one for one in of_kind(objects, "Service")}
     for one in of_kind(objects, "StatefulSet"):
         assert one["spec"]["serviceName"] in services
-        assert selects(
+        assert does_select(
             one["spec"]["selector"]["matchLabels"], one["spec"]["template"]["metadata"]["labels"]
         )
         volumes = one["spec"]["template"]["spec"]["volumes"]
@@ -79,9 +79,13 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
         wanted = dict(service["spec"]["selector"])
         pod = wanted.pop("statefulset.kubernetes.io/pod-name", None)
         assert pod in {None, "router-0", "router-1"}
-        assert pod or sum(selects(wanted, one) for one in labels) == 1, service["metadata"]["name"]
+        assert pod or sum(does_select(wanted, one) for one in labels) == 1, service["metadata"][
+            "name"
+        ]
     for budget in of_kind(objects, "PodDisruptionBudget"):
-        assert sum(selects(budget["spec"]["selector"]["matchLabels"], one) for one in labels) == 1
+        assert (
+            sum(does_select(budget["spec"]["selector"]["matchLabels"], one) for one in labels) == 1
+        )
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
@@ -89,18 +93,18 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
     """Apply the policies as a cluster does: a pod may do everything that any policy selecting it
     allows.
     """
-    objects = built(overlay)
+    objects = build_overlay(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]
     (router,) = (
         one for one in labels_of(objects) if one["app.kubernetes.io/component"] == "router"
     )
     for labels in labels_of(objects):
-        own = [one for one in policies if selects(one["podSelector"]["matchLabels"], labels)]
+        own = [one for one in policies if does_select(one["podSelector"]["matchLabels"], labels)]
         assert own, "whom no policy selects anybody reaches"
         assert all(set(one["policyTypes"]) == {"Ingress", "Egress"} for one in own)
         ways = [rule for one in own for rule in one["egress"] if {"port": 7447} in rule["ports"]]
         to = [peer["podSelector"].get("matchLabels", {}) for rule in ways for peer in rule["to"]]
-        assert any(selects(one, router) for one in to), labels
+        assert any(does_select(one, router) for one in to), labels
         if labels["app.kubernetes.io/component"] == "service" and overlay != "one-node":
             let_in = [rule for one in own for rule in one["ingress"]]
             assert [rule["ports"] for rule in let_in] == [[{"port": 9464}]]
@@ -112,7 +116,7 @@ def test_every_container_is_shut_in_and_bounded(overlay: str) -> None:
     """The restricted profile of the pod security standards, which the namespace enforces, and
     more.
     """
-    for template in templates(built(overlay)):
+    for template in list_templates(build_overlay(overlay)):
         pod = template["spec"]
         assert pod["securityContext"]["runAsNonRoot"] is True
         assert pod["securityContext"]["runAsUser"] == 10001
@@ -172,26 +176,26 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
 def test_what_the_pods_start_works_together_and_leaves_in_time(
     overlay: str, tmp_path: Path
 ) -> None:
-    with kubernetes.cluster(overlay, tmp_path) as running:
+    with kubernetes.open_cluster(overlay, tmp_path) as running:
         assert running.failed == []
         services = [pod for pod in running.pods if "router" not in pod.name]
 
-        def serving() -> list[str]:
+        def list_serving() -> list[str]:
             found = [
                 pod
                 for pod in services
-                if re.search(r"^gripmap_serves\{.*\} 1", running.fetch(pod, "/metrics"), re.M)
+                if re.search(r"^gripmap_serves\{.*\} 1", running.fetch_page(pod, "/metrics"), re.M)
             ]
             return [pod.name.rpartition("-")[0] for pod in found]
 
         wanted = sorted({pod.name.rpartition("-")[0] for pod in services})
-        until(lambda: sorted(serving()) == wanted, 120.0)
-        with reader(running) as session:
+        until(lambda: sorted(list_serving()) == wanted, 120.0)
+        with open_reader(running) as session:
             until(
                 lambda: (
                     len({token.region for token in tokens.active_tokens(session)})
                     == sum(
-                        len(json.loads(settings(running, f"{name}-0"))["regions"])
+                        len(json.loads(read_settings(running, f"{name}-0"))["regions"])
                         if overlay == "three-regions"
                         else 1
                         for name in wanted
@@ -201,14 +205,14 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(
     assert running.failed == []
 
 
-def settings(running: Cluster, pod: str) -> str:
+def read_settings(running: Cluster, pod: str) -> str:
     return (running.root / pod / "config" / f"{pod}.json").read_text()
 
 
-def reader(running: Cluster) -> zenoh.Session:
+def open_reader(running: Cluster) -> zenoh.Session:
     """A reader's session at the routers, with its own certificate where they ask for one."""
     name = next(pod.name for pod in running.pods if "router" not in pod.name)
-    shipped = ServiceConfig.model_validate_json(settings(running, name)).zenoh
+    shipped = ServiceConfig.model_validate_json(read_settings(running, name)).zenoh
     config = {"connect": shipped.connect}
     if running.overlay != "one-node":
         tls = json.loads((ROOT / "deploy" / "secure" / "reader.json").read_text())["zenoh"][

@@ -142,7 +142,7 @@ def a_log(samples: int) -> dict[str, Any]:
     return {"t": np.arange(samples) / 100.0} | columns
 
 
-def _written(**changes: object) -> Callable[[Path], object]:
+def make_log_writer(**changes: object) -> Callable[[Path], object]:
     """Writes a log of five samples with some columns replaced, or left out where the change is
     None.
     """
@@ -166,33 +166,36 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),
     "no rows": (lambda path: pq.write_table(pa.table(a_log(0)), path), "^log: .* has no rows; "),
-    "no time": (_written(t=None), "^t: the log has neither t nor timestamp; add"),
-    "no ax": (_written(ax=None), "^ax: the log has no such column; add"),
-    "no omega_rr": (_written(omega_rr=None), "^omega_rr: the log has no such column; add"),
+    "no time": (make_log_writer(t=None), "^t: the log has neither t nor timestamp; add"),
+    "no ax": (make_log_writer(ax=None), "^ax: the log has no such column; add"),
+    "no omega_rr": (make_log_writer(omega_rr=None), "^omega_rr: the log has no such column; add"),
     "no steering": (
-        _written(delta_fl=None, delta_fr=None),
+        make_log_writer(delta_fl=None, delta_fr=None),
         "^delta_fl: .* no such column; add it or delta_fr",
     ),
-    "yaw_rate all NaN": (_written(yaw_rate=_LOST), "^yaw_rate: has no reading in any row; record"),
+    "yaw_rate all NaN": (
+        make_log_writer(yaw_rate=_LOST),
+        "^yaw_rate: has no reading in any row; record",
+    ),
     "omega_fl all null": (
-        _written(omega_fl=pa.nulls(5, pa.float64())),
+        make_log_writer(omega_fl=pa.nulls(5, pa.float64())),
         "^omega_fl: has no reading in any row; record",
     ),
     "steering all NaN": (
-        _written(delta_fl=_LOST, delta_fr=_LOST),
+        make_log_writer(delta_fl=_LOST, delta_fr=_LOST),
         "^delta_fl: has no reading in any row; record",
     ),
     "time goes back": (
-        _written(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])),
+        make_log_writer(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])),
         "^t: goes back at row 3; sort the log",
     ),
     "time missing": (
-        _written(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])),
+        make_log_writer(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])),
         "^t: row 1 has no time; give",
     ),
-    "text for a number": (_written(ay=["a"] * 5), "^ay: is string, not a number; write"),
+    "text for a number": (make_log_writer(ay=["a"] * 5), "^ay: is string, not a number; write"),
     "text for a time": (
-        _written(t=None, timestamp=["a"] * 5),
+        make_log_writer(t=None, timestamp=["a"] * 5),
         "^timestamp: is string, not a time; write",
     ),
 }

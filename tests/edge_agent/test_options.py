@@ -281,7 +281,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
+def record_arguments(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
     """Record the arguments that a live command passes to the loop: vehicles, names, signals,
     settings, estimator, duration; and its files.
     """
@@ -326,14 +326,14 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
     if option == "--vehicle":
         usual = [*usual, *(word.format(folder / "0", folder / "1") for word in LOGGED)]
     first, again, other = (
-        driven(words, monkeypatch, folder) for words in (usual, usual, [*usual, *changed])
+        record_arguments(words, monkeypatch, folder) for words in (usual, usual, [*usual, *changed])
     )
     assert first == again
     assert other != first
 
 
 @cache
-def tuned(folder: Path, *words: str) -> tuple[object, list[str]]:
+def run_search(folder: Path, *words: str) -> tuple[object, list[str]]:
     """The memberships, scores and budget of a quick search, and the files that it wrote."""
     folder.mkdir(parents=True)
     with contextlib.chdir(folder):
@@ -351,7 +351,7 @@ def test_every_option_of_tune_changes_what_is_found(
 ) -> None:
     base = tmp_path_factory.getbasetemp() / "tuned"
     words = [word.format("0") for word in CHANGED["tune", option]]
-    assert tuned(base / "usual") != tuned(base / option, *words)
+    assert run_search(base / "usual") != run_search(base / option, *words)
 
 
 @pytest.mark.parametrize("option", SIMULATE)
@@ -375,7 +375,7 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
         assert main(["simulate", "slalom", "--duration", "3", "--seed", seed, *files]) == 0
     (tmp_path / "agent.json").write_text(json.dumps({"estimator": "sr-ukf"}))
 
-    def reported(log: str = "one", vehicle: str = "one", *more: str) -> FloatArray:
+    def replay_estimates(log: str = "one", vehicle: str = "one", *more: str) -> FloatArray:
         out = tmp_path / "out.parquet"
         files = [
             str(tmp_path / f"{log}.parquet"),
@@ -387,16 +387,16 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
         assert main(["replay", *files, *more]) == 0
         return np.asarray(pq.read_table(out)["mu"].to_numpy())
 
-    usual = reported()
-    configured = reported("one", "one", "--config", str(tmp_path / "agent.json"))
-    named = reported("one", "one", "--estimator", "sr-ukf")
-    for other in (reported("other"), reported("one", "other"), named):
+    usual = replay_estimates()
+    configured = replay_estimates("one", "one", "--config", str(tmp_path / "agent.json"))
+    named = replay_estimates("one", "one", "--estimator", "sr-ukf")
+    for other in (replay_estimates("other"), replay_estimates("one", "other"), named):
         assert not np.array_equal(usual, other)
     assert np.array_equal(named, configured)
 
 
 @cache
-def recorded(
+def record_blocks(
     scenario: str = "test", seed: int = 4, rate: float = 50.0, seconds: float = 12.0
 ) -> tuple[Block, SimulatedFleet]:
     """Blocks of a small fleet as one, and the fleet."""
@@ -410,7 +410,7 @@ def recorded(
 
 
 def records(config: AgentConfig) -> list[object]:
-    block, fleet = recorded()
+    block, fleet = record_blocks()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), 2, config)
     _, *output = pipeline.step(block)
     return [
@@ -441,7 +441,7 @@ def test_the_estimator_of_the_configuration_tells_another_friction() -> None:
 
 @pytest.mark.parametrize(("flush_s", "rows"), [(0.2, 50), (1.0, 3)])
 def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, rows: int) -> None:
-    block, fleet = recorded()
+    block, fleet = record_blocks()
     pipeline = Pipeline(bank_of("ckf", fleet.vehicles), 2, AgentConfig())
     _, _, states = pipeline.step(block)
     assert states.kind is Kind.STATE

@@ -45,7 +45,7 @@ def run(site: Site) -> list[Figure]:
     with open_stage(site.folder) as there:
         beside = _make_second_router(there)
         with _open_session(there.endpoint) as driver, _open_session(beside.command[-1]) as watcher:
-            fleet = Fleet(driver).meet()
+            fleet = Fleet(driver).await_services()
             heard = dict[Place, float]()
             watched = watcher.declare_subscriber(
                 f"{keys.ROOT}/alert/**", lambda sample: _record_alert(heard, sample)

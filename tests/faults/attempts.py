@@ -23,7 +23,16 @@ from schemas.errors import InputError
 from schemas.runtime.zenoh_session import configuration
 from tests.faults.ground import HONEST, ROGUE, Ground, Listener
 from tests.fleet_service.examples import REGION, TILE, batch, key
-from tests.secured import FREE, READER, ROUTERS, SERVICE, WEATHER, enrolment, registry, settings
+from tests.secured import (
+    FREE,
+    READER,
+    ROUTERS,
+    SERVICE,
+    WEATHER,
+    make_enrolment,
+    open_registry,
+    settings,
+)
 from tests.waiting import until
 
 Attempt = Callable[[Ground], bool]
@@ -41,7 +50,7 @@ def register_attempt(function: Attempt) -> Attempt:
 def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
     """Return True if a session opens."""
     try:
-        with ground.network.session(name, router, **changed):
+        with ground.network.open_session(name, router, **changed):
             return True
     except zenoh.ZError:
         return False
@@ -66,7 +75,7 @@ def issue_certificate(
 def make_stranger(ground: Ground) -> Path:
     """Folder of another authority that knows the same names."""
     folder = ground.folder / "stranger"
-    registry(folder).enrol(enrolment())
+    open_registry(folder).enrol(make_enrolment())
     return folder
 
 
@@ -406,7 +415,7 @@ def vehicle_that_plays_peer(ground: Ground) -> bool:
 def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
     through = False
     for name in ("*", "**", "0123", "sim-*", "role/services"):
-        with ground.network.session(
+        with ground.network.open_session(
             name, ROUTERS[1], **issue_certificate(ground, name, ground.folder / "odd")
         ) as session:
             places = (
@@ -451,7 +460,7 @@ def names_that_look_like_a_tile_or_a_path_are_enrolled(ground: Ground) -> bool:
 @register_attempt
 def one_name_with_two_roles(ground: Ground) -> bool:
     with suppress(ValueError):
-        return bool(enrolment(vehicles=[SERVICE]))
+        return bool(make_enrolment(vehicles=[SERVICE]))
     return False
 
 
@@ -494,7 +503,7 @@ def revoked_vehicle(ground: Ground) -> bool:
     (ground.folder / "lost.pem").rename(ground.folder / "lost.crt")
     lost["connect_certificate"] = str(ground.folder / "lost.crt")
     again = Registry(ground.folder, Terms(), datetime.now(UTC))
-    again.enrol(enrolment(vehicles=[HONEST]))
+    again.enrol(make_enrolment(vehicles=[HONEST]))
     for router in ROUTERS[::-1]:
         network.stop(router)
         network.start(router)
@@ -505,5 +514,5 @@ def revoked_vehicle(ground: Ground) -> bool:
     ground.drive()
     ground.drive()
     with suppress(InputError):
-        return bool(again.enrol(enrolment()))
+        return bool(again.enrol(make_enrolment()))
     return ground.monitor.has_payload(SECRET) or bool(listener.heard)

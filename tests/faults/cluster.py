@@ -43,7 +43,7 @@ from tests.faults.cluster_stage import (
     write_town_archive,
 )
 from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
-from tests.standbys import hosts, restored
+from tests.standbys import open_hosts, restore_archive
 from tests.waiting import until
 
 FULL: Final = 100  # failovers
@@ -99,7 +99,7 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         module = "tests.faults.cluster_service"
         names = ["one", "two", "three"]
         there = stack.enter_context(
-            hosts(
+            open_hosts(
                 site.folder,
                 names,
                 endpoint,
@@ -112,14 +112,14 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         )
         box = write_town_archive(there[0].root)
         there[0].part.start()
-        until(lambda: there[0].said("ready: "), PATIENCE_S)
+        until(lambda: there[0].has_said("ready: "), PATIENCE_S)
         cells = int(there[0].part.line_with("ready: ").split(", ")[1].split()[0])
         site.say(f"{cells} cells")
         parts = start_loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
         for part in parts:
             stack.callback(part.kill)
         machines = Machines(
-            there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_
+            there, bucket.path_of("lease"), lease_s, Journals(part.log for part in parts), random_
         )
         asking = Asking(endpoint, box, site.say)
         ways = list(WAYS)
@@ -148,7 +148,7 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
         seen = machines.stop_all()
         rows = [rows_of(host.root) for host in seen]
         census = [compare_with_archive([part.log for part in parts], host.root) for host in seen]
-        empty = restored(site.folder / "empty", bucket)
+        empty = restore_archive(site.folder / "empty", bucket)
         rows.append(rows_of(empty))
         census.append(compare_with_archive([part.log for part in parts], empty))
     site.say(f"rows {rows}; {census}")

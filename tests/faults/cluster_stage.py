@@ -223,15 +223,15 @@ def _restore_link(host: Host, random_: random.Random) -> None:
     """
     if random_.random() < 0.5 or host.to_router.is_cut:
         time.sleep(random_.uniform(0.0, 3.0))
-        host.to_bucket.mend()
-        host.to_router.mend()
+        host.to_bucket.restore()
+        host.to_router.restore()
     _check_superseded(host, random_)
-    host.to_bucket.mend()
+    host.to_bucket.restore()
 
 
 def _check_superseded(host: Host, _: random.Random) -> None:
     assert host.part.wait(PATIENCE_S) == 1
-    assert host.said("lease lost to another service")
+    assert host.has_said("lease lost to another service")
 
 
 TWO: Final = "two standbys"
@@ -283,7 +283,8 @@ class Machines:
             host.part.start()
             self.waiting.append(host)
         until(
-            lambda: all(_require_alive(host).said("standby: ") for host in self.waiting), PATIENCE_S
+            lambda: all(_require_alive(host).has_said("standby: ") for host in self.waiting),
+            PATIENCE_S,
         )
 
     def fail_over(self, name: str) -> Failover | None:
@@ -318,7 +319,9 @@ class Machines:
         self.serving = taker
 
     def _find_ready(self) -> Host | None:
-        return next((host for host in self.waiting if _require_alive(host).said("ready: ")), None)
+        return next(
+            (host for host in self.waiting if _require_alive(host).has_said("ready: ")), None
+        )
 
     def hand_over(self, router: ZenohSettings) -> Host:
         """The service gives its region to the one that waits, and has left then; returns it."""

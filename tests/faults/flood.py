@@ -32,7 +32,7 @@ from schemas.wire.tile import decode_tile
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
-from tests.secured import READER, ROUTERS, SERVICE, Network, enrolment, network, settings
+from tests.secured import READER, ROUTERS, SERVICE, Network, make_enrolment, open_network, settings
 from tests.waiting import until
 
 HONEST: Final = tuple(f"car-{number:03}" for number in range(10))
@@ -115,12 +115,13 @@ class Honest:
 def run(site: Site) -> list[Figure]:
     """Half a minute of flood, or three seconds."""
     seconds = site.choose_amount(30, 3)
-    fleet = enrolment(vehicles=[*HONEST, FLOODER])
-    with network(site.folder / "certificates", fleet=fleet) as running:
+    fleet = make_enrolment(vehicles=[*HONEST, FLOODER])
+    with open_network(site.folder / "certificates", fleet=fleet) as running:
         service = _start_service(site.folder, running)
         try:
             honest = [
-                Honest(running.session(name, ROUTERS[k % 2]), name) for k, name in enumerate(HONEST)
+                Honest(running.open_session(name, ROUTERS[k % 2]), name)
+                for k, name in enumerate(HONEST)
             ]
             _drive(honest, 4 * EVERY_S)
             _settle(honest)
@@ -216,7 +217,7 @@ def _run_flood(running: Network, honest: Sequence[Honest], seconds: float) -> in
 
 
 def _read_map(running: Network) -> pa.Table:
-    with running.session(READER) as session:
+    with running.open_session(READER) as session:
         replies = [reply.ok.payload.to_bytes() for reply in session.get(_ASKED) if reply.ok]
     return pa.concat_tables([decode_tile(payload) for payload in replies])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from schemas.runtime.figures import Figure
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.fuzz import PARSERS, Fuzzer, keeper, seeds_of
+from tests.fuzz import PARSERS, Fuzzer, make_keeper, seeds_of
 
 
 def run(site: Site) -> list[Figure]:
@@ -13,7 +13,7 @@ def run(site: Site) -> list[Figure]:
     each = site.choose_amount(10_000_000, 6_000) // len(PARSERS)
     executions = crashes = hangs = lines = 0
     for name, parser in PARSERS.items():
-        found = Fuzzer(parser, seeds_of(name), site.seed, keeper(site.folder / name)).run(
+        found = Fuzzer(parser, seeds_of(name), site.seed, make_keeper(site.folder / name)).run(
             executions=each
         )
         site.say(f"{name}: {found}")

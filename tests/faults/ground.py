@@ -73,7 +73,7 @@ class Ground:
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
         """A session that is closed at the end."""
-        return self._stack.enter_context(self.network.session(name, router, **changed))
+        return self._stack.enter_context(self.network.open_session(name, router, **changed))
 
     @property
     def admitted_count(self) -> int:

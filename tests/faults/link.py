@@ -28,7 +28,7 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.link_relay import DEVICE, LinkTerms
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, key
-from tests.secured import READER, SERVICE, registry
+from tests.secured import READER, SERVICE, open_registry
 
 ROUTER_ADDRESS: Final = "10.77.0.1"
 FLOOD_NET: Final = "10.78.0"
@@ -62,7 +62,9 @@ class Namespaces:
             for letter, port in zip("ab", PORTS, strict=True)
         }
         names = {"services": [SERVICE], "readers": [READER], "vehicles": [*HONEST, FLOODER]}
-        registry(self.certificates).enrol(Enrolment.model_validate({"routers": routers, **names}))
+        open_registry(self.certificates).enrol(
+            Enrolment.model_validate({"routers": routers, **names})
+        )
         self.road = self._add_namespace("road")
 
     def _add_namespace(self, name: str) -> str:

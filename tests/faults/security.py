@@ -9,13 +9,13 @@ from tests.faults.attempts import ATTEMPTS
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.ground import open_ground
-from tests.secured import network
+from tests.secured import open_network
 
 
 def run(site: Site) -> list[Figure]:
     """Every attack on one ground; the last revokes the attacker."""
     breaches = []
-    with network(site.folder / "certificates") as running, open_ground(running) as found:
+    with open_network(site.folder / "certificates") as running, open_ground(running) as found:
         for name, attempt in ATTEMPTS.items():
             if attempt(found):
                 breaches.append(name)

@@ -26,7 +26,7 @@ from schemas.wire import Kind
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.archive.kept import DATA, make, map_of
-from tests.fleet_service.archive.test_version import rewritten, with_columns
+from tests.fleet_service.archive.test_version import rewrite_file, with_columns
 
 
 def run(site: Site) -> list[Figure]:
@@ -44,7 +44,7 @@ def run(site: Site) -> list[Figure]:
         "states/*/*/*.parquet",
     ):
         for path in new.glob(pattern):
-            rewritten(path, with_columns, "1.7")
+            rewrite_file(path, with_columns, "1.7")
             changed += 1
     aside = lost = looks = 0
     difference = 0.0

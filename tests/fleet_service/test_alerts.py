@@ -61,14 +61,16 @@ def alert(
     )
 
 
-def told(stretches: Stretches, *alerts: Alert) -> list[Any]:
+def take_alerts(stretches: Stretches, *alerts: Alert) -> list[Any]:
     for one in alerts:
         stretches.apply_alert(one)
     return stretches.take_changes()
 
 
 def test_an_icy_road_in_both_directions_is_one_alert() -> None:
-    (found,) = told(Stretches(), *(alert(x, sector=s, at=x) for x in range(20) for s in (0, 2)))
+    (found,) = take_alerts(
+        Stretches(), *(alert(x, sector=s, at=x) for x in range(20) for s in (0, 2))
+    )
     side = 360 / 2**21 * 111_195 * np.cos(np.radians(found.latitude))
     assert found.length_m == pytest.approx(20 * side, rel=0.01)
     assert (found.direction, found.headings, found.cells) == ("east-west", ("east", "west"), 20)
@@ -77,38 +79,38 @@ def test_an_icy_road_in_both_directions_is_one_alert() -> None:
         "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since "
         "2027-01-15T08:00:00Z" in found.to_line()
     )
-    (north,) = told(Stretches(), *(alert(0, y) for y in range(10)))
+    (north,) = take_alerts(Stretches(), *(alert(0, y) for y in range(10)))
     assert north.direction == "north-south"
-    (one,) = told(Stretches(), alert(0))
+    (one,) = take_alerts(Stretches(), alert(0))
     assert one.direction == "around one place"
 
 
 def test_ice_far_away_is_another_alert_and_a_small_gap_is_none() -> None:
     gap = LINK_CELLS
-    assert len(told(Stretches(), alert(0), alert(gap))) == 1
-    assert len(told(Stretches(), alert(0), alert(gap + 1))) == 2
+    assert len(take_alerts(Stretches(), alert(0), alert(gap))) == 1
+    assert len(take_alerts(Stretches(), alert(0), alert(gap + 1))) == 2
 
 
 def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> None:
     road = Stretches()
-    (old,) = told(road, alert(0, at=0))
-    (young,) = told(road, alert(8, at=10))
+    (old,) = take_alerts(road, alert(0, at=0))
+    (young,) = take_alerts(road, alert(8, at=10))
     assert old.id != young.id
-    assert told(road, alert(0, at=0), alert(8, at=10)) == [], (
+    assert take_alerts(road, alert(0, at=0), alert(8, at=10)) == [], (
         "an alert is put again while it stands: that is no news"
     )
-    joined = {one.id: one for one in told(road, *(alert(x, at=20) for x in (2, 4, 6)))}
+    joined = {one.id: one for one in take_alerts(road, *(alert(x, at=20) for x in (2, 4, 6)))}
     assert joined[old.id].state == "changed"
     assert joined[old.id].cells == 5
     assert joined[young.id].state == "cleared"
     assert joined[old.id].since == old.since
-    apart = told(road, *(alert(x, raised=False, at=30) for x in (2, 4)))
+    apart = take_alerts(road, *(alert(x, raised=False, at=30) for x in (2, 4)))
     assert {one.state for one in apart} == {"changed", "raised"}
     assert [one.cells for one in apart if one.id == old.id] == [2], "the larger part keeps the name"
-    ended = told(road, *(alert(x, raised=False, at=40) for x in (0, 6, 8)))
+    ended = take_alerts(road, *(alert(x, raised=False, at=40) for x in (0, 6, 8)))
     assert {one.state for one in ended} == {"cleared"}
     assert {one.reason for one in ended} == {"later visits found grip"}
-    assert told(road) == []
+    assert take_alerts(road) == []
 
 
 @contextmanager
@@ -147,7 +149,7 @@ def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Pa
     said = list[str]()
     with receiver(refuse=1) as (url, heard):
         hook = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
-        for one in (*told(road, alert(0)), *told(road, alert(0, raised=False, at=5))):
+        for one in (*take_alerts(road, alert(0)), *take_alerts(road, alert(0, raised=False, at=5))):
             hook.send(one)
         until(lambda: len(heard) == 2)
         hook.close()
@@ -165,7 +167,7 @@ def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Pa
 def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
     said: list[str] = []
     hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue"))
-    hook.send(told(Stretches(), alert(0))[0])
+    hook.send(take_alerts(Stretches(), alert(0))[0])
     until(lambda: bool(hook.troubles()))
     hook.close()
     assert said[-1] == "webhook: 1 alerts wait in the queue for the next watch"
@@ -175,7 +177,7 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
         until(lambda: again.counts["delivered"] == 1)
         again.close()
     assert (len(heard), again.waiting_count, again.troubles()) == (1, 0, [])
-    assert set(alert_message(told(Stretches(), alert(0))[0])) >= {
+    assert set(alert_message(take_alerts(Stretches(), alert(0))[0])) >= {
         "receiver",
         "status",
         "alerts",
@@ -187,7 +189,7 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
 def test_full_queue_drops_the_oldest_and_reports_it(tmp_path: Path) -> None:
     said: list[str] = []
     hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue", 2))
-    for one in told(Stretches(), *(alert(10 * x) for x in range(5))):
+    for one in take_alerts(Stretches(), *(alert(10 * x) for x in range(5))):
         hook.send(one)
     assert hook.counts["dropped"] == 3
     assert "webhook: 3 alerts were lost" in hook.troubles()
@@ -231,7 +233,7 @@ def test_watch_says_stretches_as_json_and_sends_them(
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as watching:
             assert watching.stdout is not None
             assert json.loads(watching.stdout.readline()) == {"event": "watching"}
-            fleet = Fleet(session).meet()
+            fleet = Fleet(session).await_services()
             fleet.settle(
                 *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4))
             )

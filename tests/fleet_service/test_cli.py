@@ -69,7 +69,7 @@ def test_help_comes_without_what_commands_need() -> None:
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
     """A service with three cars on ice."""
-    fleet = Fleet(session).meet()
+    fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
     return fleet
 
@@ -159,7 +159,7 @@ def test_run_and_watch_as_processes_from_start_to_signal(
         assert watch.stdout is not None
         assert run.stdout.readline() == "ready: shard-0, 0 cells from the archive\n"
         assert watch.stdout.readline() == "watching\n"
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
         awaited = {
             "alert RAISED at 57.69",
@@ -239,7 +239,7 @@ def test_a_service_that_has_to_be_ended_gives_its_lease_free(
         assert "shutdown incomplete: a session or a job did not end in time" in service.read_lines()
     finally:
         service.kill()
-    (lease,) = bucket.place("lease").glob("*.json")
+    (lease,) = bucket.path_of("lease").glob("*.json")
     assert json.loads(lease.read_text())["released"] is True
 
 
@@ -258,10 +258,10 @@ def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path)
                 fleet = Fleet(client)
                 sent = batch("sim-001", 1, time.time_ns() - SECOND, [0.8])
 
-                def acknowledged() -> bool:
+                def is_acknowledged() -> bool:
                     client.put(key("sim-001"), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
                     return 1 in fleet.durable["sim-001"]
 
-                until(acknowledged)
+                until(is_acknowledged)
             run.end()
     assert run.service.engine.state.fusion.live.visits[0] == 1

@@ -37,7 +37,7 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.archive.kept import DATA, PLACES
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, batch
-from tests.secured import enrolment
+from tests.secured import make_enrolment
 
 Capture = pytest.CaptureFixture[str]
 ARCHIVE: Final = ["--archive", "{a}"]
@@ -235,8 +235,8 @@ def place(folder: Path) -> dict[str, str]:
     shutil.rmtree(next((names["b"] / "observations").glob("*/zone=*")))
     shutil.rmtree(next((names["b"] / "rollup/cell_hour").glob("*/zone=*")))
     names["out"].mkdir()
-    names["fleet"].write_text(enrolment().model_dump_json())
-    names["fleet2"].write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+    names["fleet"].write_text(make_enrolment().model_dump_json())
+    names["fleet2"].write_text(make_enrolment(vehicles=["car-1"]).model_dump_json())
     for name, degrees in (("warm", 20), ("cold", -5)):
         rows = [
             f"{k},2024-10-04T23:00:00,{lat},{lon},{degrees}\n"
@@ -256,7 +256,7 @@ def content(path: Path, folder: Path) -> str:
     return blake2b(path.read_bytes().replace(str(folder).encode(), b""), digest_size=8).hexdigest()
 
 
-def done(words: list[str], folder: Path, capsys: Capture) -> Done:
+def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
     """Run a command in a new folder."""
     names = place(folder)
     code = main([word.format(**names) for word in words])
@@ -355,10 +355,10 @@ def test_every_option_of_a_command_changes_what_it_does(
         other = [*usual[:at], change, *usual[at + 1 :]]
     else:
         other = [*usual, option, *([change] if change else [])]
-    first, again = (done(usual, tmp_path / name, capsys) for name in ("first", "again"))
+    first, again = (run_command(usual, tmp_path / name, capsys) for name in ("first", "again"))
     assert first == again
     assert first.code == 0, first.said
-    seen = done(other, tmp_path / "other", capsys)
+    seen = run_command(other, tmp_path / "other", capsys)
     if option == "--engine" and importlib.util.find_spec(
         "pyspark"
     ):  # the answer is the same: test_spark
@@ -416,7 +416,7 @@ def there(name: str, mu: float) -> wire.Batch:
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
     """A service with three cars on ice, and one on a dry road elsewhere later."""
-    fleet = Fleet(session).meet()
+    fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
     fleet.settle(there("sim-009", 0.8))
     return fleet
@@ -475,7 +475,7 @@ def test_box_selects_watched_tiles_and_both_options_name_the_router(
     try:
         for part in watching.values():
             part.line_with("watching")
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         fleet.settle(batch("sim-001", 1, time.time_ns() - SECOND, [0.8]), there("sim-009", 0.8))
         tiles = {name: part.line_with("tile ").split()[1] for name, part in watching.items()}
         assert tiles["here"] != tiles["far"]

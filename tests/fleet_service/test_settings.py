@@ -26,13 +26,13 @@ from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.fleet_service.archive.kept import DATA
 from tests.fleet_service.examples import REGION, SECOND, batch, key
-from tests.secured import enrolment
+from tests.secured import make_enrolment
 
 # Settings of the configuration: another value, and what shows it.
 Show = Callable[[ServiceConfig, Path], object]
 
 
-def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
+def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
     """An engine that has taken two cars' reports: one now, one of ten minutes ago, and one of a
     minute ahead.
     """
@@ -48,7 +48,7 @@ def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
 
 
 def of_engine(look: Callable[[Engine], object]) -> Show:
-    return lambda config, root: next(look(engine) for engine in taken(config, root))
+    return lambda config, root: next(look(engine) for engine in open_engine(config, root))
 
 
 def of_jobs(config: ServiceConfig, root: Path) -> object:
@@ -89,7 +89,7 @@ def let_in(made: Service) -> list[bool]:
     ]
 
 
-def queued(made: Service) -> int:
+def count_queued(made: Service) -> int:
     for _ in range(5):
         made.inbox.put(Message(Kind.STATE, "", b"", ""))
     return len(made.inbox)
@@ -100,7 +100,7 @@ def turns(made: Service) -> tuple[int, int]:
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}
 
-    def counted(name: str) -> Callable[..., list[Any]]:
+    def make_counter(name: str) -> Callable[..., list[Any]]:
         def call(*_: object) -> list[Any]:
             calls[name] += 1
             return []
@@ -113,7 +113,7 @@ def turns(made: Service) -> tuple[int, int]:
         patch.setattr(made._rounds, "_clock", lambda: clock[0])
         owners = ((made.engine.settlement, "begin_flush"), (made.engine.state.map, "take_dirty"))
         for owner, name in owners:
-            patch.setattr(owner, name, counted(name))
+            patch.setattr(owner, name, make_counter(name))
         for _ in range(10):
             clock[0] += 0.3
             made._step(None, threading.Event())  # type: ignore[arg-type]
@@ -140,7 +140,7 @@ def count_far_moves(config: ServiceConfig, root: Path) -> int:
         return engine.counts["implausible_moves"]
 
 
-def refused(engine: Engine) -> object:
+def count_refused(engine: Engine) -> object:
     return engine.counts["refused.time"], engine.counts["late"]
 
 
@@ -148,13 +148,13 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "name": (
         "shard-9",
         lambda c, r: (
-            of_engine(refused)(c, r),
+            of_engine(count_refused)(c, r),
             [p.name[:7] for p in (r / "inbox").glob("*.parquet")],
         ),
     ),
-    "lateness_s": (1000.0, of_engine(refused)),
-    "clock_ahead_s": (120.0, of_engine(refused)),
-    "oldest_s": (400.0, of_engine(refused)),
+    "lateness_s": (1000.0, of_engine(count_refused)),
+    "clock_ahead_s": (120.0, of_engine(count_refused)),
+    "oldest_s": (400.0, of_engine(count_refused)),
     "public_vehicles": (
         9,
         of_engine(lambda engine: len(engine.queries.changed_tiles(time.time_ns()))),
@@ -165,7 +165,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "snapshot_s": (10.0, of_jobs),
     "raw_days": (50, of_jobs),
     "put_to": ("file://{there}", of_compaction),
-    "queue_batches": (3, of_service(queued)),
+    "queue_batches": (3, of_service(count_queued)),
     "vehicle_kb_s": (1e9, of_service(let_in)),
     "vehicle_burst_kb": (100.0, of_service(let_in)),
     "fleet": ("{fleet}", of_service(let_in)),
@@ -196,7 +196,7 @@ def test_every_setting_of_the_service_is_in_a_table() -> None:
 def test_every_setting_of_the_service_changes_what_it_does(name: str, tmp_path: Path) -> None:
     value, show = SETTINGS[name]
     if isinstance(value, str):
-        (tmp_path / "fleet").write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+        (tmp_path / "fleet").write_text(make_enrolment(vehicles=["car-1"]).model_dump_json())
         pq.write_table(
             pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]}),
             tmp_path / "rain",

@@ -54,7 +54,7 @@ def batch_of_version_1(kind: Kind) -> Batch:
     )
 
 
-def acknowledgement() -> tuple[str, list[StreamAck]]:
+def make_acknowledgement() -> tuple[str, list[StreamAck]]:
     """An acknowledgement of two streams."""
     return "volvo-240", [
         StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
@@ -64,7 +64,7 @@ def acknowledgement() -> tuple[str, list[StreamAck]]:
     ]
 
 
-def alert() -> Alert:
+def make_alert() -> Alert:
     """An alert whose floats are exact in 32 bits."""
     return Alert(
         1_664_484_383_910,
@@ -85,8 +85,8 @@ def alert() -> Alert:
 MESSAGES: dict[str, Callable[[], bytes]] = {
     "observation_batch": lambda: wire.encode(batch_of_version_1(Kind.OBSERVATION)),
     "state_batch": lambda: wire.encode(batch_of_version_1(Kind.STATE)),
-    "ack": lambda: wire.encode_ack(*acknowledgement()),
-    "alert": lambda: wire.encode_alert(alert()),
+    "ack": lambda: wire.encode_ack(*make_acknowledgement()),
+    "alert": lambda: wire.encode_alert(make_alert()),
 }
 
 if (

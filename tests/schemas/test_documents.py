@@ -102,7 +102,7 @@ IN_README = (
 )
 
 
-def plain(text: str) -> str:
+def to_plain_letters(text: str) -> str:
     """A text in the letters of the .proto."""
     letters = {"·`mu`": " mu", "`": "", "≥": ">=", "μ": "mu", " degrees of": "° of"}
     for letter, replacement in letters.items():
@@ -113,7 +113,7 @@ def plain(text: str) -> str:
 @BOTH
 @pytest.mark.parametrize("statement", SHARED)
 def test_a_number_of_the_contract_stands_as_the_code_has_it(text: str, statement: str) -> None:
-    assert statement in plain(text)
+    assert statement in to_plain_letters(text)
 
 
 @pytest.mark.parametrize("statement", IN_PROTO)
@@ -175,10 +175,10 @@ def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Pa
     made, kept = (
         (folder / "gripmap_pb2.py").read_text() for folder in (tmp_path, SCHEMAS / "proto")
     )
-    assert descriptor(made) == descriptor(kept)
+    assert read_descriptor(made) == read_descriptor(kept)
 
 
-def descriptor(module: str) -> str:
+def read_descriptor(module: str) -> str:
     """The messages in a generated module, without what depends on the generator's version."""
     found = re.search(r"AddSerializedFile\((.*)\)", module)
     assert found

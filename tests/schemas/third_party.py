@@ -118,9 +118,9 @@ class Heard:
         self.tiles: list[tuple[str, int]] = []
         self.alerts: list[wire.Alert] = []
         self.errors: list[str] = []
-        session.declare_subscriber(f"{keys.ROOT}/*/**", self._hear)
+        session.declare_subscriber(f"{keys.ROOT}/*/**", self._record_sample)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _record_sample(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         payload = sample.payload.to_bytes()
         encoding = str(sample.encoding)
@@ -139,7 +139,7 @@ class Heard:
             self.errors.append(f"{key}: {error!r}")
 
 
-def asked(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
+def query_replies(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
     """Encoding and payload of every reply; an error reply comes back as its text."""
     return [
         (str(reply.ok.encoding), reply.ok.payload.to_bytes())
@@ -149,7 +149,7 @@ def asked(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
     ]
 
 
-def blocked() -> list[str]:
+def find_blocked() -> list[str]:
     """Which of the forbidden packages can indeed not be loaded."""
     out = []
     for name in FORBIDDEN:
@@ -181,11 +181,11 @@ def main(endpoint: str) -> None:
             )
         )
         box = f"bbox={LONGITUDE - 0.01},{LATITUDE - 0.01},{LONGITUDE + 0.01},{LATITUDE + 0.01};min_vehicles=2"
-        ((arrow, tile),) = asked(session, f"{keys.ROOT}/map/**?{box}")
-        ((_, document),) = asked(session, f"{keys.ROOT}/map/**?{box};format=json")
-        ((_, features),) = asked(session, f"{keys.map_key(TILE)}?{box};format=geojson")
-        ((standing, alerts),) = asked(session, keys.alert_key(TILE))
-        ((_, refusal),) = asked(session, f"{keys.ROOT}/map/**?bbox=1,2,3")
+        ((arrow, tile),) = query_replies(session, f"{keys.ROOT}/map/**?{box}")
+        ((_, document),) = query_replies(session, f"{keys.ROOT}/map/**?{box};format=json")
+        ((_, features),) = query_replies(session, f"{keys.map_key(TILE)}?{box};format=geojson")
+        ((standing, alerts),) = query_replies(session, keys.alert_key(TILE))
+        ((_, refusal),) = query_replies(session, f"{keys.ROOT}/map/**?bbox=1,2,3")
     print(
         json.dumps(
             {
@@ -209,7 +209,7 @@ def main(endpoint: str) -> None:
                     "vehicles": [PROTOBUF_SENDER, JSON_SENDER],
                 },
                 "loaded": sorted({name.partition(".")[0] for name in sys.modules} & set(FORBIDDEN)),
-                "blocked": blocked(),
+                "blocked": find_blocked(),
             }
         )
     )

@@ -34,16 +34,16 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
 from tests import reference_pages, results
-from tests.browser import opened
+from tests.browser import open_page
 from tests.faults.processes import Part
-from tests.first_drive import commands, mapped
+from tests.first_drive import map_first_drive, read_commands
 from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
-from tests.sight import SIGHTS, difference, lab
+from tests.sight import SIGHTS, colour_difference, to_lab
 from tests.structure import ROOT
 from tests.usability import mistakes, waiting
-from tests.usability.wrong_logs import WRONG, unnoticed
+from tests.usability.wrong_logs import WRONG, find_unnoticed
 from tests.waiting import until
 
 FOLDER: Final = ROOT / ".usability"
@@ -61,9 +61,9 @@ class House:
         self.archive = folder / "archive"
         synthetic.write(self.archive, WORLD, 2000)
         compact(self.archive)
-        mistakes.prepare(folder)
+        mistakes.prepare_files(folder)
 
-    def note(self, what: str, found: object) -> None:
+    def print_measured(self, what: str, found: object) -> None:
         """Print the measurements behind a figure."""
         print(f"{what}: {found}", flush=True)
 
@@ -76,10 +76,10 @@ def readme_commands_failed(house: House) -> float:
     command = ["unshare", "-n", "bash", "-c", line]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode:
-        house.note("readme", done.stderr[-400:])
+        house.print_measured("readme", done.stderr[-400:])
         return float("nan")
     failed: list[str] = json.loads(done.stdout.splitlines()[-1])
-    house.note("readme", failed)
+    house.print_measured("readme", failed)
     return float(len(failed))
 
 
@@ -107,11 +107,11 @@ def pages_with_errors(house: House) -> float:
         pages.append(ROOT / ".demo" / "map.html")
     bad = [live] if (live := live_page(house)) else []
     for path in pages:
-        with opened(path) as found:
-            drawn = found.drawn or found.page.locator("svg").count()
+        with open_page(path) as found:
+            drawn = found.drawn_count or found.page.locator("svg").count()
             if found.errors or len(found.requests) > 1 or not drawn:
                 bad.append((path.name, found.errors, found.requests))
-    house.note("pages", f"{len(pages)} and the live one opened, bad: {bad}")
+    house.print_measured("pages", f"{len(pages)} and the live one opened, bad: {bad}")
     return float(len(bad))
 
 
@@ -121,8 +121,8 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
     connection = ZenohSettings(connect=endpoints)
     with router, running(connection, house.folder / "live"), page_of(connection) as address:
         street.put(router, ("ice", "dry"), time.time_ns(), 1)
-        with opened(address) as found:
-            until(lambda: found.drawn)
+        with open_page(address) as found:
+            until(lambda: found.drawn_count)
             foreign = [
                 url for url in found.requests if not url.startswith((address, "blob:", "data:"))
             ]
@@ -161,7 +161,7 @@ def bound_painted(house: House) -> float:
         word: int(count)
         for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", done.stdout)
     }
-    house.note("bounds", counts)
+    house.print_measured("bounds", counts)
     whole = counts.get("passed") and not counts.keys() & {
         "skipped",
         "error",
@@ -175,34 +175,34 @@ def colour_distance(house: House) -> float:
     lines = [style.colour for style in (*ESTIMATORS.values(), TRUTH)]
     least = {
         sight: min(
-            difference(lab(a, sight), lab(b, sight))
+            colour_difference(to_lab(a, sight), to_lab(b, sight))
             for alike in (surfaces, lines)
             for a, b in combinations(alike, 2)
         )
         for sight in SIGHTS
     }
-    house.note("colours", least)
+    house.print_measured("colours", least)
     return min(least.values())
 
 
 def wrong_logs_unnoticed(house: House) -> float:
     """Planted mistakes of a recording that `replay` does not mention."""
-    found = unnoticed(house.folder, WRONG, SEED)
-    house.note("wrong logs", f"{len(WRONG)} planted, unnoticed: {found}")
+    found = find_unnoticed(house.folder, WRONG, SEED)
+    house.print_measured("wrong logs", f"{len(WRONG)} planted, unnoticed: {found}")
     return float(len(found))
 
 
-def tracebacks(house: House) -> float:
+def count_tracebacks(house: House) -> float:
     """Mistakes at the command line that are answered with a traceback or with success."""
-    count, bad = mistakes.tracebacks(house.folder, house.archive)
-    house.note("mistakes", f"{count} made, bad: {bad}")
+    count, bad = mistakes.find_tracebacks(house.folder, house.archive)
+    house.print_measured("mistakes", f"{count} made, bad: {bad}")
     return float(len(bad)) if count >= 60 else float("nan")
 
 
 def silent_seconds(house: House) -> float:
     """Longest silence on a terminal."""
     found = waiting.silent_seconds(house.folder, house.archive)
-    house.note("silence", found)
+    house.print_measured("silence", found)
     return max(found.values())
 
 
@@ -231,22 +231,22 @@ def install_to_first_map_s(house: House) -> float:
         *DAY,
     ]
     subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, cwd=house.folder)
-    with opened(out) as found:
-        assert found.drawn > 0
+    with open_page(out) as found:
+        assert found.drawn_count > 0
     return time.monotonic() - began
 
 
 def options_undocumented(house: House) -> float:
     """Count options without a help text."""
     found = reference_pages.undocumented_options()
-    house.note("undocumented", found)
+    house.print_measured("undocumented", found)
     return float(len(found))
 
 
 def figures_stale(house: House) -> float:
     """Count pages of figures that are not those of the files in deploy/figures."""
-    found = results.stale()
-    house.note("stale", found)
+    found = results.find_stale()
+    house.print_measured("stale", found)
     return float(len(found))
 
 
@@ -255,22 +255,22 @@ def alerts_per_stretch(house: House) -> float:
     path = ROOT / ".demo" / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else []
     values = {row["name"]: row["value"] for row in rows if "name" in row}
-    house.note("demo", path if path.exists() else "make demo first")
+    house.print_measured("demo", path if path.exists() else "make demo first")
     value = values.get("demo.alerts.per_stretch")
     return float("nan") if value is None else float(value)
 
 
 def first_drive_commands(_: House) -> float:
     """Count the commands of the first drive, from the installation to the map."""
-    return float(len(commands()))
+    return float(len(read_commands()))
 
 
 def first_drive_alerts(house: House) -> float:
     """That a real minute on a dry motorway raises under three names."""
     folder = house.folder / "minute"
     folder.mkdir()
-    cells, alerts = mapped(folder)
-    house.note("first drive", f"{len(cells)} cells, alerts {alerts}")
+    cells, alerts = map_first_drive(folder)
+    house.print_measured("first drive", f"{len(cells)} cells, alerts {alerts}")
     return float(len(set(alerts))) if len(cells) > 30 else float("nan")
 
 
@@ -280,7 +280,7 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "bound_painted": (bound_painted, "outputs", 0, "less"),
     "colour_distance": (colour_distance, "CIEDE2000", 10, "more"),
     "wrong_logs_unnoticed": (wrong_logs_unnoticed, "of 12", 0, "less"),
-    "tracebacks": (tracebacks, "", 0, "less"),
+    "tracebacks": (count_tracebacks, "", 0, "less"),
     "silent_seconds": (silent_seconds, "s", 2, "less"),
     "service_ready_s": (service_ready_s, "s", 8, "less"),
     "install_to_first_map_s": (install_to_first_map_s, "s", 90, "less"),
@@ -324,7 +324,7 @@ def main() -> int:
             except (
                 pytest.skip.Exception
             ) as missing:  # a browser that is not there: not measured does not hold
-                house.note(name, missing)
+                house.print_measured(name, missing)
                 value = float("nan")
             found.append(Figure(f"usability.{name}", value, unit, bar, better))  # type: ignore[arg-type]
     finally:

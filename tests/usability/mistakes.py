@@ -136,7 +136,7 @@ FLEET: Final = (
 )
 
 
-def prepare(folder: Path) -> None:
+def prepare_files(folder: Path) -> None:
     """Files that the mistakes are made with."""
     (folder / "text.csv").write_text("a;b\n1,5;x\n")
     (folder / "bad.json").write_text(json.dumps({"mass": "heavy", "surprise": 1}))
@@ -144,7 +144,7 @@ def prepare(folder: Path) -> None:
     assert edge_agent.cli.main([*words, "--vehicle-out", str(folder / "car.json")]) == 0
 
 
-def tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
+def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
     """Return how many mistakes were made, and those answered with a traceback or with exit code
     0.
     """

@@ -43,22 +43,22 @@ SETTLE_S: Final = 2.0  # until what says nothing is up
 LONGEST_S: Final = 300.0
 
 
-def blocks(text: str) -> list[tuple[str, str]]:
+def list_blocks(text: str) -> list[tuple[str, str]]:
     """Return language and text of each fenced block of a page."""
     return [
         (m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     ]
 
 
-def pages() -> str:
+def read_pages() -> str:
     """Return the text of all pages whose commands are run."""
     return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 
-def commands(text: str) -> list[str]:
+def list_commands(text: str) -> list[str]:
     """Return the commands of a page without their comments; a block of Python is one command."""
     found = []
-    for language, block in blocks(text):
+    for language, block in list_blocks(text):
         if language == "python":
             found.append(block)
         else:
@@ -71,7 +71,7 @@ def commands(text: str) -> list[str]:
     return [one for one in found if not one.startswith(LEFT_OUT)]
 
 
-def run(folder: Path) -> list[str]:
+def run_all(folder: Path) -> list[str]:
     """Run all; returns those that failed, with the last line they said."""
     for name in ("deploy", "tests/data"):
         shutil.copytree(
@@ -81,12 +81,12 @@ def run(folder: Path) -> list[str]:
     staying: list[tuple[str, subprocess.Popen[bytes]]] = []
     failed: list[str] = []
     try:
-        for number, command in enumerate(commands(pages())):
+        for number, command in enumerate(list_commands(read_pages())):
             log = folder / f"{number}.log"
             if command.startswith(LASTING):
                 if "certs/" in command:  # the second router wants the port of the first
                     for words, process in staying:
-                        _end(words, process, failed)
+                        _end_process(words, process, failed)
                     staying.clear()
                 with log.open("wb") as out:
                     typed = command.split()
@@ -94,24 +94,24 @@ def run(folder: Path) -> list[str]:
                         [str(bin_folder / typed[0]), *typed[1:]], cwd=folder, stdout=out, stderr=out
                     )
                 staying.append((command, process))
-                _wait(command, process, log)
+                _await_ready(command, process, log)
                 if process.poll() is not None:
-                    failed.append(f"{command}: ended with {process.returncode}: {_last(log)}")
+                    failed.append(f"{command}: ended with {process.returncode}: {_last_line(log)}")
                     staying.pop()
                 continue
             line = [sys.executable, "-c", command] if "\n" in command else ["bash", "-c", command]
-            code = _ended(
+            code = _run_to_end(
                 line, folder, log, {"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())}
             )
             if code:
-                failed.append(f"{command}: {code}: {_last(log)}")
+                failed.append(f"{command}: {code}: {_last_line(log)}")
     finally:
         for words, process in staying:
-            _end(words, process, failed)
+            _end_process(words, process, failed)
     return failed
 
 
-def _ended(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
+def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
     """The exit code of a command, or that it did not end."""
     with log.open("wb") as out:
         try:
@@ -129,7 +129,7 @@ def _ended(line: list[str], folder: Path, log: Path, environment: dict[str, str]
     return done.returncode
 
 
-def _wait(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
+def _await_ready(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
     word = next((word for start, word in READY.items() if command.startswith(start)), None)
     deadline = time.monotonic() + (SETTLE_S if word is None else LONGEST_S)
     while process.poll() is None and time.monotonic() < deadline:
@@ -140,7 +140,7 @@ def _wait(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
         time.sleep(0.1)
 
 
-def _end(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> None:
+def _end_process(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> None:
     if process.poll() is not None:
         failed.append(f"{command}: ended by itself with {process.returncode}")
         return
@@ -153,14 +153,14 @@ def _end(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> N
         failed.append(f"{command}: had to be killed")
 
 
-def _last(log: Path) -> str:
+def _last_line(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else "no word"
 
 
 def main() -> int:
     """Print what failed, as JSON: for a process in a network of its own."""
-    print(json.dumps(run(Path(sys.argv[1]))))
+    print(json.dumps(run_all(Path(sys.argv[1]))))
     return 0
 
 

@@ -43,7 +43,7 @@ LASTING: Final = (
 )
 
 
-def longest(command: list[str], cache: Path, ready: bytes | None = None) -> float:
+def longest_silence(command: list[str], cache: Path, ready: bytes | None = None) -> float:
     """The longest time between two signs of life of a command on a terminal, its begin and its end
     counted [s].
 
@@ -91,7 +91,7 @@ def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
     found = {}
     for command in COMMANDS:
         words = [word.format(d=folder, a=archive) for word in command]
-        found[" ".join(command[:2])] = longest(words, folder / "cache")
+        found[" ".join(command[:2])] = longest_silence(words, folder / "cache")
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = {"zenoh": {"connect": endpoints}}
     (folder / "lasting.json").write_text(json.dumps(connection))
@@ -100,5 +100,5 @@ def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
     with router:
         for command, ready in LASTING:
             words = [word.format(d=folder) for word in command]
-            found[" ".join(command[:2])] = longest(words, folder / "cache", ready)
+            found[" ".join(command[:2])] = longest_silence(words, folder / "cache", ready)
     return found

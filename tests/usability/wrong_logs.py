@@ -32,16 +32,16 @@ WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence onc
 )
 
 
-def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
+def find_unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
     """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be
     passed in silence.
     """
     drive = drives(1, seed, rough=False)[0]
-    out = [] if not _said(folder, drive) else ["the sound drive is suspected"]
-    return out + [name for name in names if not _said(folder, _spoilt(name, drive))]
+    out = [] if not _has_warned(folder, drive) else ["the sound drive is suspected"]
+    return out + [name for name in names if not _has_warned(folder, _spoil_drive(name, drive))]
 
 
-def _spoilt(name: str, drive: Recorded) -> Recorded:
+def _spoil_drive(name: str, drive: Recorded) -> Recorded:
     if name != TONNES:
         return PLANTED[name].spoil(drive)
     return drive._replace(
@@ -49,7 +49,7 @@ def _spoilt(name: str, drive: Recorded) -> Recorded:
     )
 
 
-def _said(folder: Path, drive: Recorded) -> bool:
+def _has_warned(folder: Path, drive: Recorded) -> bool:
     t, signals, vehicle = drive
     columns = {name: pa.array(signals[:, k], from_pandas=True) for k, name in enumerate(CHANNELS)}
     pq.write_table(pa.table({"t": pa.array(t), **columns}), folder / "wrong.parquet")

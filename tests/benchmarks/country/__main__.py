@@ -16,10 +16,10 @@ from typing import Final
 
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
-from tests.benchmarks.country.city import PREFIX, city
-from tests.benchmarks.country.coefficients import coefficients
-from tests.benchmarks.country.nation import nation
-from tests.benchmarks.country.paper import million
+from tests.benchmarks.country.city import PREFIX, simulate_city
+from tests.benchmarks.country.coefficients import measure_coefficients
+from tests.benchmarks.country.nation import simulate_nation
+from tests.benchmarks.country.paper import estimate_million
 from tests.benchmarks.country.plot import draw
 from tests.benchmarks.sumo import Sumo
 
@@ -40,13 +40,13 @@ def main() -> int:
     found: list[Figure] = []
     if given is None:
         print("1/3 city: three hundred vehicles on SUMO's routes", flush=True)
-        found += city(Sumo(FOLDER), FOLDER, SEED)
+        found += simulate_city(Sumo(FOLDER), FOLDER, SEED)
     print("2/3 coefficients: what a vehicle and a cell cost", flush=True)
-    each = coefficients()
+    each = measure_coefficients()
     print("3/3 country: a hundred thousand vehicles, twenty-one minutes", flush=True)
     with tempfile.TemporaryDirectory() as name:
         course = Path(name)
-        found += nation(given or FOLDER / PREFIX, course, SEED, each)
+        found += simulate_nation(given or FOLDER / PREFIX, course, SEED, each)
         draw(course, FOLDER / "country.png")
         shutil.copy(course / "course.npz", FOLDER)
     found += [
@@ -60,7 +60,7 @@ def main() -> int:
             "bytes of it for each of these that a vehicle visited lately",
         ),
     ]
-    found += million({figure.name: figure.value for figure in found})
+    found += estimate_million({figure.name: figure.value for figure in found})
     figures.write(FOLDER / "figures.json", "country", [SEED], found)
     print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json, {FOLDER}/country.png")
     return 0 if all(figure.holds for figure in found) else 1

@@ -11,7 +11,7 @@ from deploy.end_to_end import RATE_HZ, write
 from edge_agent.lab.simulation import SimulatedFleet
 from fleet_service.lab.end_to_end import World, measure
 from schemas.runtime.figures import Figure
-from tests.benchmarks.country.streets import drives, town
+from tests.benchmarks.country.streets import make_streets, simulate_drives
 from tests.benchmarks.sumo import Sumo
 
 VEHICLES: Final = 300
@@ -20,16 +20,16 @@ ROUGH: Final = 0.5  # half of the vehicles are as real cars are
 PREFIX: Final = "country.city"
 
 
-def city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
+def simulate_city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
     """Drive, fuse and judge; the observations stay in `folder`/NAME for the country."""
     folder.mkdir(parents=True, exist_ok=True)
 
-    def drive(into: Path) -> None:
+    def drive_fleet(into: Path) -> None:
         into.mkdir(exist_ok=True)
-        streets = town(drives(sumo, VEHICLES, SECONDS, seed), seed)
+        streets = make_streets(simulate_drives(sumo, VEHICLES, SECONDS, seed), seed)
         write(SimulatedFleet(streets, VEHICLES, seed, RATE_HZ, rough=ROUGH), SECONDS, into)
 
-    found = measure(drive, folder, World("helsinki", ROUGH, PREFIX, seed))
+    found = measure(drive_fleet, folder, World("helsinki", ROUGH, PREFIX, seed))
     cells = f"of {found[f'{PREFIX}.cells']:.0f} cells with two vehicles or more"
     return [
         Figure(

@@ -21,7 +21,7 @@ from fleet_service.fusion.store.records import PAIRS
 from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.benchmarks.ingest import messages
+from tests.benchmarks.ingest import make_messages
 
 MANY: Final = 40_000  # messages of each part
 ROWS: Final = 10
@@ -40,15 +40,15 @@ class Coefficients(NamedTuple):
     )
 
 
-def coefficients() -> Coefficients:
+def measure_coefficients() -> Coefficients:
     """Measured now."""
-    few, vehicles, cells = (_measured(kind) for kind in ("few", "vehicles", "cells"))
+    few, vehicles, cells = (_measure_growth(kind) for kind in ("few", "vehicles", "cells"))
     return Coefficients(
         (vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2]
     )
 
 
-def _measured(kind: str) -> tuple[float, float, float]:
+def _measure_growth(kind: str) -> tuple[float, float, float]:
     """Bytes that the stream added, cells at the end, and bytes of the table of pairs for each of
     them, by a process.
     """
@@ -58,33 +58,34 @@ def _measured(kind: str) -> tuple[float, float, float]:
     return float(grown), float(cells), float(pair)
 
 
-def _resident() -> int:
+def _read_resident_memory() -> int:
     gc.collect()
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024
 
 
-def _stream(kind: str) -> list[Message]:
+def _make_stream(kind: str) -> list[Message]:
     now = time.time_ns()
     if kind == "cells":
         parts = (
-            messages(MANY // REGIONS, ROWS, now, FEW // REGIONS, 0, east) for east in range(REGIONS)
+            make_messages(MANY // REGIONS, ROWS, now, FEW // REGIONS, 0, east)
+            for east in range(REGIONS)
         )
         return [message for part in parts for message in part]
-    return messages(MANY, ROWS, now, MANY if kind == "vehicles" else FEW)
+    return make_messages(MANY, ROWS, now, MANY if kind == "vehicles" else FEW)
 
 
 def main(kind: str) -> None:
     """Ingest the stream of that kind, and print the memory that it added."""
-    sent = _stream(kind)
+    sent = _make_stream(kind)
     with (
         tempfile.TemporaryDirectory() as folder,
         closing(Engine(ServiceConfig(), Path(folder))) as engine,
     ):
-        warm = messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
+        warm = make_messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
         engine.intake.ingest(warm, time.time_ns())
         engine.settlement.flush()
-        before = _resident()
+        before = _read_resident_memory()
         for at in range(0, len(sent), TURN):
             engine.intake.ingest(sent[at : at + TURN], time.time_ns())
             if at % (16 * TURN) == 0:
@@ -93,7 +94,9 @@ def main(kind: str) -> None:
         assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
         state = engine.state.fusion.store.state
         print(
-            _resident() - before, engine.state.fusion.size, state.pairs.nbytes / state.used[PAIRS]
+            _read_resident_memory() - before,
+            engine.state.fusion.size,
+            state.pairs.nbytes / state.used[PAIRS],
         )
 
 

@@ -67,7 +67,7 @@ class Service(NamedTuple):
     archive: Path
     metrics: str
 
-    def values(self) -> dict[str, float]:
+    def read_metrics(self) -> dict[str, float]:
         """Its metrics now, by name and labels."""
         with urllib.request.urlopen(f"{self.metrics}/metrics", timeout=30.0) as page:
             lines = page.read().decode().splitlines()
@@ -77,7 +77,7 @@ class Service(NamedTuple):
             if not line.startswith("#")
         }
 
-    def archived(self) -> int:
+    def count_archived(self) -> int:
         """Rows of observations in its archive, by the files' own words."""
         files = [
             *self.archive.glob("inbox/**/*.parquet"),
@@ -86,7 +86,7 @@ class Service(NamedTuple):
         return sum(pq.read_metadata(file).num_rows for file in files)
 
 
-def started(folder: Path, endpoint: str, name: str, region: str) -> Service:
+def start_service(folder: Path, endpoint: str, name: str, region: str) -> Service:
     """A service that is ready."""
     config = ServiceConfig(
         name=name,
@@ -106,7 +106,9 @@ def started(folder: Path, endpoint: str, name: str, region: str) -> Service:
     return Service(part, archive, part.line_with("ready: ").split()[-1])
 
 
-def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> list[Figure]:
+def simulate_nation(
+    city: Path, folder: Path, seed: int, coefficients: Coefficients
+) -> list[Figure]:
     """Drive the country and measure; its course stays in `folder`/course.npz."""
     country = Country(city, seed)
     seconds = WARM_S + MEASURED_S
@@ -118,8 +120,8 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
         router.start()
         endpoint = router.line_with("router: ").split()[1]
         services = []
-        for name, region in zip(SERVICES, country.expressions(), strict=True):
-            services.append(started(folder, endpoint, name, region))
+        for name, region in zip(SERVICES, country.list_expressions(), strict=True):
+            services.append(start_service(folder, endpoint, name, region))
             stack.callback(services[-1].part.kill)
         words = [endpoint, str(city), str(folder / "waits.npz"), "--seconds", str(seconds)]
         words += ["--vehicles", str(VEHICLES), "--seed", str(seed)]
@@ -129,11 +131,11 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
         stack.callback(sender.kill)
         sender.start()
         sender.line_with("{")
-        looks = _watched([*(one.part for one in services), router, sender], services, sender)
+        looks = _watch_parts([*(one.part for one in services), router, sender], services, sender)
         sent = _last_line(sender)
-        counts = [one.values() for one in services]
+        counts = [one.read_metrics() for one in services]
         codes = [one.part.stop() for one in services]
-        archived = sum(one.archived() for one in services)
+        archived = sum(one.count_archived() for one in services)
         size = sum(
             file.stat().st_size
             for one in services
@@ -144,15 +146,15 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
             for one in services
             for file in one.archive.glob("observations/**/*.parquet")
         )
-    _kept(folder, looks)
+    _save_course(folder, looks)
     if any(codes):
         raise RuntimeError(f"services left with {codes}")
     with np.load(folder / "waits.npz") as waits:
-        found = _waits(waits["put"], waits["wait"], waits["region"])
+        found = _make_wait_figures(waits["put"], waits["wait"], waits["region"])
     return [
         *found,
-        *_growth(looks, coefficients),
-        *_shares(looks, int(sent["observations"])),
+        *_make_growth_figures(looks, coefficients),
+        *_make_share_figures(looks, int(sent["observations"])),
         Figure(
             "country.unacknowledged",
             sent["unacknowledged"],
@@ -172,17 +174,17 @@ def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> l
     ]
 
 
-def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
+def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
     """Look every EVERY_S until the sender, the last of the parts, has ended."""
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
     least = [float("inf")] * (len(parts) - 1)
     while sender.is_alive:
-        values = [one.values() for one in services]
+        values = [one.read_metrics() for one in services]
         looks.append(
             Look(
                 time.monotonic() - began,
-                _least(least, parts),
+                _update_least(least, parts),
                 [spent_s(part) for part in parts],
                 [value["gripmap_cells"] for value in values],
                 [value['gripmap_rows_total{kind="observation"}'] for value in values],
@@ -199,14 +201,14 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
                 f"  {now.time:4.0f} s: {sum(now.cells):.0f} cells, {memory} MB, {waits}, {late}",
                 flush=True,
             )
-        least = _least([float("inf")] * len(least), parts)
+        least = _update_least([float("inf")] * len(least), parts)
         while time.monotonic() < began + SAYS_S + len(looks) * EVERY_S:
             time.sleep(MEMORY_S)
-            least = _least(least, parts)
+            least = _update_least(least, parts)
     return looks
 
 
-def _least(before: list[float], parts: Sequence[Part]) -> list[float]:
+def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
     """Return the memory of each process but the last: its memory now, or the earlier one if that
     was less.
     """
@@ -220,7 +222,7 @@ def _last_line(sender: Part) -> dict[str, float]:
     return said
 
 
-def _kept(folder: Path, looks: Sequence[Look]) -> None:
+def _save_course(folder: Path, looks: Sequence[Look]) -> None:
     time_s, memory, spent, cells, rows, queued = (
         np.array(column) for column in zip(*looks, strict=True)
     )
@@ -235,7 +237,7 @@ def _kept(folder: Path, looks: Sequence[Look]) -> None:
     )
 
 
-def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
+def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
     """Return the waiting times of the batches of the ten minutes, and the slowest regions."""
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)
@@ -270,7 +272,7 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
     ]
 
 
-def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
+def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
     """Return the growth of the services' memory over the ten minutes, and the part due to new
     cells.
     """
@@ -306,7 +308,7 @@ def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
     ]
 
 
-def _shares(looks: Sequence[Look], observations: int) -> list[Figure]:
+def _make_share_figures(looks: Sequence[Look], observations: int) -> list[Figure]:
     """Return the processor time of each process in the ten minutes."""
     late = [look for look in looks if look.time >= WARM_S]
     first = late[0]

@@ -19,7 +19,7 @@ HOUR_S: Final = 3600.0  # between two times that what is forgotten is dropped
 NEW_PLACES: Final = 1.0
 
 
-def million(found: Mapping[str, float]) -> list[Figure]:
+def estimate_million(found: Mapping[str, float]) -> list[Figure]:
     """Return the estimate for a million vehicles at the country's rate each, from measured figures."""
     rate = FACTOR * found["country.rate"]
     cells = FACTOR * found["country.cells"]

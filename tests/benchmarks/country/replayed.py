@@ -75,12 +75,12 @@ class Country:
             "the town does not fit between its neighbours"
         )
         self._home = grid.deinterleave(grid.zone_of(columns["cell"][:1]))
-        self.drives = [_chunks(columns, who, corner) for who in np.unique(columns["vehicle"])]
+        self.drives = [_cut_chunks(columns, who, corner) for who in np.unique(columns["vehicle"])]
         self.drives = [drive for drive in self.drives if drive]
         self.regions = [
-            self._region(zone, k) for zone, count in enumerate(ZONES) for k in range(count)
+            self._locate_region(zone, k) for zone, count in enumerate(ZONES) for k in range(count)
         ]
-        weight = np.concatenate([_shares(count) for count in ZONES])
+        weight = np.concatenate([_compute_shares(count) for count in ZONES])
         rng = np.random.default_rng(seed)
         self.region = rng.choice(len(weight), vehicles, p=weight / weight.sum())
         self.town = rng.integers(0, len(TOWNS), vehicles)
@@ -94,12 +94,12 @@ class Country:
                 same = who[self.drive[who] == one]
                 self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
 
-    def _region(self, zone: int, k: int) -> tuple[int, int]:
+    def _locate_region(self, zone: int, k: int) -> tuple[int, int]:
         """Column and row of the k-th region of a zone, among all regions of the world."""
         zone_x, zone_y = (int(side[0]) for side in self._home)
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
 
-    def expressions(self) -> list[str]:
+    def list_expressions(self) -> list[str]:
         """The regions of each service, as key expressions of zones."""
         first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
         parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]
@@ -110,7 +110,7 @@ class Country:
         x, y = self.regions[k]
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
-    def batch(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
+    def encode_report(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
         """Return key and bytes of a vehicle's report in its turn, dated now."""
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
@@ -136,23 +136,24 @@ class Country:
         return keys.observation_key(message.region, message.vehicle), message.SerializeToString()
 
 
-def _shares(count: int) -> FloatArray:
+def _compute_shares(count: int) -> FloatArray:
     share = 1.0 / np.sqrt(np.arange(1, count + 1))
     return np.asarray(share / share.sum())
 
 
-def _chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
+def _cut_chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
     """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are
     less, are left out.
     """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]
     return [
-        _chunk(columns, mine[at : at + ROWS], corner) for at in range(0, len(mine) - ROWS + 1, ROWS)
+        _make_chunk(columns, mine[at : at + ROWS], corner)
+        for at in range(0, len(mine) - ROWS + 1, ROWS)
     ]
 
 
-def _chunk(columns: dict[str, Any], rows: IntArray, corner: IntArray) -> Chunk:
+def _make_chunk(columns: dict[str, Any], rows: IntArray, corner: IntArray) -> Chunk:
     side = 1 << grid.CELL_ZOOM
     phi = np.radians(columns["latitude"][rows])
     x = (columns["longitude"][rows] + 180.0) / 360.0 * side - corner[0]

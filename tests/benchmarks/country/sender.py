@@ -32,9 +32,9 @@ class Waits:
 
     def __init__(self, session: zenoh.Session, vehicles: int, turns: int) -> None:
         self.put, self.acked = np.full((2, turns, vehicles), np.nan)
-        self._subscriber = session.declare_subscriber(keys.ack_key("*"), self._hear)
+        self._subscriber = session.declare_subscriber(keys.ack_key("*"), self._record_ack)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _record_ack(self, sample: zenoh.Sample) -> None:
         now = time.monotonic()
         name, streams = wire.decode_ack(sample.payload.to_bytes())
         vehicle = int(name.partition("-")[2])
@@ -42,7 +42,7 @@ class Waits:
             for first, last in stream.durable:
                 self.acked[first - 1 : last, vehicle] = now
 
-    def line(self, since: float) -> dict[str, float]:
+    def summarize(self, since: float) -> dict[str, float]:
         """Return the batches sent and waiting, and the 99 % quantile of finished waits since
         then [s].
         """
@@ -86,11 +86,11 @@ def main() -> int:
             time.sleep(ahead)
         late = max(late, -ahead)
         turn, vehicle = divmod(number, asked.vehicles)
-        key, payload = country.batch(vehicle, turn, boot)
+        key, payload = country.encode_report(vehicle, turn, boot)
         waits.put[turn, vehicle] = time.monotonic()
         session.put(key, payload, encoding=encoding, congestion_control=_BLOCK)
         if time.monotonic() - said >= EVERY_S:
-            line = waits.line(said) | {"late_s": late, "payload": float(len(payload))}
+            line = waits.summarize(said) | {"late_s": late, "payload": float(len(payload))}
             print(json.dumps(line), flush=True)
             said = time.monotonic()
             late = 0.0

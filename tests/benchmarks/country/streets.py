@@ -55,15 +55,15 @@ class Streets(Scenario):
         return self.lanes
 
 
-def drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
+def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
     """Paths of the first `vehicles` whose way is long enough for so many seconds.
 
     Raises:
         RuntimeError: there were fewer.
     """
-    sumo.trips(6 * vehicles, 2.0, seed, *TRIPS)
-    fixes = pd.read_parquet(sumo.fixes(6 * vehicles + 900, STEP_S, seed, *CHANGE_S))
-    found = [_drive(rows) for _, rows in fixes.groupby("vehicle_id", sort=False)]
+    sumo.draw_trips(6 * vehicles, 2.0, seed, *TRIPS)
+    fixes = pd.read_parquet(sumo.drive_trips(6 * vehicles + 900, STEP_S, seed, *CHANGE_S))
+    found = [_make_drive(rows) for _, rows in fixes.groupby("vehicle_id", sort=False)]
     least = seconds * float(np.quantile(fixes.vehicle_speed[fixes.vehicle_speed > SLOWEST], 0.9))
     long = [one for one in found if one is not None and len(one.line) >= least]
     if len(long) < vehicles:
@@ -71,7 +71,7 @@ def drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
     return long[:vehicles]
 
 
-def _drive(rows: pd.DataFrame) -> Drive | None:
+def _make_drive(rows: pd.DataFrame) -> Drive | None:
     """The path of one vehicle; None of one that leapt, or went nowhere."""
     x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
     step = np.hypot(np.diff(x), np.diff(y))
@@ -97,7 +97,7 @@ def _drive(rows: pd.DataFrame) -> Drive | None:
     )
 
 
-def town(found: list[Drive], seed: int) -> Streets:
+def make_streets(found: list[Drive], seed: int) -> Streets:
     """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and
     there on a way.
     """

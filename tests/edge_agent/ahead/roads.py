@@ -49,7 +49,7 @@ def cells(
     )
 
 
-def told(parts: list[ReceivedCells]) -> LocalMap:
+def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
     """A cache that has heard of these cells."""
     cache = LocalMap()
     for part in parts:

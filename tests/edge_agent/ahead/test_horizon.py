@@ -33,7 +33,7 @@ from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degr
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
-from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, told
+from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, make_local_map
 
 
 def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:
@@ -120,7 +120,7 @@ def test_unknown_stays_unknown() -> None:
 
 def test_a_bound_is_no_value_and_gives_no_advice() -> None:
     horizon = look_ahead(
-        straight_path(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW
+        straight_path(HOME, 100.0), make_local_map([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW
     )
     assert (horizon.basis == known.BOUND).any()
     assert np.isnan(horizon.mu).all()
@@ -138,7 +138,7 @@ def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
 
 
 def test_without_a_network_the_horizon_fades_to_unknown() -> None:
-    cache = told([cells(keys_on(), 0.8, width=0.05)])
+    cache = make_local_map([cells(keys_on(), 0.8, width=0.05)])
     path = straight_path(HOME, 60.0)
     fresh, later, gone = (
         look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0)
@@ -153,7 +153,7 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
 def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     said = cells(keys_on(), 0.15, width=0.05)
     said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
-    cache = told([said])
+    cache = make_local_map([said])
     path = straight_path(HOME, 60.0)
     share = -math.expm1(-2400.0 / CHANGE_S)
     assert 0.9 * (1.0 - share) + 0.304 * share < WARN_ABOVE
@@ -253,7 +253,7 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
 
 def test_behind_the_last_place_of_a_road_nothing_is_known() -> None:
     (way,) = ways_on(HOME, keys_on(60.0), 400.0)
-    horizon = look_ahead(way, told([cells(keys_on(60.0), 0.8)]), NOW)
+    horizon = look_ahead(way, make_local_map([cells(keys_on(60.0), 0.8)]), NOW)
     assert len(way.distance) > 180
     assert horizon.basis[:50].all()
     assert not horizon.basis[85:].any()

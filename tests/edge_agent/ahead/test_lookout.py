@@ -47,31 +47,31 @@ class Driving:
         route = GivenRoute(*line())
         self.lookout = Lookout([CAR], lambda _, warning: self.told.put(warning), lambda _: route)
         self.lookout.attach(CAR, session)
-        self.be()
+        self.report_pose()
         self.lookout.start()
 
-    def be(self, *, later_s: float = 0.0) -> None:
+    def report_pose(self, *, later_s: float = 0.0) -> None:
         """Say where it is."""
         latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
-    def until(self, condition: Callable[[Outlook], object]) -> Outlook:
+    def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
         """Report its position until the outlook meets the condition."""
 
-        def there() -> bool:
-            self.be()
+        def has_outlook() -> bool:
+            self.report_pose()
             seen = self.lookout.outlook(CAR)
             return seen is not None and bool(condition(seen))
 
-        until(there)
+        until(has_outlook)
         seen = self.lookout.outlook(CAR)
         assert seen is not None
         return seen
 
-    def next(self) -> GripWarning:
+    def next_warning(self) -> GripWarning:
         for _ in range(600):
-            self.be()
+            self.report_pose()
             try:
                 return self.told.get(timeout=0.05)
             except queue.Empty:
@@ -102,12 +102,12 @@ def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         town.put(alert(int(ICE[0]), time=NOW))
-        raised = car.next()
+        raised = car.next_warning()
         assert raised.state == "raised"
         assert raised.reason == "an alert stands"
         assert 50.0 < raised.distance_m < 75.0
         town.put(alert(int(ICE[0]), raised=False, time=NOW + NS))
-        assert car.next().state == "ended"
+        assert car.next_warning().state == "ended"
 
 
 def test_an_alert_is_told_at_once_and_not_with_the_next_look(
@@ -120,7 +120,7 @@ def test_an_alert_is_told_at_once_and_not_with_the_next_look(
             lambda: car.lookout.counts.looks == 2 and any("alert" in asked for asked in town.asked)
         )
         town.put(alert(int(ICE[0]), time=NOW))
-        assert car.next().state == "raised"
+        assert car.next_warning().state == "raised"
         assert car.lookout.counts.looks == 3
 
 
@@ -130,11 +130,11 @@ def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(
     town.standing = [alert(int(key), time=NOW) for key in keys_on(2600.0, start=2560.0)]
     with driving(router) as car:
         subscriber = car.lookout.counts.subscribers[CAR]
-        car.until(lambda _: car.lookout.counts.looks > 1)
+        car.drive_until(lambda _: car.lookout.counts.looks > 1)
         before = set(subscriber.tiles)
         assert not subscriber.counts["alerts"] + car.lookout.counts.warnings
         car.metre = 2500.0
-        raised = car.next()
+        raised = car.next_warning()
         assert (raised.state, raised.way) == ("raised", "corridor"), "it has left its route"
         assert set(subscriber.tiles) - before
 
@@ -144,7 +144,7 @@ def test_ice_that_was_found_before_the_car_came_is_asked_for(
 ) -> None:
     town.standing = [alert(int(key), time=NOW) for key in ICE]
     with driving(router) as car:
-        assert car.next().mu == pytest.approx(0.15, abs=0.03)
+        assert car.next_warning().mu == pytest.approx(0.15, abs=0.03)
 
 
 def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
@@ -152,9 +152,9 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
 ) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
-        warning = car.next()
+        warning = car.next_warning()
         assert warning.reason == "the map says so"
-        seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        seen = car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
         assert seen.way == "route"
         dry = seen.runs.start_m < 60.0
         assert seen.runs.mu[dry & (seen.runs.basis == known.MEASURED)].min() > 0.7
@@ -174,11 +174,11 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(
     with owner:
         owner.declare_subscriber(keys.ahead_key(CAR), heard.put)
         with driving(router) as car:
-            assert car.next().state == "raised"
-            car.until(lambda seen: seen.warnings)
+            assert car.next_warning().state == "raised"
+            car.drive_until(lambda seen: seen.warnings)
             sample = heard.get(timeout=10.0)
             while not decode_ahead(sample.payload.to_bytes()).warnings:
-                car.be()
+                car.report_pose()
                 sample = heard.get(timeout=10.0)
     assert str(sample.encoding) == AHEAD_ENCODING
     told = decode_ahead(sample.payload.to_bytes())
@@ -197,7 +197,7 @@ def test_ice_during_a_router_outage_is_received_after_reconnect(
             town.standing = [alert(int(key), time=NOW) for key in ICE]
         before = len(town.asked)
         router.start()
-        assert car.next().state == "raised"
+        assert car.next_warning().state == "raised"
         assert any("alert" in asked for asked in town.asked[before:])
 
 
@@ -206,7 +206,7 @@ def test_a_service_that_comes_after_the_car_is_asked_too(router: Router) -> None
         until(lambda: car.lookout.counts.looks > 1)
         with MadeUpService(router.settings, time.time_ns()) as town:
             town.standing = [alert(int(key), time=NOW) for key in ICE]
-            assert car.next().state == "raised"
+            assert car.next_warning().state == "raised"
 
 
 def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
@@ -214,7 +214,7 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
 ) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()}
     with driving(router) as car:
-        car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
         router.stop()
         car.lookout.see([HOME._replace(time=time.time_ns() + round((known.HELD_S + 60.0) * NS))])
         looks = car.lookout.counts.looks
@@ -232,7 +232,7 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
     with MadeUpService(router.settings, time.time_ns() - DAY) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:
-            seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).any())
+            seen = car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).any())
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
@@ -241,9 +241,9 @@ def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Rou
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         with MadeUpService(router.settings, time.time_ns() - DAY, yesterday, kept=True):
-            car.until(lambda _: car.lookout.counts.total_of("cells") > 10)
+            car.drive_until(lambda _: car.lookout.counts.total_of("cells") > 10)
             looks = car.lookout.counts.looks
-            seen = car.until(lambda _: car.lookout.counts.looks > looks + 1)
+            seen = car.drive_until(lambda _: car.lookout.counts.looks > looks + 1)
             assert not seen.runs.basis.any(), "nobody knows what it is like today"
             assert np.isnan(seen.runs.safe_speed).all()
             assert not seen.warnings
@@ -253,7 +253,7 @@ def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Rou
         for when, mu in ((now, 0.15), (now - DAY, 0.85)):
             with subscriber.looking():
                 subscriber.known.take(*decode_cells(key, tile_payload(HERE, mu, when), now), now)
-        assert car.next().mu == pytest.approx(0.15, abs=0.03)
+        assert car.next_warning().mu == pytest.approx(0.15, abs=0.03)
 
 
 def test_where_it_is_the_car_believes_its_filter_and_the_map(
@@ -264,16 +264,16 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     flat = (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
         car.lookout.believe(np.array([-1]), flat)
-        car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
         assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
 
-        def informed(seen: Outlook) -> bool:
+        def is_informed(seen: Outlook) -> bool:
             car.lookout.believe(
                 here, flat
             )  # block after block: while the car looks ahead, it does not wait for that
             return bool(seen.here[0] < 0.3)
 
-        seen = car.until(informed)
+        seen = car.drive_until(is_informed)
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
@@ -282,7 +282,7 @@ def test_a_hostile_alert_is_refused_counted_and_changes_nothing(
 ) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:
-        assert car.next().state == "raised"
+        assert car.next_warning().state == "raised"
         tile = int(grid.tile_of(ICE[0] // grid.SECTORS))
         until(lambda: town.session.get(keys.alert_key(tile)) is not None)
         town.session.put(keys.alert_key(tile), b"\xff" * 300)
@@ -299,7 +299,7 @@ def test_a_hostile_alert_is_refused_counted_and_changes_nothing(
             )
         )
         assert car.lookout.counts.values()["heard_refused"] >= 2
-        assert car.until(lambda seen: seen.warnings).warnings[0].state == "raised"
+        assert car.drive_until(lambda seen: seen.warnings).warnings[0].state == "raised"
 
 
 TILE = int(grid.tile_of(ICE[0] // grid.SECTORS))
@@ -365,15 +365,15 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
         while liar.said < every:  # a piece is asked for again when it is old
             said = liar.said
             later_s = later_s + REFRESH_S + 1.0
-            car.be(later_s=later_s)
+            car.report_pose(later_s=later_s)
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
         assert not car.lookout.counts.total_of("cells")
-        car.until(
+        car.drive_until(
             lambda seen: seen.time < time.time_ns() + NS
         )  # at an hour from now an alert of now is forgotten
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
-        assert car.next().state == "raised"
+        assert car.next_warning().state == "raised"
         assert not car.lookout.counts.failures
 
 

@@ -18,7 +18,7 @@ from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
-from tests.edge_agent.ahead.roads import NOW, cells, keys_on, told
+from tests.edge_agent.ahead.roads import NOW, cells, keys_on, make_local_map
 
 FLAT = np.zeros((1, mugrid.BINS))
 
@@ -66,13 +66,15 @@ def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
     shares = []
     for age_s in (0.0, 1800.0, 4 * 3600.0):
         said = cells(road, 0.2, at=NOW - round(age_s * NS))
-        belief = told([said._replace(heard=np.full(len(road), NOW))]).belief(place, NOW)
+        belief = make_local_map([said._replace(heard=np.full(len(road), NOW))]).belief(place, NOW)
         assert belief is not None
         shares.append(float(belief[mugrid.CENTRES < 0.4].sum()))
     assert shares[0] > shares[1] + 0.05 > shares[2] + 0.2
-    assert told([cells(road, 0.2)]).belief(place, NOW + round((HELD_S + 1.0) * NS)) is None
-    assert told([cells(road, 0.2, basis=BOUND)]).belief(place, NOW) is None
-    assert told([]).belief(place, NOW) is None
+    assert (
+        make_local_map([cells(road, 0.2)]).belief(place, NOW + round((HELD_S + 1.0) * NS)) is None
+    )
+    assert make_local_map([cells(road, 0.2, basis=BOUND)]).belief(place, NOW) is None
+    assert make_local_map([]).belief(place, NOW) is None
 
 
 def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> None:

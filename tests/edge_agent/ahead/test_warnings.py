@@ -14,7 +14,7 @@ from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, update_warning
 from schemas.numeric import IntArray
 from schemas.thresholds import GRAVITY, NS, REACTION_S
 from schemas.wire.ahead import GripWarning
-from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, told
+from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, make_local_map
 
 ROAD = 600.0
 
@@ -58,7 +58,9 @@ def icy(start: float = 300.0, length: float = 40.0) -> IntArray:
 def dry_but(*ice: IntArray) -> LocalMap:
     slippery = np.concatenate(ice)
     rest = keys_on(ROAD)
-    return told([cells(rest[~np.isin(rest, slippery)], 0.9), cells(slippery, 0.15, width=0.05)])
+    return make_local_map(
+        [cells(rest[~np.isin(rest, slippery)], 0.9), cells(slippery, 0.15, width=0.05)]
+    )
 
 
 def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
@@ -92,24 +94,27 @@ def test_who_is_slow_is_warned_later() -> None:
 
 
 def test_dry_and_unknown_roads_warn_of_nothing() -> None:
-    assert Car(told([cells(keys_on(ROAD), 0.9)])).drive(450.0) == []
+    assert Car(make_local_map([cells(keys_on(ROAD), 0.9)])).drive(450.0) == []
     assert Car(LocalMap()).drive(450.0) == []
 
 
 def test_ice_on_the_other_carriageway_is_none_of_ours() -> None:
-    assert Car(told([cells(keys_on(ROAD) + 2, 0.15, width=0.05)])).drive(450.0) == []
+    assert Car(make_local_map([cells(keys_on(ROAD) + 2, 0.15, width=0.05)])).drive(450.0) == []
 
 
 def test_one_vehicle_alone_warns_nobody() -> None:
     lonely = cells(icy(), 0.15, width=0.05)
     assert (
-        Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
+        Car(make_local_map([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(
+            450.0
+        )
+        == []
     )
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """Ice fades on the map before its alert ends: the former value is only a bound then."""
-    cache = told([cells(icy(), 0.1, basis=BOUND)])
+    cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
         cache.alert(alert(key, time=NOW - NS), NOW)
     raised = Car(cache).drive(290.0)[0]

@@ -65,7 +65,7 @@ def fleet_blocks(
     return fleet, [next(source) for _ in range(count)]
 
 
-def joined(parts: list[Block]) -> Block:
+def join_blocks(parts: list[Block]) -> Block:
     return Block(
         *(np.concatenate([getattr(b, name) for b in parts]) for name in ("t", "time", "signals"))
     )
@@ -80,7 +80,7 @@ def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> N
     last = pipeline.finish()
     assert last is not None
     basket.offer(last)
-    whole = joined(parts)
+    whole = join_blocks(parts)
     _, located = locate_vehicles(new_tracks(VEHICLES), whole.t, whole.signals)
     visits = np.count_nonzero(located.closes & (located.cell != NOWHERE))
     assert len(basket.column(Kind.OBSERVATION, "cell")) == visits > 20
@@ -94,7 +94,7 @@ def test_the_records_of_a_fleet_do_not_depend_on_the_blocks() -> None:
     fleet, parts = fleet_blocks(60)
     whole = Basket()
     pieces = Basket()
-    whole.offer(*pipeline_of(fleet).step(joined(parts))[1:])
+    whole.offer(*pipeline_of(fleet).step(join_blocks(parts))[1:])
     pipeline = pipeline_of(fleet)
     for block in parts:
         pieces.offer(*pipeline.step(block)[1:])
@@ -240,7 +240,7 @@ def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(
     assert set(truth["vehicle"].to_pylist()) == set(recorder.names)
     mine = truth.filter([name == "sim-001" for name in truth["vehicle"].to_pylist()])
     enter, leave = (np.array(mine[name].cast(pa.int64())) for name in ("enter_time", "leave_time"))
-    whole = joined(parts)
+    whole = join_blocks(parts)
     assert enter[0] == whole.time[0, 0]
     assert leave[-1] == whole.time[-1, 0]
     assert (enter[1:] - leave[:-1] == round(1e9 / RATE)).all()

@@ -27,17 +27,20 @@ def test_an_agent_shows_what_was_settled_and_what_waits(
     sent = len(observations.vehicle)
     publisher.offer(observations)
 
-    def shown(name: str, kind: str = "") -> float:
+    def read_metric(name: str, kind: str = "") -> float:
         return {metric.name: metric.values for metric in metrics.metrics(publisher, progress)}[
             name
         ][kind]
 
-    until(lambda: service.batches and shown("published_records", "observation") == sent)
-    assert shown("unsettled_records") == sent
+    until(lambda: service.batches and read_metric("published_records", "observation") == sent)
+    assert read_metric("unsettled_records") == sent
     service.answer = True
-    until(lambda: shown("acknowledged_records", "observation") == sent)
+    until(lambda: read_metric("acknowledged_records", "observation") == sent)
     assert publisher.close(within_s=5.0)
-    assert (shown("unsettled_records"), shown("rejected_records", Kind.STATE.name.lower())) == (
+    assert (
+        read_metric("unsettled_records"),
+        read_metric("rejected_records", Kind.STATE.name.lower()),
+    ) == (
         0,
         0,
     )

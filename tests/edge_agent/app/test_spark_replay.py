@@ -25,7 +25,7 @@ ESTIMATOR = "aco-fckf"  # `make setup` has compiled it; another one takes minute
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[Any]:
-    with spark_sessions.cores(2) as found:
+    with spark_sessions.spark_session(2) as found:
         yield found
 
 

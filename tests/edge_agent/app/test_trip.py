@@ -35,7 +35,7 @@ def source(drive: Recorded) -> Generator[Block]:
         yield Block(t, np.rint(t * 1e9).astype(np.int64), drive.signals[first : first + ROWS, None])
 
 
-def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
+def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
     """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
     admitted = []
     blocks = []
@@ -58,7 +58,7 @@ def delayed_by(rows: int, late: FloatArray, raw: FloatArray) -> bool:
 def test_nothing_is_admitted_before_the_doctor_has_passed(smooth: Recorded, tmp_path: Path) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
     assert trip.troubles()
-    admitted, blocks = driven(trip, smooth)
+    admitted, blocks = drive_trip(trip, smooth)
     first = admitted.index(True)
     assert LOOK_S - 1.0 <= blocks[first].t[0, 0] <= 4.0 * LOOK_S
     assert all(admitted[first:])
@@ -70,13 +70,13 @@ def test_a_fault_is_never_admitted_and_teaches_nothing(
 ) -> None:
     path = tmp_path / "car.json"
     trip = Trip(smooth.vehicle, PROFILE, path)
-    admitted, _ = driven(trip, scaled([S.AY], -1.0)(smooth))
+    admitted, _ = drive_trip(trip, scaled([S.AY], -1.0)(smooth))
     assert not any(admitted)
     assert "ay sign" in trip.troubles()[0]
     assert "ay sign" in caplog.text
     assert not path.exists()
     trusted = Trip(smooth.vehicle, PROFILE, path, trusted=True)
-    assert all(driven(trusted, scaled([S.AY], -1.0)(smooth))[0])
+    assert all(drive_trip(trusted, scaled([S.AY], -1.0)(smooth))[0])
     assert not path.exists(), "what is trusted is not for that reason learned from"
 
 
@@ -88,7 +88,7 @@ def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path:
         assert trip.admitted() == (count > 1), "the doctor's word is remembered"
         known = trip.vehicle.calibration
         assert (0 if known is None else known.drives) == count - 1
-        _, blocks = driven(trip, bad)
+        _, blocks = drive_trip(trip, bad)
         got = np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks])
         raw = bad.signals[:, S.YAW_RATE]
         offset = 0.0 if known is None or known.yaw_rate is None else known.yaw_rate[0]
@@ -104,10 +104,10 @@ def test_a_fault_that_comes_up_takes_the_doctors_word_back(
     smooth: Recorded, tmp_path: Path
 ) -> None:
     path = tmp_path / "car.json"
-    driven(Trip(smooth.vehicle, PROFILE, path), smooth)
+    drive_trip(Trip(smooth.vehicle, PROFILE, path), smooth)
     broken = Trip(smooth.vehicle, PROFILE, path)
     assert broken.admitted()
-    driven(broken, scaled([S.AY], -1.0)(smooth))
+    drive_trip(broken, scaled([S.AY], -1.0)(smooth))
     assert not Trip(smooth.vehicle, PROFILE, path).admitted()
 
 
@@ -115,7 +115,7 @@ def test_another_car_or_a_broken_file_begins_anew(
     smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "car.json"
-    driven(Trip(smooth.vehicle, PROFILE, path), smooth)
+    drive_trip(Trip(smooth.vehicle, PROFILE, path), smooth)
     assert Trip(smooth.vehicle, PROFILE, path).admitted()
     heavier = smooth.vehicle.model_copy(update={"mass": 2.0 * smooth.vehicle.mass})
     assert not Trip(heavier, PROFILE, path).admitted()
@@ -132,10 +132,10 @@ def test_a_short_trip_teaches_nothing_and_a_disk_that_refuses_is_no_crash(
 ) -> None:
     path = tmp_path / "car.json"
     rows = round(0.9 * LEAST_S * 100)
-    driven(Trip(smooth.vehicle, PROFILE, path), replace_rows(smooth, rows))
+    drive_trip(Trip(smooth.vehicle, PROFILE, path), replace_rows(smooth, rows))
     assert Trip(smooth.vehicle, PROFILE, path).vehicle.calibration is None
     with caplog.at_level(logging.WARNING):
-        driven(Trip(smooth.vehicle, PROFILE, tmp_path / "nowhere" / "car.json"), smooth)
+        drive_trip(Trip(smooth.vehicle, PROFILE, tmp_path / "nowhere" / "car.json"), smooth)
     assert "cannot be written" in caplog.text
 
 

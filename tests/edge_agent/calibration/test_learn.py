@@ -30,7 +30,7 @@ def smooth() -> Recorded:
     return drives(1, 31, rough=False, seconds=180)[0]
 
 
-def spoiled(drive: Recorded) -> Recorded:
+def spoil_drive(drive: Recorded) -> Recorded:
     for spoil in (
         moved([S.AX], OFF["ax"]),
         moved([S.YAW_RATE], OFF["yaw_rate"]),
@@ -48,7 +48,7 @@ def parts(drive: Recorded, count: int) -> list[tuple[FloatArray, FloatArray]]:
 
 def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded) -> None:
     before = learn(parts(smooth, 3), smooth.vehicle)
-    after = learn(parts(spoiled(smooth), 3), smooth.vehicle)
+    after = learn(parts(spoil_drive(smooth), 3), smooth.vehicle)
     assert after.drives == 3
     for name, off in OFF.items():
         one = getattr(before, name)
@@ -66,7 +66,7 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
 
 
 def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
-    bad = spoiled(smooth)
+    bad = spoil_drive(smooth)
     calibration = learn(parts(bad, 3), bad.vehicle)
     mended = corrected(
         bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration})
@@ -224,7 +224,7 @@ def write(path: Path, drive: Recorded) -> str:
 def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output
 ) -> None:
-    log = write(tmp_path / "a.parquet", spoiled(smooth))
+    log = write(tmp_path / "a.parquet", spoil_drive(smooth))
     car = tmp_path / "car.json"
     better = tmp_path / "better.json"
     car.write_text(smooth.vehicle.model_dump_json(exclude_none=True))

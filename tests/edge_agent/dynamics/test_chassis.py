@@ -59,7 +59,7 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
     omega = np.full(4, 57.0)
     inputs = wheel_inputs(DELTA, omega)
 
-    def felt(known: FloatArray) -> tuple[float, float, float]:
+    def compute_response(known: FloatArray) -> tuple[float, float, float]:
         cos = four(inputs[:, 0])
         sin = four(inputs[:, 1])
         mu = (0.8, 0.8, 0.8, 0.8)
@@ -68,12 +68,12 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
         )
 
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
-    assert felt(UNKNOWN) == pytest.approx(
+    assert compute_response(UNKNOWN) == pytest.approx(
         accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
     )
     tyre_x[:2] = 100.0, 200.0
     known = np.array([100.0, 200.0, np.nan, np.nan])
-    assert felt(known) == pytest.approx(
+    assert compute_response(known) == pytest.approx(
         accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
     )
 

@@ -30,7 +30,7 @@ def drive(
     )
 
 
-def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
+def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
     """Drives one after the other, 10 ms apart."""
     clock = []
     rows = []
@@ -42,7 +42,7 @@ def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, 
     return np.concatenate(clock), np.concatenate(rows)
 
 
-def jointed() -> tuple[FloatArray, FloatArray, Vehicle]:
+def drive_over_joints() -> tuple[FloatArray, FloatArray, Vehicle]:
     """A gentle pull over joints in a dry motorway, without torque: the wheels of an axle jump by 3
     to 4 % for 50 ms.
 

@@ -18,7 +18,7 @@ from schemas.errors import InputError
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from tests.edge_agent.estimators.drives import drive, joined
+from tests.edge_agent.estimators.drives import drive, join_drives
 
 PRIOR_WIDTH = 0.9 * 1.15
 
@@ -49,7 +49,7 @@ def test_interval_keeps_the_width_of_the_prior_without_excitation() -> None:
 def test_estimate_is_forgotten_over_metres_without_excitation() -> None:
     turn = drive("j-turn", 0.5)
     straight = drive("straight", 0.5, seconds=40.0)
-    t, signals = joined(turn, straight)
+    t, signals = join_drives(turn, straight)
     reported = run("fckf", t, signals, turn[2])
     width = (reported.mu_upper - reported.mu_lower)[:, 0]
     assert width[len(turn[0]) - 1] < 0.4
@@ -98,7 +98,7 @@ def test_evidence_of_a_cell_is_independent_of_the_belief_at_entry() -> None:
     reported = []
     for before in (0.3, 0.85):
         lead = drive("j-turn", before)
-        t, signals = joined(lead, visit)
+        t, signals = join_drives(lead, visit)
         closes = np.zeros(len(t), bool)
         closes[[len(lead[0]) + 300, -1]] = True
         estimates = run("fckf", t, signals, visit[2], closes)

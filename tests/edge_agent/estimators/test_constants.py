@@ -20,7 +20,7 @@ from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
-from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, joined, jointed
+from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, drive_over_joints, join_drives
 
 SAMPLES = 400  # of the short drives
 FIRST = 100  # sample from which figures are taken
@@ -190,7 +190,7 @@ MOVES = {
 
 
 @cache
-def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
+def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
     """t (T,), signals (T, 18) and vehicle of a drive."""
     if name in SHORT:
         t, signals, vehicle = drive(name, SHORT[name])
@@ -207,12 +207,12 @@ def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
         signals[:, TORQUE] = np.nan
         return t[:SAMPLES], signals[:SAMPLES], vehicle
     if name == "joints":
-        return jointed()
+        return drive_over_joints()
     if name == "constant-radius":
         return drive(name, 0.5)
     if name == "turn and straight":
         turn = drive("j-turn", 0.5)
-        return *joined(turn, drive("straight", 0.5, seconds=40.0)), turn[2]
+        return *join_drives(turn, drive("straight", 0.5, seconds=40.0)), turn[2]
     if name == "rough acceleration":
         log, vehicle = simulate_manoeuvre(
             "acceleration", mu=0.8, seed=1, duration_s=12.0, sensors="rough", road="hilly"
@@ -247,7 +247,7 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 @cache
 def figures(place: str, name: str | None, times: float) -> dict[str, float]:
     """Figures of a drive, with constant `name` that many times as large."""
-    t, signals, vehicle = driven(place)
+    t, signals, vehicle = make_drive(place)
     constants = Constants()
     if name is not None:
         constants = constants._replace(**{name: times * getattr(constants, name)})
@@ -260,10 +260,10 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
         parts.append(bank.advance(t[k : k + CUT, None], signals[k : k + CUT, None]).values)
         looks.append(bank._filters.copy())
     found = Estimates(np.concatenate(parts)[FIRST:, 0])
-    return reported(found) | inside(np.concatenate(looks)[FIRST // CUT :])
+    return summarize_reports(found) | inside(np.concatenate(looks)[FIRST // CUT :])
 
 
-def reported(estimates: Estimates) -> dict[str, float]:
+def summarize_reports(estimates: Estimates) -> dict[str, float]:
     """Return figures of the reports of one drive."""
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,
@@ -308,14 +308,14 @@ def inside(filters: np.ndarray) -> dict[str, float]:
         "stands": float(rolling["stands"].mean()),
         "v_x told by wheels": float(np.isfinite(rolling["ahead"]).mean()),
         "v_y told by an axle": float(np.isfinite(rolling["left"]).mean()),
-        "std of wheels' v_x": known(rolling["ahead_std"], rolling["ahead"]),
-        "std of the axle's v_y": known(rolling["left_std"], rolling["left"]),
+        "std of wheels' v_x": mean_of_known(rolling["ahead_std"], rolling["ahead"]),
+        "std of the axle's v_y": mean_of_known(rolling["left_std"], rolling["left"]),
         "strain": float(trust["strain"].mean()),
         "distrust": float(trust["distrust"].mean()),
     }
 
 
-def known(values: FloatArray, where: FloatArray) -> float:
+def mean_of_known(values: FloatArray, where: FloatArray) -> float:
     """Return the mean of the reported values, 0 without any."""
     there = np.isfinite(where)
     return float(values[there].mean()) if there.any() else 0.0

@@ -11,7 +11,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import Estimates, create
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, jointed
+from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, drive_over_joints
 
 GRAVITY = 9.81
 PRIOR_WIDTH = 0.9 * 1.15
@@ -71,7 +71,7 @@ def test_slope_without_torque_is_no_ice_and_agreeing_wheels_give_speed() -> None
 
 
 def test_joints_in_the_road_are_no_ice() -> None:
-    said = run(*jointed())
+    said = run(*drive_over_joints())
     assert said.mu_upper[50:].min() > 0.7
 
 

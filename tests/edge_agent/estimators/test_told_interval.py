@@ -42,7 +42,7 @@ def _tell(
     return friction.lower, friction.median, friction.upper
 
 
-def told(
+def find_told_interval(
     weight: FloatArray, patch: float = 0.0, likeness: float = 0.0
 ) -> tuple[float, float, float]:
     """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so
@@ -66,7 +66,7 @@ def about(mu: float, width: float) -> FloatArray:
 
 
 def test_who_knows_nothing_tells_the_prior() -> None:
-    lower, median, upper = told(DESIGN.prior)
+    lower, median, upper = find_told_interval(DESIGN.prior)
     assert upper == pytest.approx(0.05 + UPPER_END * 1.15, abs=1e-3)
     assert median == pytest.approx(0.625, abs=1e-3)
     assert lower == pytest.approx(0.05 + LOWER_END * 1.15, abs=1e-3)
@@ -77,17 +77,17 @@ def test_correct_vehicle_file_lowers_only_the_upper_end(
     mu: float,
 ) -> None:
     weight = about(mu, 0.1)
-    rough = told(weight)
-    alike = told(weight, likeness=0.7)
+    rough = find_told_interval(weight)
+    alike = find_told_interval(weight, likeness=0.7)
     assert alike[:2] == rough[:2]
     assert alike[2] <= rough[2] - (0.02 if mu > 0.4 else 0.0)
     assert (alike[2] < SLIPPERY_MU) == (rough[2] < SLIPPERY_MU)
-    assert told(DESIGN.prior, likeness=1.0) == told(DESIGN.prior)
+    assert find_told_interval(DESIGN.prior, likeness=1.0) == find_told_interval(DESIGN.prior)
 
 
 def test_learned_upper_end_is_below_the_quantile_of_tempered_evidence() -> None:
     weight = about(0.8, 0.1)
-    _, median, upper = told(weight)
+    _, median, upper = find_told_interval(weight)
     assert median < upper < quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
     assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.prior, weight, LEARNED_END), abs=2e-3)
 
@@ -95,21 +95,21 @@ def test_learned_upper_end_is_below_the_quantile_of_tempered_evidence() -> None:
 def test_a_long_upper_tail_is_not_cut_off() -> None:
     weight = 0.85 * about(0.35, 0.05) + 0.15 * about(0.9, 0.05)
     widest = quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
-    assert told(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
+    assert find_told_interval(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4])
 def test_slippery_for_sure_is_said_at_its_own_level_only(mu: float) -> None:
     weight = about(mu, 0.08)
-    _, _, upper = told(weight)
+    _, _, upper = find_told_interval(weight)
     assert (upper < SLIPPERY_MU) == (
         quantile(DESIGN.mu, DESIGN.prior, weight, SURE_END) < SLIPPERY_MU
     )
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:
-    lower, median, upper = told(about(0.8, 0.1))
-    icy, same_median, same_upper = told(about(0.8, 0.1), 0.1)
+    lower, median, upper = find_told_interval(about(0.8, 0.1))
+    icy, same_median, same_upper = find_told_interval(about(0.8, 0.1), 0.1)
     assert icy < 0.2 < lower
     assert (same_median, same_upper) == (median, upper)
 

@@ -172,7 +172,7 @@ def test_downdate_without_a_valid_covariance_changes_nothing() -> None:
     assert np.array_equal(root, before)
 
 
-def _measured(
+def _make_update(
     seed: int, noise: float
 ) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
     rng = np.random.default_rng(seed)
@@ -197,7 +197,7 @@ def _measured(
 
 
 def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
-    (mean, other, cov, other_cov), told = _measured(11, 0.5)
+    (mean, other, cov, other_cov), told = _make_update(11, 0.5)
     assert not told[3]
     assert mean == pytest.approx(other, abs=1e-9)
     assert cov == pytest.approx(other_cov, abs=1e-9)
@@ -234,7 +234,7 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
 
 def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:
     """Noise so small that rounding leaves no variance in the measured direction."""
-    (mean, other, cov, other_cov), told = _measured(12, 1e-9)
+    (mean, other, cov, other_cov), told = _make_update(12, 1e-9)
     assert told[3]
     assert np.array_equal(mean, other)
     assert np.array_equal(cov, other_cov)

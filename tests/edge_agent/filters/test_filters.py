@@ -84,7 +84,7 @@ def factor_of(cov: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
-def _moved(
+def _predict_moments(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, f: FloatArray, q: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     n = len(mean)
@@ -100,7 +100,7 @@ def _moved(
     return new, root
 
 
-def _corrected(
+def _update_moments(
     rule: SigmaRule,
     mean: FloatArray,
     root: FloatArray,
@@ -147,8 +147,8 @@ def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> No
         rest = np.eye(4) - k @ h
         mean = mean + k @ nu
         cov = rest @ cov @ rest.T + k @ np.diag(std**2) @ k.T
-        ours, root = _moved(rule, ours, ours_cov, f, q)
-        ours, root, said = _corrected(rule, ours, root, h, std, z)
+        ours, root = _predict_moments(rule, ours, ours_cov, f, q)
+        ours, root, said = _update_moments(rule, ours, root, h, std, z)
         ours_cov = root @ root.T
         assert said[1] == pytest.approx(expected, abs=1e-9)
         assert np.allclose(ours, mean, rtol=0, atol=1e-12)
@@ -244,10 +244,10 @@ def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:
     root = np.array([[1.0, 0.0], [0.3, 0.5]])
     h = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     std = np.array([0.1, 0.2, 0.3])
-    gappy = _corrected(rule, mean, root, h, std, np.array([1.5, math.nan, 3.0]))
-    whole = _corrected(rule, mean, root, h[[0, 2]], std[[0, 2]], np.array([1.5, 3.0]))
+    gappy = _update_moments(rule, mean, root, h, std, np.array([1.5, math.nan, 3.0]))
+    whole = _update_moments(rule, mean, root, h[[0, 2]], std[[0, 2]], np.array([1.5, 3.0]))
     assert np.array_equal(gappy[0], whole[0])
     assert np.array_equal(gappy[1], whole[1])
-    nothing = _corrected(rule, mean, root, h, std, np.full(3, math.nan))
+    nothing = _update_moments(rule, mean, root, h, std, np.full(3, math.nan))
     assert np.array_equal(nothing[0], mean)
     assert nothing[2] == (0, 0.0, 0.0)

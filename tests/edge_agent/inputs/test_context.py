@@ -101,7 +101,7 @@ def frames_of(name: str) -> list[can.Message]:
     return frames
 
 
-def imported(path: Path, profile: Profile, out: Path) -> SignalLog:
+def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
     """Import a source as a log, without checking the signals that an estimator needs."""
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
     merged = merge(
@@ -145,7 +145,7 @@ def test_a_bus_fills_the_context_that_its_profile_reads(
     profile = load_profile(name)[0]
     writers: dict[str, Any] = {"blf": formats.as_log, "mf4": formats.as_mf4, "bag": formats.as_bag}
     path = writers[kind](tmp_path / ("bag" if kind == "bag" else f"a.{kind}"), frames)
-    assert_filled(imported(path, profile, tmp_path / "o.parquet"))
+    assert_filled(import_log(path, profile, tmp_path / "o.parquet"))
 
 
 def plain_profile(names: dict[str, str]) -> Profile:
@@ -173,7 +173,7 @@ def test_a_measurement_file_fills_the_context(tmp_path: Path) -> None:
     mdf.append(asammdf.Signal(np.full(len(slow), 100.0), slow, name=names["wiper"], unit="%"))
     mdf.save(tmp_path / "lab.mf4")
     mdf.close()
-    assert_filled(imported(tmp_path / "lab.mf4", plain_profile(names), tmp_path / "o.parquet"))
+    assert_filled(import_log(tmp_path / "lab.mf4", plain_profile(names), tmp_path / "o.parquet"))
 
 
 def test_topics_of_a_bag_fill_the_context(tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_topics_of_a_bag_fill_the_context(tmp_path: Path) -> None:
                     else number(told_at(k / RATE).get(name, 30.0))
                 )
                 writer.write(connection, ns, store.serialize_cdr(message, connection.msgtype))
-    assert_filled(imported(tmp_path / "bag", plain_profile(names), tmp_path / "o.parquet"))
+    assert_filled(import_log(tmp_path / "bag", plain_profile(names), tmp_path / "o.parquet"))
 
 
 def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
     pq.write_table(
         pa.table({"t": t, "omega_fl": np.full(len(t), 30.0), **columns}), tmp_path / "a.parquet"
     )
-    log = imported(
+    log = import_log(
         tmp_path / "a.parquet",
         plain_profile({"omega_fl": "omega_fl"} | dict(zip(CONTEXT, CONTEXT, strict=True))),
         tmp_path / "o.parquet",

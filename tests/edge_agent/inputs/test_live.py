@@ -105,11 +105,11 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
     rng = np.random.default_rng(3)
 
     def hears(payload: bytes, heard: Callable[[], bool]) -> None:
-        def sent() -> bool:
+        def has_heard() -> bool:
             session.put(key, payload)
             return heard()
 
-        until(sent)
+        until(has_heard)
 
     hears(b"\x00\x01\x00\x00", lambda: feed.broken > 0)
     for _ in range(200):
@@ -274,7 +274,7 @@ def test_live_sources_and_a_log_do_not_go_together(
 
 
 def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Path) -> None:
-    from tests.schemas.test_documents import descriptor
+    from tests.schemas.test_documents import read_descriptor
 
     folder = Path(live.__file__).parent / "kuksa"
     words = [
@@ -287,7 +287,7 @@ def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Pa
     ]
     subprocess.run([sys.executable, *words], check=True)
     made, kept = ((place / "broker_pb2.py").read_text() for place in (tmp_path, folder))
-    assert descriptor(made) == descriptor(kept)
+    assert read_descriptor(made) == read_descriptor(kept)
 
 
 def test_nothing_is_left_running() -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
 
-def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
+def join_records(records: list[RecordBlock]) -> dict[str, np.ndarray]:
     """Columns of several blocks, one after the other, with vehicle and urgent."""
     columns = {
         name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns
@@ -61,8 +61,8 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
     rows = [slice(a, b) for a, b in pairwise(cuts)]
     pieces = [watch.step(part(block, r), reported.part(r))[1:] for r in rows]
     for kind in (0, 1):
-        expected = joined([whole[kind]])
-        found = joined([piece[kind] for piece in pieces])
+        expected = join_records([whole[kind]])
+        found = join_records([piece[kind] for piece in pieces])
         for name, column in expected.items():
             assert np.array_equal(column, found[name], equal_nan=column.dtype.kind == "f"), name
 
@@ -177,7 +177,7 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
 
-def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
+def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
     """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and
     feels `observed` (T,) g.
     """
@@ -208,7 +208,7 @@ def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
     inside = np.full(450, 0.1)
     at_border[border : border + 8] = 0.6
     inside[border + 30 : border + 60] = 0.6
-    plain, near, far = (felt(observed, east)[1] for observed in (gentle, at_border, inside))
+    plain, near, far = (observe_grip(observed, east)[1] for observed in (gentle, at_border, inside))
     assert plain == pytest.approx(WHEEL_SHARE * 0.1 + FELT_STD, abs=1e-3)
     assert near == pytest.approx(plain, abs=0.15)
     assert far > WHEEL_SHARE * 0.55
@@ -218,7 +218,9 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
     east = np.arange(450)[:, None] * 0.1
     rng = np.random.default_rng(3)
     noisy = 0.1 + 0.05 * rng.normal(size=450)
-    assert max(felt(noisy, east)) < WHEEL_SHARE * 0.16 + FELT_STD < WHEEL_SHARE * noisy.max()
+    assert (
+        max(observe_grip(noisy, east)) < WHEEL_SHARE * 0.16 + FELT_STD < WHEEL_SHARE * noisy.max()
+    )
 
 
 @pytest.mark.parametrize("cut", [None, 31, 33])

@@ -21,7 +21,7 @@ def states(time: IntArray, vehicle: int = 0) -> RecordBlock:
     return RecordBlock(Kind.STATE, {"time": time}, np.full(n, vehicle), np.zeros(n, bool))
 
 
-def reported(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
+def list_passed_times(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
     """Times [s] of the states that pass, one a second, of a trip at SPEED."""
     out = []
     steps = round(1.0 / 0.1 * block_s)
@@ -36,7 +36,7 @@ def reported(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
 
 
 def test_without_the_setting_every_record_passes_at_once() -> None:
-    assert reported(TripEnds(1, 0.0, 0.0), 20) == list(range(1, 21))
+    assert list_passed_times(TripEnds(1, 0.0, 0.0), 20) == list(range(1, 21))
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_without_the_setting_every_record_passes_at_once() -> None:
 def test_both_ends_are_cut_by_the_larger_of_way_and_time(
     metres: float, seconds: float, cut: float
 ) -> None:
-    found = reported(TripEnds(1, metres, seconds), 40)
+    found = list_passed_times(TripEnds(1, metres, seconds), 40)
     assert min(found) == pytest.approx(cut, abs=1.01)
     assert max(found) == pytest.approx(40.0 - cut, abs=1.01)
     assert found == sorted(found)

@@ -139,7 +139,7 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
     outbox.close()
 
 
-def silenced(outbox: Outbox, now: float = 0.0) -> float:
+def silence_route(outbox: Outbox, now: float = 0.0) -> float:
     """Put a batch and let nobody answer until the route is silent; returns the time then."""
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:
@@ -153,7 +153,7 @@ def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
     path: Path,
 ) -> None:
     outbox = Outbox(path, boot=BOOT)
-    began = silenced(outbox)
+    began = silence_route(outbox)
     assert SILENT_S <= began <= SILENT_S + 8.0
     put = []
     for second in range(0, 3600, 5):
@@ -169,7 +169,7 @@ def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
 
 def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
-    now = silenced(outbox)
+    now = silence_route(outbox)
     for _ in range(300):
         outbox.store([draft()], now)
     while not (probe := outbox.due(now, limit=64)):
@@ -216,7 +216,7 @@ def test_reconnect_sends_everything_again_oldest_first_and_once(path: Path) -> N
 
 def test_reconnect_probes_a_silent_route_at_once_with_one_batch(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
-    now = silenced(outbox)
+    now = silence_route(outbox)
     for _ in range(12):
         now += LONGEST_PROBE_S
         outbox.due(now, limit=9)
@@ -241,11 +241,11 @@ def test_folders_made_for_an_outbox_are_synced_into_the_ones_above(
     synced: list[Path] = []
     fsync = os.fsync
 
-    def seen(handle: int) -> None:
+    def record_sync(handle: int) -> None:
         synced.append(Path(f"/proc/self/fd/{handle}").resolve())
         fsync(handle)
 
-    monkeypatch.setattr(os, "fsync", seen)
+    monkeypatch.setattr(os, "fsync", record_sync)
     Outbox(tmp_path / "a" / "b" / "spool.sqlite").close()
     assert synced == [tmp_path, tmp_path / "a"]
 

@@ -17,7 +17,7 @@ PAGE = 4096
 BATCHES = 120
 
 
-def stored(path: Path) -> dict[int, bytes]:
+def store_batches(path: Path) -> dict[int, bytes]:
     """Some hundred batches on disk, by seq."""
     random_ = random.Random(7)
     payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]
@@ -33,12 +33,12 @@ def stored(path: Path) -> dict[int, bytes]:
     return dict(enumerate(payloads, 1))
 
 
-def found(batches: list[StoredBatch]) -> dict[int, bytes]:
+def payloads_by_seq(batches: list[StoredBatch]) -> dict[int, bytes]:
     return {batch.seq: batch.payload for batch in batches}
 
 
 def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) -> None:
-    whole = stored(tmp_path / "whole.sqlite")
+    whole = store_batches(tmp_path / "whole.sqlite")
     image = (tmp_path / "whole.sqlite").read_bytes()
     noticed = 0
     least = BATCHES
@@ -50,7 +50,7 @@ def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) 
         path.write_bytes(image[: page * PAGE] + bytes(PAGE) + image[(page + 1) * PAGE :])
         outbox = Outbox(path, boot=6)
         noticed += outbox.counts.damages
-        held = found(outbox.held_batches())
+        held = payloads_by_seq(outbox.held_batches())
         assert held.items() <= whole.items(), "a batch is not what was stored"
         least = min(least, len(held))
         assert (
@@ -66,14 +66,14 @@ def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) 
 def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     random_ = random.Random(3)
-    whole = stored(path)
+    whole = store_batches(path)
     image = bytearray(path.read_bytes())
     places = [image.find(whole[seq]) + random_.randrange(60) for seq in (20, 70, 110)]
     for place in places:
         image[place] ^= 1 << random_.randrange(8)
     path.write_bytes(image)
     outbox = Outbox(path, boot=6)
-    held = found(outbox.held_batches())
+    held = payloads_by_seq(outbox.held_batches())
     assert held == {seq: payload for seq, payload in whole.items() if seq not in (20, 70, 110)}
     assert outbox.counts.damaged == 6
     outbox.close()
@@ -81,19 +81,19 @@ def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
 
 def test_a_batch_whose_number_of_records_is_damaged_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
-    whole = stored(path)
+    whole = store_batches(path)
     with sqlite3.connect(path) as database:
         database.execute("UPDATE batch SET records = 0 WHERE seq = 20")
     database.close()
     outbox = Outbox(path, boot=6)
-    assert found(outbox.held_batches()).keys() == whole.keys() - {20}
+    assert payloads_by_seq(outbox.held_batches()).keys() == whole.keys() - {20}
     assert outbox.counts.damaged == 1
     outbox.close()
 
 
 def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
-    stored(path)
+    store_batches(path)
     outbox = Outbox(path, boot=6)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f: b"mine")
     first = outbox.store([draft, draft], 0.0)
@@ -108,12 +108,12 @@ def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> 
 
 def test_an_outbox_of_a_former_version_has_no_checksums_and_is_read(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
-    whole = stored(path)
+    whole = store_batches(path)
     with sqlite3.connect(path) as database:
         database.execute("ALTER TABLE batch DROP COLUMN checksum")
     database.close()
     outbox = Outbox(path, boot=6)
-    assert found(outbox.held_batches()) == whole
+    assert payloads_by_seq(outbox.held_batches()) == whole
     assert outbox.counts.damages == 0
     outbox.close()
 

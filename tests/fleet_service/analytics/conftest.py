@@ -34,7 +34,7 @@ PART = Extract(START_NS, START_NS + WORLD.days * DAY_S * 10**9)
 HOUR_NS = 3600 * 10**9
 
 
-def visited(fusion: Fusion) -> IntArray:
+def find_visited(fusion: Fusion) -> IntArray:
     """Slots that somebody visited."""
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 
@@ -51,7 +51,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fusion = Fusion(120.0)
         for _ in replay(root, fusion, Since(until=now)):
             pass
-        snapshots.write(root, cell_table(fusion, visited(fusion), now), now)
+        snapshots.write(root, cell_table(fusion, find_visited(fusion), now), now)
     return root
 
 

@@ -49,7 +49,7 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
         name for name in flat if name not in place
     ]
     assert lines[-1].startswith(f"{answer.num_rows} rows")
-    assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else explained(name)
+    assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else list_explained(name)
 
 
 MAP = {
@@ -57,7 +57,7 @@ MAP = {
 }  # that map-columns.md explains: tests/deploy/test_docs.py
 
 
-def explained(question: str) -> set[str]:
+def list_explained(question: str) -> set[str]:
     """Columns of an answer that the handbook's page has a meaning for."""
     page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]

@@ -39,7 +39,7 @@ def test_the_fit_finds_the_rate_and_the_misreadings_of_a_known_process() -> None
     assert misread == pytest.approx(2 * MISREAD * (1 - MISREAD), abs=0.01)
 
 
-def counted(days: list[FloatArray]) -> pa.Table:
+def make_counts(days: list[FloatArray]) -> pa.Table:
     rows = [
         {
             "day": f"2026-01-{day + 1:02}",
@@ -64,7 +64,7 @@ def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
     for trial in range(trials):
         rng = np.random.default_rng([7, trial])
         days = [pairs_of_a_day(rng, RATE * rng.uniform(0.4, 1.6), 800) for _ in range(12)]
-        found = _fit_class(counted(days))
+        found = _fit_class(make_counts(days))
         assert found["rate_lower"] is not None
         assert found["rate_upper"] is not None
         held += found["rate_lower"] <= 3600 * RATE <= found["rate_upper"]
@@ -73,7 +73,7 @@ def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
 
 def test_few_days_have_no_interval() -> None:
     rng = np.random.default_rng(2)
-    found = _fit_class(counted([pairs_of_a_day(rng, RATE, 500) for _ in range(LEAST_DAYS - 1)]))
+    found = _fit_class(make_counts([pairs_of_a_day(rng, RATE, 500) for _ in range(LEAST_DAYS - 1)]))
     assert found["rate_per_hour"] is not None
     assert found["rate_lower"] is None
     assert found["rate_upper"] is None

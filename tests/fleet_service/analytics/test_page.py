@@ -16,7 +16,7 @@ from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.cli import main
 from schemas import grid
 from schemas.runtime.palette import GRIP_RANGE, shade
-from tests.browser import opened
+from tests.browser import open_page
 from tests.fleet_service.analytics.test_analyze import DAYS
 from tests.fleet_service.examples import CELL
 
@@ -48,11 +48,11 @@ def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 def test_a_page_opens_without_an_error_or_a_network_and_draws_its_cells(
     pages: dict[str, Path], name: str
 ) -> None:
-    with opened(pages[name]) as found:
+    with open_page(pages[name]) as found:
         assert found.errors == []
         assert found.requests == [pages[name].resolve().as_uri()]
-        assert found.drawn > 3
-        assert len(found.colours()) > 3
+        assert found.drawn_count > 3
+        assert len(found.count_colours()) > 3
         assert found.page.locator("#frames").is_visible() == (name in ("frames", "grip"))
 
 
@@ -68,8 +68,8 @@ def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> Non
     path = tmp_path / "page.html"
     path.write_text(render("two", cells([0.9, None]), GRIP_SCALE))
     dry = ",".join(str(int(shade(0.9, *GRIP_RANGE)[k : k + 2], 16)) for k in (1, 3, 5))
-    with opened(path) as found:
-        colours = found.colours()
+    with open_page(path) as found:
+        colours = found.count_colours()
         assert colours[dry] > 1000
         painted = {name for name, count in colours.items() if count > 200} - {dry}
         for name in painted:
@@ -83,7 +83,7 @@ def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> Non
 def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(render("one", cells([0.2]), GRIP_SCALE))
-    with opened(path) as found:
+    with open_page(path) as found:
         canvas = found.page.locator("canvas.map")
         box = canvas.bounding_box()
         assert box is not None
@@ -97,7 +97,7 @@ def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
         for _ in range(30):
             found.page.keyboard.press("ArrowLeft")
         assert "nothing is known" in found.page.locator("#said").inner_text()
-    with opened(path, phone=True, ratio=3.0) as found:
+    with open_page(path, phone=True, ratio=3.0) as found:
         assert found.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
         canvas = found.page.locator("canvas.map")
         assert canvas.evaluate("c => c.width / c.clientWidth") == pytest.approx(3.0, abs=0.02)
@@ -108,8 +108,8 @@ def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
 def test_a_finger_moves_the_map(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(render("one", cells([0.2]), GRIP_SCALE))
-    with opened(path, phone=True) as found:
-        before = found.colours()
+    with open_page(path, phone=True) as found:
+        before = found.count_colours()
         found.page.evaluate("""() => {
           const canvas = document.querySelector("canvas.map"), box = canvas.getBoundingClientRect();
           canvas.setPointerCapture = () => {};
@@ -118,11 +118,11 @@ def test_a_finger_moves_the_map(tmp_path: Path) -> None:
           send("pointerdown", 100); send("pointermove", 2000); send("pointerup", 2000);
         }""")
         assert found.errors == []
-        assert sum(found.colours().values()) < sum(before.values())
+        assert sum(found.count_colours().values()) < sum(before.values())
 
 
 def test_each_frame_is_drawn_alone_and_the_slider_changes_it(pages: dict[str, Path]) -> None:
-    with opened(pages["frames"]) as found:
+    with open_page(pages["frames"]) as found:
         first = found.page.locator("#frame").inner_text()
         found.page.locator("#slider").fill("2")
         assert found.page.locator("#frame").inner_text() != first
@@ -150,8 +150,8 @@ def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_pat
         {"cell": [bent[0]], "sector": [0], "mu": [0.2], "score": [1.0], "members": [bent]}
     )
     (tmp_path / "worst.html").write_text(output.page(worst, QUESTIONS["worst"]))
-    with opened(tmp_path / "worst.html") as found:
-        assert found.drawn == len(bent)
+    with open_page(tmp_path / "worst.html") as found:
+        assert found.drawn_count == len(bent)
     spells = pa.table(
         {
             "cell": [CELL, CELL + 1],
@@ -162,7 +162,7 @@ def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_pat
         }
     )
     (tmp_path / "spells.html").write_text(output.page(spells, QUESTIONS["spells"]))
-    with opened(tmp_path / "spells.html") as found:
+    with open_page(tmp_path / "spells.html") as found:
         assert found.page.locator("#lasting").is_visible()
         assert not found.page.locator("#unknown").is_visible()
-        assert found.colours().get("208,0,111", 0) > 50
+        assert found.count_colours().get("208,0,111", 0) > 50

@@ -21,7 +21,7 @@ BENT = grid.interleave(
 NOON_US = 1_769_515_200_000_000  # 27 January 2026
 
 
-def drawn(name: str, table: pa.Table) -> Figure:
+def draw_figure(name: str, table: pa.Table) -> Figure:
     figure = Figure()
     plots._DRAWN[name](figure, table)
     return figure
@@ -31,7 +31,7 @@ def shapes(axes: Axes) -> int:
     return sum(len(one.get_paths()) for one in axes.collections if isinstance(one, PolyCollection))
 
 
-def named(axes: Axes) -> list[str]:
+def list_names(axes: Axes) -> list[str]:
     legend = axes.get_legend()
     return [text.get_text() for text in legend.get_texts()] if legend else []
 
@@ -45,7 +45,7 @@ def test_worst_draws_cells_of_each_stretch_without_connecting_lines() -> None:
         "share_lower": 0.7,
         "values": 12,
     }
-    figure = drawn(
+    figure = draw_figure(
         "worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}])
     )
     first, second = (axes for axes in figure.axes if axes.get_xlabel() == "east [m]")
@@ -56,11 +56,11 @@ def test_worst_draws_cells_of_each_stretch_without_connecting_lines() -> None:
 
 def test_grip_of_a_day_shows_that_day_and_cells_with_bounds_only() -> None:
     table = pa.table({"day": ["2026-01-27"] * 3, "mu_p50": [0.3, 0.8, None]})
-    (axes,) = drawn("grip", table).axes
+    (axes,) = draw_figure("grip", table).axes
     assert [label.get_text() for label in axes.get_xticklabels()] == ["2026-01-27"]
     assert np.ptp(axes.get_xlim()) < 2.0
     assert "2 measured\n1 bounded" in [text.get_text() for text in axes.texts]
-    assert len(named(axes)) == 2
+    assert len(list_names(axes)) == 2
 
 
 def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
@@ -73,7 +73,7 @@ def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
             "mu": [0.3, None, 0.4],
         }
     )
-    maps = [axes for axes in drawn("replay", table).axes if axes.get_xlabel() == "east [m]"]
+    maps = [axes for axes in draw_figure("replay", table).axes if axes.get_xlabel() == "east [m]"]
     assert [axes.get_title() for axes in maps] == [
         "2026-01-27T12:00:00 UTC",
         "2026-01-27T12:00:10 UTC",
@@ -90,8 +90,8 @@ def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
     table = pa.Table.from_pylist(
         [dict(zip(("basis", "age_h", "held", "compatible"), row, strict=True)) for row in rows]
     )
-    (axes,) = drawn("calibration", table).axes
-    assert set(named(axes)) == {
+    (axes,) = draw_figure("calibration", table).axes
+    assert set(list_names(axes)) == {
         "measured: held",
         "measured: compatible",
         "bound: held",
@@ -105,11 +105,11 @@ def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
 @pytest.mark.parametrize("lasts", [True, False])
 def test_a_spell_that_lasts_is_told_from_one_that_ended(lasts: bool) -> None:
     table = pa.table({"onset": [NOON_US * 1e-6], "duration_s": [600.0], "lasts": [lasts]})
-    (axes,) = drawn("spells", table).axes
+    (axes,) = draw_figure("spells", table).axes
     arrows = [
         line
         for line in axes.lines
         if line.get_marker() == ">" and len(np.asarray(line.get_xdata()))
     ]
     assert len(arrows) == lasts
-    assert named(axes) == ["ended", "lasts at the end of the data"]
+    assert list_names(axes) == ["ended", "lasts at the end of the data"]

@@ -24,7 +24,7 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import Z_95
 from tests.fleet_service.analytics.agreement import Order
-from tests.fleet_service.analytics.conftest import HOUR_NS, PART, WORLD, visited
+from tests.fleet_service.analytics.conftest import HOUR_NS, PART, WORLD, find_visited
 
 Ask = Callable[..., pa.Table]
 PLACE = ["cell", "sector"]
@@ -255,7 +255,7 @@ def test_replay_is_the_map_of_the_service(asked: Ask, archive: Path) -> None:
     fusion = Fusion(120.0)
     for _ in replay(archive, fusion, Since(until=at)):
         pass
-    expected = cell_table(fusion, visited(fusion), at)
+    expected = cell_table(fusion, find_visited(fusion), at)
     assert found.drop_columns(["frame"]).sort_by("cell").equals(expected.sort_by("cell"))
 
 

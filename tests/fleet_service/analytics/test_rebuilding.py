@@ -46,7 +46,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def made(root: Path, out: Path, engine: str = "local") -> Path:
+def rebuild_archive(root: Path, out: Path, engine: str = "local") -> Path:
     out.mkdir()
     assert sum(one.cells for one in rebuild(Rebuild(root, out, UNTIL), engine)) > 500
     return out
@@ -59,11 +59,11 @@ def test_zone_by_zone_the_map_is_that_of_a_whole_replay(archive: Path, tmp_path:
     step = 360.0 / (1 << grid.CELL_ZOOM)
     sides = {bool(side) for side in east[np.abs(east - BORDER) < 2 * step] > BORDER}
     assert sides == {False, True}, "nobody crossed the border"
-    assert difference(rebuilt_map(made(archive, tmp_path / "out")), whole) <= 1e-6
+    assert difference(rebuilt_map(rebuild_archive(archive, tmp_path / "out")), whole) <= 1e-6
 
 
 def test_the_roll_ups_are_those_of_the_archive_byte_for_byte(archive: Path, tmp_path: Path) -> None:
-    out = made(archive, tmp_path / "out")
+    out = rebuild_archive(archive, tmp_path / "out")
     assert contents(out / rollup.TABLE) == contents(archive / rollup.TABLE)
     assert len(contents(out / rollup.TABLE)) == len(
         list(layout.compacted_files(archive, Kind.OBSERVATION))
@@ -73,7 +73,7 @@ def test_the_roll_ups_are_those_of_the_archive_byte_for_byte(archive: Path, tmp_
 def test_a_zone_done_again_leaves_the_same_files_and_no_draft(
     archive: Path, tmp_path: Path
 ) -> None:
-    out = made(archive, tmp_path / "out")
+    out = rebuild_archive(archive, tmp_path / "out")
     before = contents(out)
     rebuild_zone(Rebuild(archive, out, UNTIL), zones_of(archive)[0])
     assert contents(out) == before

@@ -32,7 +32,7 @@ WORLD = SyntheticFleet(rows=4_000, days=1, vehicles=30, roads=6, length=60, icy=
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[Any]:
-    with spark_sessions.cores(2) as found:
+    with spark_sessions.spark_session(2) as found:
         yield found
 
 
@@ -74,13 +74,13 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     assert contents(out) == contents(tmp_path / "local")
 
 
-def _refused(task: str) -> str:
+def _refuse_task(task: str) -> str:
     raise InputError("log", f"{task} is no log", "give another")
 
 
 def test_bad_input_comes_as_itself_and_a_task_that_always_fails_as_a_line(session: Any) -> None:  # noqa: ANN401
     with pytest.raises(InputError, match="log: 1.parquet is no log; give another"):
-        spark.spread(session, ["1.parquet"], _refused)
+        spark.spread(session, ["1.parquet"], _refuse_task)
     with pytest.raises(InputError, match="engine: Spark gave up: "):
         spark.spread(session, ["x"], partial(int, base=10))
-    assert spark.spread(session, [], _refused) == []
+    assert spark.spread(session, [], _refuse_task) == []

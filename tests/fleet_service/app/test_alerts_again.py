@@ -14,7 +14,7 @@ from tests.fleet_service.examples import batch
 
 @pytest.fixture
 def fleet(service: Running, session: zenoh.Session) -> Fleet:
-    return Fleet(session).meet()
+    return Fleet(session).await_services()
 
 
 def test_standing_alerts_are_repeated_and_cleared_ones_are_not(fleet: Fleet) -> None:

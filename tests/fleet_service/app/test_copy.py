@@ -28,9 +28,9 @@ from fleet_service.replication.replica import OWNER
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Batch, Kind
-from tests.buckets import SECRET, BucketServer, held
+from tests.buckets import SECRET, BucketServer, list_copied_files
 from tests.fleet_service.app.test_erasing import MONTH, pseudonyms_of
-from tests.fleet_service.app.test_kill import archived, identities
+from tests.fleet_service.app.test_kill import identities, list_archived
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
@@ -60,7 +60,7 @@ def take(engine: Engine, sent: list[Batch]) -> None:
     )
 
 
-def known(engine: Engine) -> dict[str, pa.Table]:
+def read_image(engine: Engine) -> dict[str, pa.Table]:
     """All that a service would keep of itself: map, trust, batches, alerts."""
     return dict(engine._image().tables)
 
@@ -87,15 +87,15 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         rows = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
     without = ServiceConfig()
     with closing(Engine(without, root)) as engine:
-        expected = known(engine)
+        expected = read_image(engine)
     with closing(Engine(config, new)) as engine:
-        assert held(new).keys() == held(root).keys()
+        assert list_copied_files(new).keys() == list_copied_files(root).keys()
         missing = rows - sum(
             table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"])
         )
         assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
         assert engine.alerts.count > 0
-        found = known(engine)
+        found = read_image(engine)
         assert found.keys() == expected.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         take(engine, first + second)
@@ -154,11 +154,11 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
         bucket.start()
         acks: list[tuple[str, bytes]] = []
 
-        def acknowledged() -> bool:
+        def is_acknowledged() -> bool:
             acks.extend(engine.settlement.flush())
             return bool(acks)
 
-        until(acknowledged)
+        until(is_acknowledged)
         assert sorted(vehicle for vehicle, _ in acks) == sorted({one.vehicle for one in sent})
         assert engine.copy is not None
         assert engine.copy.away_s == 0
@@ -204,9 +204,9 @@ def health(address: str) -> str:
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
     """Send unacknowledged batches again, as spools do; return True if all are acknowledged."""
-    for one in fleet.unsettled(sent)[:20]:
+    for one in fleet.list_unsettled(sent)[:20]:
         fleet.publish(one)
-    return not fleet.unsettled(sent)
+    return not fleet.list_unsettled(sent)
 
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
@@ -221,18 +221,18 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
     with service(router, tmp_path, bucket) as (process, address):
         until(lambda: drive(fleet, before), PATIENCE_S)
         assert "does not take segments" not in health(address)
-        bucket.away(kind)
+        bucket.take_away(kind)
         until(
             lambda: not drive(fleet, during) and "does not take segments" in health(address),
             PATIENCE_S,
         )
         assert SECRET not in health(address)
-        assert len(fleet.unsettled(during)) == len(during)  # nothing of it is acknowledged
-        bucket.back(kind)
+        assert len(fleet.list_unsettled(during)) == len(during)  # nothing of it is acknowledged
+        bucket.bring_back(kind)
         until(lambda: drive(fleet, during), PATIENCE_S)
         process.terminate()
         assert process.wait(20) == 0
-    found = archived(tmp_path)
+    found = list_archived(tmp_path)
     assert len(found) == len(set(found)) == 3 * len(before + during)
     _same_in_the_bucket(bucket, root)
 
@@ -248,18 +248,20 @@ def test_service_killed_between_disk_and_bucket_loses_nothing(
     during = reports(0.6, BATCHES + 1, 2 * BATCHES)
     with service(router, tmp_path, bucket) as (process, _):
         until(lambda: drive(fleet, before), PATIENCE_S)
-        written = len(archived(tmp_path))
-        bucket.away(kind)
-        until(lambda: not drive(fleet, during) and len(archived(tmp_path)) > written, PATIENCE_S)
+        written = len(list_archived(tmp_path))
+        bucket.take_away(kind)
+        until(
+            lambda: not drive(fleet, during) and len(list_archived(tmp_path)) > written, PATIENCE_S
+        )
         process.kill()
         process.wait()
-        assert len(fleet.unsettled(during)) == len(during)
-    bucket.back(kind)
+        assert len(fleet.list_unsettled(during)) == len(during)
+    bucket.bring_back(kind)
     with service(router, tmp_path, bucket) as (process, _):
         until(lambda: drive(fleet, during), PATIENCE_S)
         process.terminate()
         assert process.wait(20) == 0
-    found = archived(tmp_path)
+    found = list_archived(tmp_path)
     assert len(found) == len(set(found)) == 3 * len(before + during)
     assert all(one in found for one in identities(fleet, tmp_path))
     _same_in_the_bucket(bucket, root)
@@ -298,7 +300,7 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
         )
     kept = {
         name: content
-        for name, content in bucket.objects().items()
+        for name, content in bucket.read_objects().items()
         if not name.startswith("observations/")
     }
     assert not any(
@@ -309,8 +311,8 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
 
 
 def _same_in_the_bucket(bucket: BucketServer, root: Path) -> None:
-    there = bucket.objects()
-    here = held(root)
+    there = bucket.read_objects()
+    here = list_copied_files(root)
     log = {name for name in here if name.startswith(("inbox/", "keys/"))}
     assert {name for name in there if name.startswith(("inbox/", "keys/"))} == log
     assert all(there[name] == here[name] for name in log)

@@ -60,7 +60,7 @@ def pseudonyms_of(root: Path) -> list[str]:
     return sorted(map(str, pa.concat_tables(tables)["vehicle"].to_pylist()))
 
 
-def shown(session: zenoh.Session) -> dict[int, int]:
+def count_shown(session: zenoh.Session) -> dict[int, int]:
     """Observations by cell."""
     found: dict[int, int] = {}
     for reply in session.get(keys.map_key(TILE)):
@@ -83,14 +83,14 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     sent = [sent_by(vehicle, seq) for seq in range(1, 21) for vehicle in (GONE, *OTHERS)]
     alone = int(grid.cell_of(ALONE, LONGITUDE))
 
-    def settled() -> bool:
-        for one in fleet.unsettled(sent)[:20]:
+    def is_settled() -> bool:
+        for one in fleet.list_unsettled(sent)[:20]:
             fleet.publish(one)
-        return not fleet.unsettled(sent)
+        return not fleet.list_unsettled(sent)
 
     with service(router, tmp_path) as process:
-        until(settled, PATIENCE_S)
-        until(lambda: alone in shown(session), PATIENCE_S)
+        until(is_settled, PATIENCE_S)
+        until(lambda: alone in count_shown(session), PATIENCE_S)
         words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", GONE, "--json"]
         command = [sys.executable, "-m", "fleet_service.cli", *words]
         with subprocess.Popen(
@@ -100,15 +100,15 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
             while eraser.poll() is None:
                 seq += 1
                 sent += [sent_by(vehicle, seq) for vehicle in OTHERS]
-                until(settled, PATIENCE_S)
+                until(is_settled, PATIENCE_S)
             output, _ = eraser.communicate()
         assert (eraser.returncode, json.loads(output)["rows"]) == (0, 40)
         assert seq > 20, "others drove meanwhile"
         assert process.poll() is None
-        until(lambda: alone not in shown(session), PATIENCE_S)
+        until(lambda: alone not in count_shown(session), PATIENCE_S)
         sent += [sent_by(vehicle, seq + 1) for vehicle in OTHERS]
-        until(settled, PATIENCE_S)
-        at_last = shown(session)
+        until(is_settled, PATIENCE_S)
+        at_last = count_shown(session)
         assert not erasure_requests.open_requests(root)
         process.terminate()
         assert process.wait(PATIENCE_S) == 0
@@ -136,7 +136,7 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         assert sum(at_last.values()) > 2 * 3
 
 
-def filled(root: Path, *names: str) -> Engine:
+def fill_engine(root: Path, *names: str) -> Engine:
     engine = Engine(ServiceConfig(), root)
     messages = [
         Message(Kind.OBSERVATION, key(one), wire.encode(sent_by(one, 1)), "") for one in names
@@ -146,7 +146,7 @@ def filled(root: Path, *names: str) -> Engine:
     return engine
 
 
-def answered(engine: Engine, root: Path) -> None:
+def answer_requests(engine: Engine, root: Path) -> None:
     """Carry out the requests, with a worker."""
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())
@@ -158,7 +158,7 @@ def answered(engine: Engine, root: Path) -> None:
 
 
 def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
-    with closing(filled(tmp_path, *OTHERS[1:])) as engine:
+    with closing(fill_engine(tmp_path, *OTHERS[1:])) as engine:
         sent = sent_by("sim-001", 1)
         engine.intake.ingest(
             [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns()
@@ -166,7 +166,7 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
         engine.settlement.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
         question = erasure_requests.write_request(tmp_path, Erasure(MONTH))
-        answered(engine, tmp_path)
+        answer_requests(engine, tmp_path)
         assert erasure_requests.answer_to(question) == {"rows": 0, "files": []}
         assert engine.state.fusion.size
         assert not any(stream.vehicle for stream in engine.state.streams)
@@ -177,10 +177,10 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
 
 
 def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:
-    with closing(filled(tmp_path, *OTHERS)) as engine:
+    with closing(fill_engine(tmp_path, *OTHERS)) as engine:
         none = erasure_requests.write_request(tmp_path, Erasure("1999-01", GONE))
         (tmp_path / erasure_requests.FOLDER / "other.json").write_text("[]")
-        answered(engine, tmp_path)
+        answer_requests(engine, tmp_path)
         with pytest.raises(InputError, match="no key of 1999-01"):
             erasure_requests.answer_to(none)
         with pytest.raises(InputError, match="other.json is none"):
@@ -189,7 +189,7 @@ def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Pat
 
 
 def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Path) -> None:
-    engine = filled(tmp_path, GONE, *OTHERS)
+    engine = fill_engine(tmp_path, GONE, *OTHERS)
     stopped = threading.Event()
     stopped.set()
     question = erasure_requests.write_request(tmp_path, Erasure(MONTH, GONE))
@@ -197,7 +197,7 @@ def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Pa
     assert erasure_requests.open_requests(tmp_path) == [question]
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        answered(again, tmp_path)
+        answer_requests(again, tmp_path)
         told = erasure_requests.answer_to(question)
         assert told is not None
         assert told["rows"] == 2

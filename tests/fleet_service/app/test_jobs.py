@@ -39,7 +39,7 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
 ) -> None:
     moment = now()
     with running(router, tmp_path, compact_s=0.05) as run:
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         for seq in range(1, 11):
             fleet.settle(*(batch(f"sim-{k:03}", seq, moment, [0.8]) for k in range(3)))
         until(lambda: not list((tmp_path / "inbox").glob("*.parquet")))

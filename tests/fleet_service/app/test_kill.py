@@ -59,21 +59,21 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
     fleet = Fleet(session)
     for turn in range(KILLS + 1):
         with service(router, tmp_path) as process:
-            waiting = fleet.unsettled(sent)
+            waiting = fleet.list_unsettled(sent)
             left = 0 if turn == KILLS else len(waiting) - int(rng.integers(1, len(waiting) // 2))
 
             def few_enough(left: int = left) -> bool:
-                for one in fleet.unsettled(sent)[:20]:
+                for one in fleet.list_unsettled(sent)[:20]:
                     fleet.publish(one)
-                return len(fleet.unsettled(sent)) <= left
+                return len(fleet.list_unsettled(sent)) <= left
 
             until(few_enough)
-            for one in fleet.unsettled(sent):
+            for one in fleet.list_unsettled(sent):
                 fleet.publish(one)
             if turn == KILLS:
                 process.terminate()
                 assert process.wait(10) == 0
-        held = archived(tmp_path)
+        held = list_archived(tmp_path)
         assert all(one in held for one in identities(fleet, tmp_path))
     assert len(held) == len(set(held)) == 3 * len(sent)
 
@@ -93,7 +93,7 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
     ]
 
 
-def archived(folder: Path) -> list[tuple[int, int, int]]:
+def list_archived(folder: Path) -> list[tuple[int, int, int]]:
     """Boot, seq and row of everything in the segments."""
     table = pa.concat_tables(
         reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])

@@ -20,7 +20,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
-from tests.schemas.runtime.test_metrics import fetch
+from tests.schemas.runtime.test_metrics import fetch_page
 from tests.waiting import matched, until
 
 
@@ -37,8 +37,8 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
             session.put(key("sim-001"), wire.encode(sent), encoding=wire.ENCODING[Kind.OBSERVATION])
         list(session.get("gripmap/v1/map/**?colour=red"))
 
-        def shown() -> dict[str, float]:
-            families = text_string_to_metric_families(fetch(f"{address}/metrics")[2])
+        def read_metrics() -> dict[str, float]:
+            families = text_string_to_metric_families(fetch_page(f"{address}/metrics")[2])
             return {
                 sample.name.removeprefix("gripmap_")
                 + "".join(f".{v}" for v in sample.labels.values()): sample.value
@@ -48,17 +48,22 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
 
         until(
             lambda: (
-                shown().get("rows_total.observation")
-                and shown().get("refused_messages_total.speed")
+                read_metrics().get("rows_total.observation")
+                and read_metrics().get("refused_messages_total.speed")
             )
         )
-        until(lambda: shown()["segments.observation"] == 1 and not shown()["unsettled_batches"])
-        found = shown()
+        until(
+            lambda: (
+                read_metrics()["segments.observation"] == 1
+                and not read_metrics()["unsettled_batches"]
+            )
+        )
+        found = read_metrics()
         assert found["refused_messages_total.speed"] == 1
         assert found["bad_queries_total.query"] == 1, "the asker's own word is no label"
         assert (found["cells"], found["routers"], found["queue_capacity"]) == (1, 1, 20_000)
         assert 1.0 <= found["report_lag_seconds"] < 60.0
-        status, _, text = fetch(f"{address}/healthz")
+        status, _, text = fetch_page(f"{address}/healthz")
         assert (status, json.loads(text)["troubles"]) == (200, [])
 
 
@@ -67,7 +72,7 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
     pulse = Pulse(turn_age_s=0.1, queued=0, routers=1, clock_lag_s=0.0)
     engine = Engine(config, tmp_path)
 
-    def damaged() -> object:
+    def count_damaged() -> object:
         found = {
             metric.name: metric.values
             for metric in metrics.metrics(engine, pulse, config, tmp_path)
@@ -77,14 +82,14 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
     (tmp_path / "weather").mkdir(exist_ok=True)
     for name in ("inbox/a.parquet.bad", "weather/b.parquet.bad"):
         (tmp_path / name).touch()
-    assert damaged() == 0, "a scrape walks through no archive"
+    assert count_damaged() == 0, "a scrape walks through no archive"
     (inventory,) = (
         job
         for job in archive_jobs(engine, config, tmp_path, SteadyClock().moment)
         if job.name == "inventory"
     )
     inventory.work(threading.Event())
-    assert damaged() == 2
+    assert count_damaged() == 2
     engine.close()
 
 

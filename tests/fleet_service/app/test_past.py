@@ -141,11 +141,11 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
     real = subprocess.Popen
 
-    def noted(command: list[str], stdin: int, stdout: int) -> subprocess.Popen[bytes]:
+    def record_process(command: list[str], stdin: int, stdout: int) -> subprocess.Popen[bytes]:
         found.append(real(command, stdin=stdin, stdout=stdout))
         return found[-1]
 
-    monkeypatch.setattr(subprocess, "Popen", noted)
+    monkeypatch.setattr(subprocess, "Popen", record_process)
     return found
 
 

@@ -47,13 +47,13 @@ class Fleet:
         self.tiles: queue.Queue[tuple[str, pa.Table]] = queue.Queue()
         self.alerts: queue.Queue[wire.Alert] = queue.Queue()
         self.acks = 0
-        session.declare_subscriber(f"{keys.ROOT}/ack/*", self._acked)
-        session.declare_subscriber(f"{keys.ROOT}/map/**", self._tile)
+        session.declare_subscriber(f"{keys.ROOT}/ack/*", self._record_ack)
+        session.declare_subscriber(f"{keys.ROOT}/map/**", self._record_tile)
         self.repeated = 0
         self._last: dict[tuple[int, int], wire.Alert] = {}
-        session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alerted)
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", self._record_alert)
 
-    def meet(self, *regions: int) -> Fleet:
+    def await_services(self, *regions: int) -> Fleet:
         """Wait until services for the regions receive published messages and queries."""
         for region in regions or (REGION,):
             for name in (
@@ -68,7 +68,7 @@ class Fleet:
             querier.undeclare()
         return self
 
-    def _acked(self, sample: zenoh.Sample) -> None:
+    def _record_ack(self, sample: zenoh.Sample) -> None:
         vehicle, streams = wire.decode_ack(sample.payload.to_bytes())
         assert str(sample.key_expr) == keys.ack_key(vehicle)
         for stream in streams:
@@ -77,7 +77,7 @@ class Fleet:
             self.rejected += [(vehicle, *refused) for refused in stream.rejected]
         self.acks += 1
 
-    def _alerted(self, sample: zenoh.Sample) -> None:
+    def _record_alert(self, sample: zenoh.Sample) -> None:
         alert = wire.decode_alert(sample.payload.to_bytes())
         if self._last.get((alert.cell, alert.sector)) == alert:
             self.repeated += 1  # it stands still
@@ -85,7 +85,7 @@ class Fleet:
             self._last[alert.cell, alert.sector] = alert
             self.alerts.put(alert)
 
-    def _tile(self, sample: zenoh.Sample) -> None:
+    def _record_tile(self, sample: zenoh.Sample) -> None:
         self.tiles.put(
             (str(sample.key_expr), pa.ipc.open_stream(sample.payload.to_bytes()).read_all())
         )
@@ -93,7 +93,7 @@ class Fleet:
     def publish(self, sent: Batch) -> None:
         send(self.session, sent)
 
-    def unsettled(self, sent: list[Batch]) -> list[Batch]:
+    def list_unsettled(self, sent: list[Batch]) -> list[Batch]:
         """Those that were not acknowledged yet."""
         return [one for one in sent if one.seq not in self.durable[one.vehicle]]
 
@@ -106,7 +106,7 @@ class Fleet:
 
 @pytest.fixture
 def fleet(service: Running, session: zenoh.Session) -> Fleet:
-    return Fleet(session).meet()
+    return Fleet(session).await_services()
 
 
 def ask(
@@ -291,7 +291,7 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
         for k in range(40)
     ]
     with running(router, tmp_path) as first:
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         fleet.settle(*sent)
         before = first.service.engine.state.fusion
     with running(router, tmp_path) as second:
@@ -448,7 +448,7 @@ def test_two_services_share_the_world_and_a_query_gets_both(
         running(router, tmp_path / "a", name="shard-a", regions=[here]) as a,
         running(router, tmp_path / "b", name="shard-b", regions=[there]) as b,
     ):
-        fleet = Fleet(session).meet(REGION, region)
+        fleet = Fleet(session).await_services(REGION, region)
         fleet.settle(batch("sim-001", 1, now(), [0.8]))
         sent = dataclasses.replace(batch("sim-002", 1, now(), [0.8], **far), region=region)
         session.put(
@@ -468,7 +468,7 @@ def test_leaving_flushes_and_acknowledges_what_was_taken_in(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     with running(router, tmp_path) as run:
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         sent = batch("sim-001", 1, now(), [0.8])
         fleet.publish(sent)
         until(lambda: len(run.service.inbox) or run.service.engine.counts[Kind.OBSERVATION])

@@ -29,15 +29,15 @@ def test_signs_of_life_end_with_a_reason_when_an_answer_hangs(
             assert [manager.recv(64) for _ in range(3)] == [LIFE] * 3
             run.service._replies._busy_since = time.monotonic() - 2 * service.HANGS_S
 
-            def said() -> int:
+            def count_said() -> int:
                 return sum(line.startswith(SAID) for line in run.lines)
 
-            until(said)
+            until(count_said)
             manager.setblocking(False)
             with suppress(BlockingIOError):  # what came before
                 while manager.recv(64):
                     pass
-            before = said()
-            until(lambda: said() > before + 2)
+            before = count_said()
+            until(lambda: count_said() > before + 2)
             with pytest.raises(BlockingIOError):
                 manager.recv(64)

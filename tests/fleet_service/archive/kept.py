@@ -63,7 +63,7 @@ def now_of(turn: int) -> int:
     return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
 
 
-def observed(turn: int, vehicle: int) -> Batch:
+def make_observations(turn: int, vehicle: int) -> Batch:
     """Return the reports of a vehicle in a round: ice in every second cell, bounds from every
     third vehicle.
     """
@@ -88,7 +88,7 @@ def observed(turn: int, vehicle: int) -> Batch:
     return replace(one, region=int(grid.region_of(cell)))
 
 
-def moved(turn: int, vehicle: int) -> Batch:
+def make_state(turn: int, vehicle: int) -> Batch:
     """The state that a vehicle sends in a round."""
     latitude, longitude = PLACES[vehicle % 2]
     values = {
@@ -108,27 +108,27 @@ def messages(turn: int) -> Iterator[Message]:
     """All that a round brings."""
     for vehicle in range(VEHICLES):
         for one, key in (
-            (observed(turn, vehicle), keys.observation_key),
-            (moved(turn, vehicle), keys.state_key),
+            (make_observations(turn, vehicle), keys.observation_key),
+            (make_state(turn, vehicle), keys.state_key),
         ):
             yield Message(
                 one.kind, key(one.region, one.vehicle), wire.encode(one), wire.ENCODING[one.kind]
             )
 
 
-def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
+def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
     """A checkpoint as the service takes it: asked by one thread, taken by the worker."""
     found: list[object] = []
     stop = threading.Event()
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))
     thread.start()
 
-    def settled() -> bool:
+    def is_taken() -> bool:
         engine.settlement.flush()
         return bool(found)
 
     try:
-        until(settled)
+        until(is_taken)
     finally:
         stop.set()
         thread.join()
@@ -169,7 +169,7 @@ def make(root: Path) -> dict[str, Any]:
                 compact(root)
                 rollup.complete(root)
                 snapshots.write(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
-                checkpoints.save(root, taken(engine))
+                checkpoints.save(root, take_checkpoint(engine))
         rows = {str(kind): engine.counts[kind] for kind in Kind}
         return map_of(engine, now_of(ROUNDS)) | {
             "alerts": engine.alerts.count,

@@ -29,14 +29,14 @@ from tests.fleet_service.examples import SECOND, batch, key
 MONTH = 31 * 86_400 * SECOND
 
 
-def sent(vehicle: str, seq: int, told: bool = True) -> Message:
+def make_message(vehicle: str, seq: int, told: bool = True) -> Message:
     one = batch(vehicle, seq, time.time_ns() - SECOND, [0.8, 0.7], told=told)
     return Message(
         Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
     )
 
 
-def settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int]]]:
+def read_settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int]]]:
     return {
         vehicle: [r for s in wire.decode_ack(ack)[1] for r in s.durable] for vehicle, ack in acks
     }
@@ -67,7 +67,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
     monkeypatch.setattr(os, "fsync", seen_fsync)
     monkeypatch.setattr(Path, "rename", seen_rename)
     for seq in (1, 2):
-        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.intake.ingest([make_message("sim-001", seq)], time.time_ns())
         order.clear()
         acks = engine.settlement.flush()
         order.append("ack")
@@ -75,20 +75,20 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
             ["file", "folder"] if seq == 1 else []
         )  # which vehicle of the map this is, when it is new
         assert order == [*who, "file", "rename", "folder", "ack"]
-        assert settled(acks) == {"sim-001": [(seq, seq)]}
+        assert read_settled(acks) == {"sim-001": [(seq, seq)]}
 
 
 def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(
     engine: Engine, tmp_path: Path
 ) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")
-    engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+    engine.intake.ingest([make_message("sim-001", 1)], time.time_ns())
     assert engine.settlement.flush() == []
-    engine.intake.ingest([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
+    engine.intake.ingest([make_message("sim-001", 2), make_message("sim-001", 1)], time.time_ns())
     assert engine.settlement.flush() == []
     assert engine.counts["segment_failures"] == 2
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
-    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
+    assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert (
         sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION))
         == 4
@@ -106,7 +106,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
     engine: Engine, tmp_path: Path
 ) -> None:
     for seq in (1, 2, 3):
-        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.intake.ingest([make_message("sim-001", seq)], time.time_ns())
         engine.settlement.flush()
     engine.close()
     damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
@@ -114,7 +114,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 4
         assert damaged.with_name(damaged.name + ".bad").exists()
-        again.intake.ingest([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
+        again.intake.ingest([make_message("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
         assert again.counts[Kind.OBSERVATION] == 2
         assert again.counts["duplicates"] == 2
 
@@ -123,7 +123,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
 def test_a_changed_byte_is_noticed_wherever_it_is(
     engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, place: float
 ) -> None:
-    engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+    engine.intake.ingest([make_message("sim-001", 1)], time.time_ns())
     engine.settlement.flush()
     engine.close()
     (segment,) = segments.paths(tmp_path, Kind.OBSERVATION)
@@ -138,7 +138,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
         assert ("is damaged and set aside" in caplog.text) == (not held)
-        again.intake.ingest([sent("sim-001", 1)], time.time_ns())
+        again.intake.ingest([make_message("sim-001", 1)], time.time_ns())
         assert again.counts["duplicates"] == bool(held)
 
 
@@ -150,11 +150,11 @@ def test_unsynced_names_are_synced_before_any_acknowledgement(
 
     with monkeypatch.context() as patch:
         patch.setattr(segments, "sync_directory", broken)
-        engine.intake.ingest([sent("sim-001", 1)], time.time_ns())
+        engine.intake.ingest([make_message("sim-001", 1)], time.time_ns())
         assert engine.settlement.flush() == []
         assert engine.counts["segment_failures"] == 1
-    engine.intake.ingest([sent("sim-001", 2)], time.time_ns())
-    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
+    engine.intake.ingest([make_message("sim-001", 2)], time.time_ns())
+    assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert sum(table.num_rows for table in reading.read(tmp_path, Kind.OBSERVATION)) == 4
 
 
@@ -169,14 +169,16 @@ def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_pat
 def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
     for seq in range(1, 4):
         engine = Engine(ServiceConfig(), tmp_path)
-        engine.intake.ingest([sent("sim-001", seq)], time.time_ns())
+        engine.intake.ingest([make_message("sim-001", seq)], time.time_ns())
         engine.settlement.flush()
         engine.close()
     assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
 
 
 def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
-    engine.intake.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.intake.ingest(
+        [make_message("sim-001", 1), make_message("sim-002", 1, told=False)], time.time_ns()
+    )
     engine.settlement.flush()
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     rows = segments.rows_of(table)
@@ -189,7 +191,9 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
 
 
 def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
-    engine.intake.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.intake.ingest(
+        [make_message("sim-001", 1), make_message("sim-002", 1, told=False)], time.time_ns()
+    )
     engine.settlement.flush()
     pattern = str(tmp_path / "inbox" / "*.parquet")
     with duckdb.connect() as db:
@@ -232,9 +236,9 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
 def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
-    engine.intake.ingest([sent("sim-001", 1)], now)
+    engine.intake.ingest([make_message("sim-001", 1)], now)
     engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
-    assert settled(engine.settlement.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
+    assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
     assert engine.counts["late"] == 1
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [

@@ -28,7 +28,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill, identities, rows_of
-from tests.fleet_service.archive.test_archive import sent, settled
+from tests.fleet_service.archive.test_archive import make_message, read_settled
 
 SEGMENTS = 4
 ROWS = 50
@@ -99,7 +99,7 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
     """Count changes of the disk; die before the one with this number."""
     seen: list[str] = []
 
-    def counted(name: str, real: Callable[..., object]) -> Callable[..., object]:
+    def count_calls(name: str, real: Callable[..., object]) -> Callable[..., object]:
         def call(*args: object, **kwargs: object) -> object:
             seen.append(name)
             if len(seen) == die_at:
@@ -109,12 +109,12 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
         return call
 
     for name in ("rename", "unlink", "mkdir"):
-        monkeypatch.setattr(Path, name, counted(name, getattr(Path, name)))
+        monkeypatch.setattr(Path, name, count_calls(name, getattr(Path, name)))
     monkeypatch.setattr(
-        os, "fsync", counted("fsync", lambda _: None)
+        os, "fsync", count_calls("fsync", lambda _: None)
     )  # a dead process needs no disk that syncs
-    monkeypatch.setattr(files, "write_table", counted("write", files.write_table))
-    monkeypatch.setattr(compaction, "write_table", counted("write", files.write_table))
+    monkeypatch.setattr(files, "write_table", count_calls("write", files.write_table))
+    monkeypatch.setattr(compaction, "write_table", count_calls("write", files.write_table))
     return seen
 
 
@@ -240,7 +240,7 @@ def test_segment_names_are_not_reused_even_if_the_clock_went_back(
 
 
 def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: Path) -> None:
-    messages = [sent(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
+    messages = [make_message(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 20, 4):
             engine.intake.ingest(messages[k : k + 4], time_ns())
@@ -258,5 +258,7 @@ def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: P
             )
             again.intake.ingest(messages, time_ns())
             assert again.counts["duplicates"] == 20
-            assert settled(again.settlement.flush()).keys() == {f"sim-{k:03}" for k in range(5)}
+            assert read_settled(again.settlement.flush()).keys() == {
+                f"sim-{k:03}" for k in range(5)
+            }
         compact(tmp_path)

@@ -30,7 +30,7 @@ DATE = layout.date_of(20_000)
 MONTH = f"{DATE:%Y-%m}"
 
 
-def exported(root: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, int]:
+def export_tables(root: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, int]:
     capsys.readouterr()
     words = ["export", "iceberg", "--archive", str(root), "--catalog", uri(root), "--json", *more]
     assert main(words) == 0
@@ -49,16 +49,16 @@ def test_compacted_files_are_registered_once_and_the_log_never(
     writer = fill(root, 2, 100)
     compact(root)
     writer.write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 30, 9))  # waits in the inbox
-    assert exported(root, capsys) == {
+    assert export_tables(root, capsys) == {
         "added": 8,
         "dropped": 0,
         "rows": 400,
     }  # two days, two zones, two kinds
-    assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 400}
+    assert export_tables(root, capsys) == {"added": 0, "dropped": 0, "rows": 400}
     assert rows_different(root, uri(root)) == 0
     compact(root)
     assert rows_different(root, uri(root)) == 30  # not yet
-    assert exported(root, capsys)["rows"] == 430
+    assert export_tables(root, capsys)["rows"] == 430
     assert rows_different(root, uri(root)) == 0
     table = table_of(uri(root), Kind.OBSERVATION)
     connection = table.scan(selected_fields=("cell", "boot", "mu")).to_duckdb("seen")
@@ -74,10 +74,10 @@ def test_what_retention_removes_leaves_the_tables_first(
     root = tmp_path / "archive"
     fill(root, 2, 100)
     compact(root)
-    exported(root, capsys)
+    export_tables(root, capsys)
     assert retention.retire_rows(root, 31, DATE + timedelta(days=32)) == (2, 4)
     assert rows_different(root, uri(root)) == 0  # read whole: no table names a file that is gone
-    told = exported(root, capsys)
+    told = export_tables(root, capsys)
     assert (told["added"], told["dropped"]) == (0, 0)
     assert 0 < told["rows"] < 400
 
@@ -88,7 +88,7 @@ def test_a_catalogue_that_is_away_holds_retention_up(
     root = tmp_path / "archive"
     fill(root, 1, 50)
     compact(root)
-    exported(root, capsys)
+    export_tables(root, capsys)
     files = sorted(root.rglob("zone=*/*.parquet"))
     (tmp_path / "tables.db").rename(tmp_path / "elsewhere.db")
     (tmp_path / "tables.db").mkdir()
@@ -113,7 +113,7 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         rows["vehicle"] = names[np.arange(100) % 5]
         writer.write(kind, rows)
     compact(root)
-    assert exported(root, capsys)["rows"] == 200
+    assert export_tables(root, capsys)["rows"] == 200
     assert (
         main(["forget", "--archive", str(root), "--vehicle", "sim-003", "--period", MONTH, "--yes"])
         == 0
@@ -122,8 +122,8 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()
     )  # rewritten files are out, and it can be read
     assert names[3] not in seen["vehicle"].to_pylist()
-    assert exported(root, capsys)["rows"] == 160
-    assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 160}
+    assert export_tables(root, capsys)["rows"] == 160
+    assert export_tables(root, capsys) == {"added": 0, "dropped": 0, "rows": 160}
     assert rows_different(root, uri(root)) == 0
     for path in tmp_path.rglob("*.avro"):
         assert names[3].encode() not in path.read_bytes()
@@ -136,7 +136,7 @@ def test_readers_elsewhere_are_told_of_the_mirror(
     there = tmp_path / "there"
     fill(root, 1, 50)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
-    assert exported(root, capsys, "--at", there.as_uri())["rows"] == 100
+    assert export_tables(root, capsys, "--at", there.as_uri())["rows"] == 100
     paths = [task.file.file_path for task in table_of(uri(root), Kind.STATE).scan().plan_files()]
     assert paths
     assert all(path.startswith(there.as_uri()) for path in paths)
@@ -150,7 +150,7 @@ def test_the_namespace_is_the_one_that_is_given(
     root = tmp_path / "archive"
     fill(root, 1, 50)
     compact(root)
-    exported(root, capsys, "--namespace", "north")
+    export_tables(root, capsys, "--namespace", "north")
     with closing(sqlite3.connect(tmp_path / "tables.db")) as catalogue:
         found = {
             name for (name,) in catalogue.execute("select table_namespace from iceberg_tables")
@@ -162,8 +162,8 @@ def test_two_archives_share_tables(tmp_path: Path, capsys: pytest.CaptureFixture
     for k in range(2):
         fill(tmp_path / f"archive-{k}", 1, 50, seed=k)
         compact(tmp_path / f"archive-{k}")
-        assert exported(tmp_path / f"archive-{k}", capsys)["rows"] == 100
-    assert exported(tmp_path / "archive-0", capsys) == {"added": 0, "dropped": 0, "rows": 100}
+        assert export_tables(tmp_path / f"archive-{k}", capsys)["rows"] == 100
+    assert export_tables(tmp_path / "archive-0", capsys) == {"added": 0, "dropped": 0, "rows": 100}
     tables = [table_of(uri(tmp_path / "archive-0"), kind) for kind in Kind]
     whole = pa.concat_tables([table.scan(selected_fields=("boot",)).to_arrow() for table in tables])
     assert set(whole["boot"].to_pylist()) == {0, 1}

@@ -152,7 +152,7 @@ DAY = 86_400 * SECOND
 ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 
 
-def told(engine: Engine, sent: Batch, now: int) -> list[str]:
+def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
     """Return the acknowledgement of a batch, once a segment is written."""
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [
@@ -178,16 +178,18 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
     after = NOON + 3 * DAY
     later = batch("car-001", 2, after, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert told(engine, old, after + SECOND) == ["durable"]
-        assert told(engine, later, after + SECOND) == ["durable"]
+        assert acknowledge_batch(engine, old, after + SECOND) == ["durable"]
+        assert acknowledge_batch(engine, later, after + SECOND) == ["durable"]
     assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
     for _ in range(2):  # replayed from the log, then from a checkpoint
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-            assert told(engine, old, after + SECOND) == [ERASED], (
+            assert acknowledge_batch(engine, old, after + SECOND) == [ERASED], (
                 "settled, or its car would send it for ever"
             )
-            assert told(engine, away, after + SECOND) == [ERASED], "of that month, and never there"
-            assert told(engine, later, after + SECOND) == ["durable"]
+            assert acknowledge_batch(engine, away, after + SECOND) == [ERASED], (
+                "of that month, and never there"
+            )
+            assert acknowledge_batch(engine, later, after + SECOND) == ["durable"]
             assert (engine.counts["refused.erased"], engine.counts["duplicates"]) == (2, 1)
             assert rows_kept(tmp_path) == 2
             assert engine.state.fusion.live.visits[: engine.state.fusion.size].sum() == 2
@@ -201,13 +203,17 @@ def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: 
     late = replace(late, vehicle="car-001", boot=2)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for one in (old, other):
-            assert told(engine, one, NOON + DAY) == ["durable"]
+            assert acknowledge_batch(engine, one, NOON + DAY) == ["durable"]
     assert retention.forget_vehicle(tmp_path, "car-001", "2026-01").rows == 1
     for _ in range(2):
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-            assert told(engine, replace(old, boot=9), NOON + DAY) == [ERASED], "told as a new one"
-            assert told(engine, other, NOON + DAY) == ["durable"], "known, and counted once"
-            assert told(engine, late, NOON + DAY) == ["durable"], "measured since"
+            assert acknowledge_batch(engine, replace(old, boot=9), NOON + DAY) == [ERASED], (
+                "told as a new one"
+            )
+            assert acknowledge_batch(engine, other, NOON + DAY) == ["durable"], (
+                "known, and counted once"
+            )
+            assert acknowledge_batch(engine, late, NOON + DAY) == ["durable"], "measured since"
             assert engine.counts["refused.erased"] == 1
         assert rows_kept(tmp_path) == 2
     (mark,) = (tmp_path / "keys").glob("*.erased")
@@ -223,19 +229,24 @@ def test_forgetting_a_month_does_not_readmit_an_already_forgotten_vehicle(
 ) -> None:
     other, last = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2))
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [
+        assert [acknowledge_batch(engine, one, NOON + DAY) for one in (other, last)] == [
             ["durable"],
             ["durable"],
         ]
     retention.forget_vehicle(tmp_path, "car-002", "2026-01")
     retention.forget_period(tmp_path, "2026-01")
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [[ERASED], [ERASED]]
+        assert [acknowledge_batch(engine, one, NOON + DAY) for one in (other, last)] == [
+            [ERASED],
+            [ERASED],
+        ]
 
 
 def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert told(engine, batch("car-001", 1, NOON, [0.8]), NOON + DAY) == ["durable"]
+        assert acknowledge_batch(engine, batch("car-001", 1, NOON, [0.8]), NOON + DAY) == [
+            "durable"
+        ]
     assert retention.forget_vehicle(tmp_path, "car-001", "2026-01").rows == 1
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["files_set_aside"] == 0
@@ -247,10 +258,13 @@ def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> 
     seen = batch("car-001", 1, NOON - DAY, [0.8])
     new = batch("car-001", 2, NOON, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert told(engine, seen, NOON) == ["durable"]
+        assert acknowledge_batch(engine, seen, NOON) == ["durable"]
     assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert [told(engine, one, NOON) for one in (seen, new)] == [[ERASED], ["durable"]]
+        assert [acknowledge_batch(engine, one, NOON) for one in (seen, new)] == [
+            [ERASED],
+            ["durable"],
+        ]
     assert rows_kept(tmp_path) == 2
 
 

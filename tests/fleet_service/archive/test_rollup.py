@@ -28,7 +28,7 @@ JOIN: dict[str, Callable[..., Any]] = {
 }
 
 
-def merged(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
+def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
     """Statistics of each cell, sector and hour: parts merged as their columns say."""
     out: dict[tuple[int, int, int], dict[str, Any]] = {}
     for path in (root / rollup.TABLE).rglob("*.parquet"):
@@ -58,7 +58,7 @@ def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
         strict=True,
     ):
         direct[row["cell"], row["sector"], time // rollup.HOUR_NS * rollup.HOUR_NS].append(row)
-    found = merged(tmp_path)
+    found = merge_parts(tmp_path)
     assert found.keys() == direct.keys()
     assert max(map(len, direct.values())) > 3
     for key, group in direct.items():
@@ -83,6 +83,6 @@ def test_bits_count_distinct_vehicles_also_across_parts(tmp_path: Path) -> None:
     fill(tmp_path, 6, 60)  # five vehicles each, thirty in all
     compact(tmp_path, round_rows=60)
     rollup.complete(tmp_path)
-    bits = np.bitwise_or.reduce([row["vehicle_bits"] for row in merged(tmp_path).values()])
+    bits = np.bitwise_or.reduce([row["vehicle_bits"] for row in merge_parts(tmp_path).values()])
     set_bits = bin(int(bits) & (2**64 - 1)).count("1")
     assert 0.7 * 30 < -64 * np.log(1 - set_bits / 64) < 1.3 * 30

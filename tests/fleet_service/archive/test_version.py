@@ -137,7 +137,7 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
     return sorted(zip(*(found[name].to_pylist() for name in found.column_names), strict=True))
 
 
-def rewritten(
+def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
     """Let a file be one of another version."""
@@ -161,8 +161,8 @@ def with_columns(table: pa.Table) -> pa.Table:
 def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
     first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
-    rewritten(first, without_columns, "1.0")
-    rewritten(second, with_columns, "1.7")
+    rewrite_file(first, without_columns, "1.0")
+    rewrite_file(second, with_columns, "1.7")
     read = list(reading.read(tmp_path, Kind.OBSERVATION))
     assert [table.schema.names for table in read] == 3 * [tables.OBSERVATION_ARCHIVE.names]
     assert [table["tyre_season"].null_count for table in read] == [20, 0, 0]
@@ -180,7 +180,7 @@ def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) 
     added = ["esc_active", "tcs_active", "wiper"]
     fill(tmp_path, 1, 20)
     (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
-    rewritten(path, lambda table: table.drop_columns(added), "1.2")
+    rewrite_file(path, lambda table: table.drop_columns(added), "1.2")
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     assert [table[name].null_count for name in added] == [20, 20, 20]
     rows = segments.rows_of(table)
@@ -194,8 +194,8 @@ def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) 
 def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
     first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
-    rewritten(first, without_columns, "1.0")
-    rewritten(second, with_columns, "1.7")
+    rewrite_file(first, without_columns, "1.0")
+    rewrite_file(second, with_columns, "1.7")
     before = _identities(tmp_path, Kind.OBSERVATION)
     compact(tmp_path)
     assert _identities(tmp_path, Kind.OBSERVATION) == before
@@ -216,7 +216,7 @@ def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -
 def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> None:
     compact(old)
     for path in layout.compacted_files(old, Kind.OBSERVATION):
-        rewritten(path, with_columns, "1.7", COMPACTED)
+        rewrite_file(path, with_columns, "1.7", COMPACTED)
     assert (
         cli.main(["forget", "--archive", str(old), "--period", "2024-10", "--vehicle", "sim-003"])
         == 0
@@ -232,7 +232,7 @@ def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> Non
 def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
     for seed, change in enumerate((without_columns, with_columns, lambda table: table)):
         fill(tmp_path, 1, 20, seed)
-        rewritten(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
+        rewrite_file(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
         compact(tmp_path)
     engine = pytest.importorskip("fleet_service.analytics.engines").QueryEngine(
         "duckdb", tmp_path, EVERYTHING
@@ -257,7 +257,7 @@ AHEAD = {
 @pytest.mark.parametrize("folder", AHEAD)
 def test_archive_of_a_newer_major_version_is_refused_untouched(old: Path, folder: str) -> None:
     path = next((old / folder).glob("*.parquet"), None) or next((old / folder).rglob("*.parquet"))
-    rewritten(path, lambda table: table, "2.0", AHEAD[folder])
+    rewrite_file(path, lambda table: table, "2.0", AHEAD[folder])
     with pytest.raises(
         InputError, match=r"^archive: .* is of version 2\.0, .* reads 1\.x; use a newer GripMap$"
     ):
@@ -271,11 +271,11 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
 ) -> None:
     archive = ["--archive", str(old), "--out", str(old / "out.csv")]
     for what, encoding in (("observations", COMPACTED), ("rollup", ROLLUP), ("map", MAP)):
-        rewritten(next((old / what).rglob("*.parquet")), lambda table: table, "2.0", encoding)
+        rewrite_file(next((old / what).rglob("*.parquet")), lambda table: table, "2.0", encoding)
         more = ["--snapshot"] if what == "map" else []  # a replay of now reads the last month only
         assert cli.main(["export", what, *archive, *more]) == 2
         assert "is of version 2.0" in capsys.readouterr().err
-    rewritten(segments.paths(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")
+    rewrite_file(segments.paths(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")
     assert cli.main(["compact", "--archive", str(old)]) == 2
     assert "is of version 3.1" in capsys.readouterr().err
     assert not list(old.rglob("*.bad"))
@@ -284,7 +284,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
 def test_a_column_without_which_a_row_is_none_is_said_by_name(tmp_path: Path) -> None:
     fill(tmp_path, 1, 5)
     (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
-    rewritten(path, lambda table: table.drop_columns(["seq"]), "1.9")
+    rewrite_file(path, lambda table: table.drop_columns(["seq"]), "1.9")
     with pytest.raises(InputError, match="^archive: a file has no column seq; "):
         Engine(ServiceConfig(), tmp_path)
 
@@ -297,13 +297,13 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
         place = table.column_names.index("health")
         return table.set_column(place, "health", table["health"].cast(pa.int64()))
 
-    rewritten(path, wider, "1.2")
+    rewrite_file(path, wider, "1.2")
     compact(tmp_path)
     assert (
         pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type
         == pa.int32()
     )
-    rewritten(
+    rewrite_file(
         next(layout.compacted_files(tmp_path, Kind.OBSERVATION)),
         lambda t: t.set_column(
             t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)

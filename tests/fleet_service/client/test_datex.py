@@ -188,7 +188,7 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as following:
             assert following.stdout is not None
             assert following.stdout.readline() == f"0 slippery stretches in {out}\n"
-            fleet = Fleet(session).meet()
+            fleet = Fleet(session).await_services()
             fleet.settle(
                 *(batch(f"sim-{k:03}", 1, time.time_ns() - 9 * SECOND, [0.2]) for k in range(4))
             )
@@ -215,7 +215,7 @@ def test_who_only_rolled_is_in_no_publication(
 ) -> None:
     out = tmp_path / "situations.xml"
     with start(tmp_path / "archive"):
-        fleet = Fleet(session).meet()
+        fleet = Fleet(session).await_services()
         now = time.time_ns() - SECOND
         fleet.settle(
             *(batch(f"sim-{k:03}", 1, now, [0.2], told=False, used=0.02) for k in range(9))

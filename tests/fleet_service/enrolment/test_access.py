@@ -27,9 +27,9 @@ from tests.secured import (
     SERVICE,
     VEHICLES,
     Network,
-    enrolment,
-    network,
-    registry,
+    make_enrolment,
+    open_network,
+    open_registry,
     settings,
 )
 from tests.waiting import matched, until
@@ -53,7 +53,7 @@ def breaches(where: Ground) -> set[str]:
 
 @pytest.fixture(params=["quic", "tls"])
 def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Network]:
-    with network(tmp_path, protocol=request.param) as found:
+    with open_network(tmp_path, protocol=request.param) as found:
         yield found
 
 
@@ -65,14 +65,14 @@ def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
 @pytest.mark.parametrize("protocol", ["quic", "tls"])
 def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
     with (
-        network(tmp_path, guarded=False, protocol=protocol) as open_to_all,
+        open_network(tmp_path, guarded=False, protocol=protocol) as open_to_all,
         open_ground(open_to_all) as found,
     ):
         assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
 
 
 def test_a_vehicle_may_exactly_what_the_design_says() -> None:
-    listed = access_control(enrolment())
+    listed = access_control(make_enrolment())
     rules = {rule["id"]: rule for rule in listed["rules"]}
     granted = [
         rules[name]
@@ -81,7 +81,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
         for name in policy["rules"]
     ]
 
-    def allowed(flow: str) -> set[tuple[str, str]]:
+    def list_allowed(flow: str) -> set[tuple[str, str]]:
         ours = [rule for rule in granted if flow in rule["flows"]]
         return {
             (message, place)
@@ -91,7 +91,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
         }
 
     public = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
-    assert allowed("ingress") == {
+    assert list_allowed("ingress") == {
         *(("put", f"{keys.ROOT}/{kind}/*/*/*/{HONEST}") for kind in ("obs", "state")),
         *(
             (message, place)
@@ -106,7 +106,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
             for message in ("liveliness_query", "declare_liveliness_subscriber")
         ),
     }
-    assert allowed("egress") == {
+    assert list_allowed("egress") == {
         ("put", keys.ack_key(HONEST)),
         *(
             (message, place)
@@ -121,7 +121,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
     assert (listed["enabled"], listed["default_permission"]) == (True, "deny")
 
 
-def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
+def is_heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
     """Return True if a vehicle's message on its own key reaches a service."""
     received: list[bytes] = []
     with listener.declare_subscriber(
@@ -129,11 +129,11 @@ def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
     ):
         publisher = listener.declare_publisher(key(name))  # only a service is told who hears
 
-        def arrived() -> bool:
+        def has_arrived() -> bool:
             vehicle.put(key(name), b"here")
             return bool(received)
 
-        until(arrived)
+        until(has_arrived)
         publisher.undeclare()
     return True
 
@@ -169,38 +169,38 @@ def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(runnin
         return zenoh.open(configuration(one, name))
 
     with anywhere(SERVICE) as service, anywhere(HONEST) as honest:
-        assert heard(honest, HONEST, service)
-        assert registry(running.folder).enrol(enrolment(vehicles=[HONEST, "new-001"])).made == [
-            "new-001"
-        ]
+        assert is_heard(honest, HONEST, service)
+        assert open_registry(running.folder).enrol(
+            make_enrolment(vehicles=[HONEST, "new-001"])
+        ).made == ["new-001"]
         for router in ROUTERS:
             running.stop(router)
-            assert heard(honest, HONEST, service), "the other router is there"
+            assert is_heard(honest, HONEST, service), "the other router is there"
             running.start(router)
-            running.linked()
+            running.await_link()
         with anywhere("new-001") as new:
-            assert heard(new, "new-001", service)
+            assert is_heard(new, "new-001", service)
 
 
 def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: Network) -> None:
-    with running.session(SERVICE) as service, running.session(HONEST) as honest:
-        assert heard(honest, HONEST, service)
+    with running.open_session(SERVICE) as service, running.open_session(HONEST) as honest:
+        assert is_heard(honest, HONEST, service)
         much_later = Registry(running.folder, Terms(renew_days=364.9), datetime.now(UTC))
         for step in ("next", "switch", "drop"):
-            much_later.enrol(enrolment(), step)
+            much_later.enrol(make_enrolment(), step)
         for router in ROUTERS:
             running.stop(router)
         for router in (
             ROUTERS
         ):  # they trust only the new authority, so that the old certificates are worth nothing
             running.start(router)
-        assert heard(honest, HONEST, service)
+        assert is_heard(honest, HONEST, service)
 
 
 def test_old_and_new_authority_get_on_while_one_replaces_the_other(
     running: Network, tmp_path: Path
 ) -> None:
-    registry(running.folder).enrol(enrolment(), "next")
+    open_registry(running.folder).enrol(make_enrolment(), "next")
     for router in ROUTERS[::-1]:
         running.stop(router)
         running.start(router)
@@ -208,13 +208,13 @@ def test_old_and_new_authority_get_on_while_one_replaces_the_other(
     shutil.copytree(
         running.folder, before, ignore=shutil.ignore_patterns("authority", "archive", before.name)
     )
-    registry(running.folder).enrol(enrolment(), "switch")
+    open_registry(running.folder).enrol(make_enrolment(), "switch")
     running.stop(ROUTERS[1])
     running.start(ROUTERS[1])
-    running.linked()
+    running.await_link()
     old = zenoh.open(configuration(settings(running.endpoints[ROUTERS[1]], before), HONEST))
-    with old, running.session(SERVICE, ROUTERS[0]) as service:
-        assert heard(old, HONEST, service)
+    with old, running.open_session(SERVICE, ROUTERS[0]) as service:
+        assert is_heard(old, HONEST, service)
 
 
 def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None:
@@ -228,7 +228,10 @@ def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None
 def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
     """Else it would send nothing, silently."""
     received: list[bytes] = []
-    with running.session(SERVICE) as service, running.session(HONEST, ROUTERS[1]) as vehicle:
+    with (
+        running.open_session(SERVICE) as service,
+        running.open_session(HONEST, ROUTERS[1]) as vehicle,
+    ):
         service.declare_subscriber(
             f"{keys.ROOT}/obs/*/*/*/*", lambda sample: received.append(sample.payload.to_bytes())
         )
@@ -243,23 +246,23 @@ def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
     tmp_path: Path, own: Callable[[str], str]
 ) -> None:
     other = next(name for name in VEHICLES if name != HONEST)
-    fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
+    fleet = make_enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
     listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")
     heard_by: dict[str, list[bytes]] = {name: [] for name in listeners}
-    with network(tmp_path, fleet=fleet) as found, ExitStack() as stack:
-        sessions = {name: stack.enter_context(found.session(name)) for name in listeners}
+    with open_network(tmp_path, fleet=fleet) as found, ExitStack() as stack:
+        sessions = {name: stack.enter_context(found.open_session(name)) for name in listeners}
         for name, session in sessions.items():
             for expression in (own(HONEST), own("*"), "gripmap/**"):
                 stack.enter_context(session.declare_subscriber(expression, _noting(heard_by[name])))
         publisher = sessions[HONEST].declare_publisher(own(HONEST))
         matched(publisher)
 
-        def arrived() -> bool:
+        def has_arrived() -> bool:
             publisher.put(b"ice")
             sessions[other].put(own(HONEST), b"a lie")
             return bool(heard_by[HONEST] and heard_by["owner-0"])
 
-        until(arrived)
+        until(has_arrived)
         assert set(heard_by[HONEST] + heard_by["owner-0"]) == {b"ice"}
         # what was put before this has been at the others' routers too
         for name in (other, SERVICE, READER, "owner-1"):
@@ -269,7 +272,7 @@ def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
 
 def test_an_owner_of_what_is_no_vehicle_is_refused() -> None:
     with pytest.raises(ValueError, match="is no vehicle"):
-        enrolment(owners={"owner-0": ["nobody-1"]})
+        make_enrolment(owners={"owner-0": ["nobody-1"]})
 
 
 def _noting(received: list[bytes]) -> Callable[[zenoh.Sample], None]:

@@ -13,7 +13,7 @@ from fleet_service.cli import main
 from fleet_service.enrolment import authority as ca
 from fleet_service.enrolment.enrol import Registry, Terms
 from schemas.errors import InputError
-from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, WEATHER, enrolment
+from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, WEATHER, make_enrolment
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 EVERYONE = {*ROUTERS, SERVICE, READER, WEATHER, *VEHICLES}
@@ -30,18 +30,18 @@ def certificate(folder: Path, name: str) -> x509.Certificate:
     return found
 
 
-def trusted(folder: Path) -> list[x509.Certificate]:
+def read_trusted(folder: Path) -> list[x509.Certificate]:
     return x509.load_pem_x509_certificates((folder / "trust.pem").read_bytes())
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    at(tmp_path).enrol(enrolment())
+    at(tmp_path).enrol(make_enrolment())
     return tmp_path
 
 
 def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) -> None:
-    (authority,) = trusted(folder)
+    (authority,) = read_trusted(folder)
     for name in EVERYONE:
         found = certificate(folder, name)
         assert ca.is_signed_by(found, authority)
@@ -63,19 +63,19 @@ def test_private_keys_are_for_their_owner_alone(folder: Path) -> None:
 
 def test_running_it_again_changes_nothing(folder: Path) -> None:
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    done = at(folder, 1.0).enrol(enrolment())
+    done = at(folder, 1.0).enrol(make_enrolment())
     assert set(done.kept) == EVERYONE
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_what_comes_to_its_end_is_issued_anew(folder: Path) -> None:
-    assert not at(folder, 334.0).enrol(enrolment()).made
-    assert set(at(folder, 336.0).enrol(enrolment()).made) == EVERYONE
+    assert not at(folder, 334.0).enrol(make_enrolment()).made
+    assert set(at(folder, 336.0).enrol(make_enrolment()).made) == EVERYONE
     assert certificate(folder, SERVICE).not_valid_after_utc == NOW + timedelta(days=336 + 365)
 
 
 def test_a_router_with_another_address_gets_another_certificate(folder: Path) -> None:
-    moved = enrolment(routers={"router-a": {"hosts": ["10.0.0.7"]}, "router-b": {}})
+    moved = make_enrolment(routers={"router-a": {"hosts": ["10.0.0.7"]}, "router-b": {}})
     assert at(folder).enrol(moved).made == ["router-a"]
     names = (
         certificate(folder, "router-a")
@@ -87,50 +87,52 @@ def test_a_router_with_another_address_gets_another_certificate(folder: Path) ->
 
 def test_a_pair_that_was_cut_off_half_way_is_made_whole(folder: Path) -> None:
     (folder / f"{READER}.key").write_bytes((folder / f"{SERVICE}.key").read_bytes())
-    assert at(folder).enrol(enrolment()).made == [READER]
+    assert at(folder).enrol(make_enrolment()).made == [READER]
     assert ca.read(folder / READER) is not None
 
 
 def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> None:
     gone, left = VEHICLES
-    fewer = enrolment(vehicles=[left])
+    fewer = make_enrolment(vehicles=[left])
     assert at(folder).enrol(fewer).revoked == [gone]
     assert not (folder / f"{gone}.key").exists()
     assert gone not in (folder / "router-a.json5").read_text()
     with pytest.raises(
         InputError, match=f"^fleet: '{gone}' was revoked .* until 2027-03-01; give another name$"
     ):
-        at(folder, 1.0).enrol(enrolment())
-    assert gone in at(folder, 366.0).enrol(enrolment()).made
+        at(folder, 1.0).enrol(make_enrolment())
+    assert gone in at(folder, 366.0).enrol(make_enrolment()).made
 
 
 def test_change_of_authority_takes_three_steps_with_both_trusted(folder: Path) -> None:
-    (first,) = trusted(folder)
-    assert not at(folder).enrol(enrolment(), "next").made, "everyone must trust it before it signs"
-    assert first in trusted(folder)
-    assert len(trusted(folder)) == 2
-    assert set(at(folder).enrol(enrolment(), "switch").made) == EVERYONE
-    second = trusted(folder)[0]
-    assert set(trusted(folder)) == {first, second}
+    (first,) = read_trusted(folder)
+    assert not at(folder).enrol(make_enrolment(), "next").made, (
+        "everyone must trust it before it signs"
+    )
+    assert first in read_trusted(folder)
+    assert len(read_trusted(folder)) == 2
+    assert set(at(folder).enrol(make_enrolment(), "switch").made) == EVERYONE
+    second = read_trusted(folder)[0]
+    assert set(read_trusted(folder)) == {first, second}
     assert ca.is_signed_by(certificate(folder, SERVICE), second)
-    assert set(at(folder).enrol(enrolment(), "drop").kept) == EVERYONE
-    assert trusted(folder) == [second]
+    assert set(at(folder).enrol(make_enrolment(), "drop").kept) == EVERYONE
+    assert read_trusted(folder) == [second]
 
 
 def test_a_step_out_of_order_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"^ca: there is no next authority; begin with --ca next"):
-        at(folder).enrol(enrolment(), "switch")
+        at(folder).enrol(make_enrolment(), "switch")
 
 
 def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^days: the authority ends before, on 2026-04-10; "):
-        at(tmp_path, ca_days=40.0).enrol(enrolment())
+        at(tmp_path, ca_days=40.0).enrol(make_enrolment())
 
 
 def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> None:
     (folder / "authority" / "ca.key").unlink()
     with pytest.raises(InputError, match=r"lacks the authority's key; restore ca.key"):
-        at(folder).enrol(enrolment())
+        at(folder).enrol(make_enrolment())
 
 
 # A name with a wrong letter near its end: a pattern that can read the letters before in many ways
@@ -142,7 +144,7 @@ LONG = "a" * 62 + "_b"
     "host", ["a", "r-1.example.org", "127.0.0.1", "::1", "a" * 63 + ".b", "xn--bcher-kva.example."]
 )
 def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
-    assert enrolment(routers={"r-1": {"hosts": [host]}}).routers["r-1"].hosts == [host]
+    assert make_enrolment(routers={"r-1": {"hosts": [host]}}).routers["r-1"].hosts == [host]
 
 
 @pytest.mark.parametrize(
@@ -150,7 +152,7 @@ def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
 )
 def test_what_is_no_host_is_refused(host: str) -> None:
     with pytest.raises(ValueError, match="is no host name and no address"):
-        enrolment(routers={"r-1": {"hosts": [host]}})
+        make_enrolment(routers={"r-1": {"hosts": [host]}})
 
 
 @pytest.mark.parametrize(
@@ -211,13 +213,13 @@ def test_what_was_not_made_here_is_left_alone_and_no_key_is_deleted(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     other = tmp_path_factory.mktemp("other")
-    at(other).enrol(enrolment())
+    at(other).enrol(make_enrolment())
     for ending in (".pem", ".key"):
         (folder / f"nginx{ending}").write_bytes((other / f"{SERVICE}{ending}").read_bytes())
     (folder / "notes.pem").write_text("no certificate at all")
     gone = VEHICLES[0]
     key = (folder / f"{gone}.key").read_bytes()
-    assert at(folder).enrol(enrolment(vehicles=list(VEHICLES[1:]))).revoked == [gone]
+    assert at(folder).enrol(make_enrolment(vehicles=list(VEHICLES[1:]))).revoked == [gone]
     assert (folder / "nginx.pem").exists()
     assert (folder / "nginx.key").exists()
     assert (folder / "notes.pem").exists()
@@ -230,9 +232,9 @@ def test_a_list_that_is_short_by_mistake_revokes_nobody_without_a_word(
 ) -> None:
     names = [f"car-{k:03}" for k in range(6)]
     words = ["certs", "--fleet", str(tmp_path / "fleet.json"), "--out", str(tmp_path / "certs")]
-    (tmp_path / "fleet.json").write_text(enrolment(vehicles=names).model_dump_json())
+    (tmp_path / "fleet.json").write_text(make_enrolment(vehicles=names).model_dump_json())
     assert main(words) == 0
-    (tmp_path / "fleet.json").write_text(enrolment(vehicles=names[:2]).model_dump_json())
+    (tmp_path / "fleet.json").write_text(make_enrolment(vehicles=names[:2]).model_dump_json())
     capsys.readouterr()
     assert main([*words, "--dry-run"]) == 0
     assert capsys.readouterr().out == f"would revoke 4: {', '.join(names[2:])}\n"

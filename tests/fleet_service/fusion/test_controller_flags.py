@@ -24,7 +24,7 @@ def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations
     return dataclasses.replace(o, limited=limited, used=used.astype(np.float32))
 
 
-def acquainted(claims_on_dry: bool) -> Fusion:
+def make_acquainted(claims_on_dry: bool) -> Fusion:
     """Fusion after 30 minutes on dry cells.
 
     FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`; else it gives
@@ -52,12 +52,12 @@ def ice_with(fusion: Fusion, *, flag: bool) -> bool:
 
 
 def test_controller_is_the_second_witness_of_ice() -> None:
-    assert ice_with(acquainted(claims_on_dry=False), flag=True)
-    assert not ice_with(acquainted(claims_on_dry=False), flag=False)
+    assert ice_with(make_acquainted(claims_on_dry=False), flag=True)
+    assert not ice_with(make_acquainted(claims_on_dry=False), flag=False)
 
 
 def test_flag_that_is_always_on_supports_no_alert() -> None:
-    fusion = acquainted(claims_on_dry=True)
+    fusion = make_acquainted(claims_on_dry=True)
     assert fusion.standings[-1].heeded.sum() == 11
     assert not ice_with(fusion, flag=True)
 

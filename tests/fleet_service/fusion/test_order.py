@@ -37,7 +37,7 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
     )
 
 
-def delayed(o: Observations, most_s: float, seed: int) -> IntArray:
+def delay_arrivals(o: Observations, most_s: float, seed: int) -> IntArray:
     """An order of arrival in which each visit comes up to `most_s` late."""
     return np.argsort(
         o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
@@ -66,7 +66,7 @@ def difference(a: Fusion, b: Fusion) -> float:
 def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: int) -> None:
     o = drive(seed, 400, 900.0)
     straight, _ = fold_in(o, np.arange(400), 400)
-    mixed, told = fold_in(o, delayed(o, 110.0, seed), parts)
+    mixed, told = fold_in(o, delay_arrivals(o, 110.0, seed), parts)
     assert not any(updated.late.any() for _, updated in told)
     assert difference(straight, mixed) <= 1e-6
     order = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
@@ -78,7 +78,7 @@ def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: in
 
 def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     o = drive(3, 3000, 4000.0)
-    order = delayed(o, 300.0, 4)
+    order = delay_arrivals(o, 300.0, 4)
     fusion, told = fold_in(o, order, 300)
     late = np.zeros(3000, bool)
     weight = np.zeros(3000, np.float32)

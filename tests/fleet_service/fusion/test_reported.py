@@ -15,16 +15,18 @@ from schemas import mugrid
 from tests.fleet_service.examples import CELL, observations, value
 
 
-def told(mu: float, std: float = 0.05) -> np.ndarray:
+def encode_value(mu: float, std: float = 0.05) -> np.ndarray:
     """A value as bytes, (1, 32)."""
     return mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - mu) / std))[None]
 
 
 def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
     steps, reported = as_reported(
-        np.vstack([told(0.85), np.minimum(told(0.3), 200) + 7, 0 * told(0.3)])
+        np.vstack(
+            [encode_value(0.85), np.minimum(encode_value(0.3), 200) + 7, 0 * encode_value(0.3)]
+        )
     )
-    np.testing.assert_array_equal(steps[0], told(0.85)[0])
+    np.testing.assert_array_equal(steps[0], encode_value(0.85)[0])
     assert steps[1].min() == 0
     assert reported[:2, 0] == pytest.approx([0.85, 0.3], abs=0.01)
     assert reported[0, 1] == pytest.approx(

@@ -29,7 +29,7 @@ def information(p: FloatArray) -> float:
     return float(np.sum(p * np.log(np.maximum(p, 1e-300) * mugrid.BINS)))
 
 
-def told(fusion: Fusion) -> FloatArray:
+def read_beliefs(fusion: Fusion) -> FloatArray:
     """Beliefs of all cells by their own reports, (cells, 32)."""
     kept = fusion.live.belief[: fusion.size].astype(float)
     return np.asarray(kept / kept.sum(axis=1, keepdims=True))
@@ -90,8 +90,8 @@ def test_all_cells_together_learn_no_more_than_one_would(
     cells, share = space.other_cells(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
     sure.update(o)
     unsure.update(dataclasses.replace(o, other=cells, other_share=share))
-    total = sum(information(kept) for kept in told(unsure))
-    assert total <= information(told(sure)[0]) + 2e-3  # rounding of the 16 bits
+    total = sum(information(kept) for kept in read_beliefs(unsure))
+    assert total <= information(read_beliefs(sure)[0]) + 2e-3  # rounding of the 16 bits
 
 
 def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
@@ -102,7 +102,7 @@ def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
         dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32))
     )
     slots = fusion.slots_of(np.array([CELL, cells[2]]), np.zeros(2, np.int64))
-    own, beside = told(fusion)[slots]
+    own, beside = read_beliefs(fusion)[slots]
     assert information(own) > 3 * information(beside) > 0.0
     assert fusion.live.vehicles[slots].tolist() == fusion.live.visits[slots].tolist() == [1, 0]
     assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)  # a newcomer's

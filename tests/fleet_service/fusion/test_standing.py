@@ -18,7 +18,9 @@ from tests.fleet_service.examples import belief, interval, observations, value
 VEHICLES = 30
 
 
-def acquainted(slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False) -> Fusion:
+def make_acquainted(
+    slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
+) -> Fusion:
     """A fleet with gain errors after forty minutes in ten cells; a value is too low by `slope`
     for each μ left.
     """
@@ -42,17 +44,17 @@ def acquainted(slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool 
     return fusion
 
 
-def learned(fusion: Fusion) -> float:
+def learned_slope(fusion: Fusion) -> float:
     return shape_of(fusion.store.peers, fusion.standings[-1].weight).slope
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 def test_shape_is_found_from_a_vehicle_that_differs_from_itself(slope: float) -> None:
-    assert learned(acquainted(slope)) == pytest.approx(slope, abs=0.15)
+    assert learned_slope(make_acquainted(slope)) == pytest.approx(slope, abs=0.15)
 
 
 def test_shape_of_nobody_is_the_prior() -> None:
-    assert learned(Fusion(120.0)) == pytest.approx(c.SHAPE_PRIOR)
+    assert learned_slope(Fusion(120.0)) == pytest.approx(c.SHAPE_PRIOR)
 
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
@@ -60,12 +62,12 @@ def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None
     """Between vehicles such errors look like a slope of cov(value, use)/var(use) ≥ .3; within
     one they cancel.
     """
-    assert learned(acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
+    assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
 def road_after(slope: float, used: float) -> FloatArray:
     """Belief of a new cell after three values of .5 that used `used`, in a fleet of that slope."""
-    fusion = acquainted(slope)
+    fusion = make_acquainted(slope)
     o = observations(2500.0 + np.arange(3.0), np.arange(3), value(np.full(3, 0.5)), cell=70)
     fusion.update(dataclasses.replace(o, used=np.full(3, used, np.float32)))
     return belief(fusion, cell=70)
@@ -96,18 +98,18 @@ def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
-    fusion = acquainted(0.0)
+    fusion = make_acquainted(0.0)
     known = shape_of(fusion.store.peers, fusion.standings[-1].weight)
     assert known.std < 0.05
     assert known.alarm < known.reader + 0.08 < unknown.alarm - 0.2
-    steep = acquainted(0.5)
+    steep = make_acquainted(0.5)
     assert shape_of(steep.store.peers, steep.standings[-1].weight).alarm > 0.5
 
 
 def test_vehicle_with_a_record_sharpens_a_cell_and_a_newcomer_does_not() -> None:
     widths = []
     for who in (3, 999):
-        fusion = acquainted()
+        fusion = make_acquainted()
         fusion.update(observations([2500.0], [who], value([0.6], 0.04), cell=77))
         lower, upper = interval(belief(fusion, cell=77))
         widths.append(upper - lower)

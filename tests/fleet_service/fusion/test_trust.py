@@ -15,7 +15,7 @@ HONEST = np.arange(20)
 LIARS = np.arange(100, 108)
 
 
-def driven(private: int = 0) -> Fusion:
+def drive_liars(private: int = 0) -> Fusion:
     """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in
     `private` others.
     """
@@ -37,7 +37,7 @@ def driven(private: int = 0) -> Fusion:
 def test_group_that_agrees_only_with_itself_loses_its_vote(
     private: int,
 ) -> None:
-    fusion = driven(private)
+    fusion = drive_liars(private)
     assert max(fusion.trust(int(v)) for v in LIARS) < 0.1
     assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
 
@@ -45,11 +45,11 @@ def test_group_that_agrees_only_with_itself_loses_its_vote(
 def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
     assert initial_trust(False) == pytest.approx(0.75)
     assert Fusion(120.0).trust(7) == pytest.approx(initial_trust(False))
-    assert driven().trust(999) == pytest.approx(c.NEWCOMER)
+    assert drive_liars().trust(999) == pytest.approx(c.NEWCOMER)
 
 
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
-    fusion = driven()
+    fusion = drive_liars()
     n = 200
     updated = fusion.update(
         observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1)

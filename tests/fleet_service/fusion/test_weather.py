@@ -42,7 +42,7 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
     )
 
 
-def passed(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
+def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
     """Hours of road time of drift and change."""
     drift, change, _ = w.aged(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0
@@ -53,19 +53,20 @@ def test_without_a_word_about_a_region_its_roads_age_by_the_clock() -> None:
         w.weather_of(w.no_reports()),
         w.weather_of(reports((0.0, RAIN), region=REGION + 1)),
     ):
-        assert passed(weather, -5.0, 7.0) == pytest.approx((12.0, 12.0))
+        assert compute_road_time(weather, -5.0, 7.0) == pytest.approx((12.0, 12.0))
 
 
 def test_road_time_integrates_the_weather_until_a_report_expires() -> None:
     weather = w.weather_of(reports((0.0, RAIN), (1.0, FREEZING), (2.0, STEADY)))
-    assert passed(weather, -1.0, 0.0) == pytest.approx((1.0, 1.0))
-    assert passed(weather, 0.0, 1.0) == pytest.approx((w.WET_DRIFT, w.WET_CHANGE))
-    assert passed(weather, 1.0, 2.0) == pytest.approx((w.WET_DRIFT, w.FREEZING_CHANGE))
-    assert passed(weather, 2.0, 5.0) == pytest.approx((3.0, 3.0 * w.STEADY_CHANGE))
-    assert passed(weather, 5.0, 9.0) == pytest.approx((4.0, 4.0))
-    whole = [passed(weather, -1.0, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
+    assert compute_road_time(weather, -1.0, 0.0) == pytest.approx((1.0, 1.0))
+    assert compute_road_time(weather, 0.0, 1.0) == pytest.approx((w.WET_DRIFT, w.WET_CHANGE))
+    assert compute_road_time(weather, 1.0, 2.0) == pytest.approx((w.WET_DRIFT, w.FREEZING_CHANGE))
+    assert compute_road_time(weather, 2.0, 5.0) == pytest.approx((3.0, 3.0 * w.STEADY_CHANGE))
+    assert compute_road_time(weather, 5.0, 9.0) == pytest.approx((4.0, 4.0))
+    whole = [compute_road_time(weather, -1.0, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
     parts = [
-        passed(weather, -1.0, 0.3)[1] + passed(weather, 0.3, t)[1] for t in (0.5, 1.5, 2.5, 9.0)
+        compute_road_time(weather, -1.0, 0.3)[1] + compute_road_time(weather, 0.3, t)[1]
+        for t in (0.5, 1.5, 2.5, 9.0)
     ]
     assert whole == pytest.approx(parts)
 

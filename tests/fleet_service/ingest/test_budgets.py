@@ -166,11 +166,11 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
     synced = []
     fsync = os.fsync
 
-    def noted(handle: int) -> None:
+    def record_sync(handle: int) -> None:
         synced.append(Path(f"/proc/self/fd/{handle}").readlink().suffix)
         fsync(handle)
 
-    monkeypatch.setattr("os.fsync", noted)
+    monkeypatch.setattr("os.fsync", record_sync)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([message(batch("car-000", 1, now, [0.8, 0.8]))], now)
         assert ".witnesses" not in synced

@@ -75,11 +75,11 @@ def test_start_opens_each_waiting_segment_twice_whatever_their_number(
     opened: Counter[str] = Counter()
     begin = pq.ParquetFile.__init__
 
-    def counted(self: pq.ParquetFile, path: Path, **options: Any) -> None:  # noqa: ANN401
+    def count_open(self: pq.ParquetFile, path: Path, **options: Any) -> None:  # noqa: ANN401
         opened[Path(path).name] += 1
         begin(self, path, **options)
 
-    monkeypatch.setattr(pq.ParquetFile, "__init__", counted)
+    monkeypatch.setattr(pq.ParquetFile, "__init__", count_open)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.size == 1
     assert len(opened) >= segments
@@ -90,7 +90,7 @@ def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) ->
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         intake = engine.intake.batches
 
-        def known(seq: int, now: int) -> list[tuple[str, int, int, int]]:
+        def list_known(seq: int, now: int) -> list[tuple[str, int, int, int]]:
             sent = batch("car-1", seq, now, [0.8])
             engine.intake.ingest(
                 [Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now
@@ -98,9 +98,9 @@ def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) ->
             engine.settlement.flush()
             return list(intake._known[Kind.OBSERVATION])
 
-        (first,) = known(1, NOW)
-        (again,) = known(2, NOW + 1000 * SECOND)
+        (first,) = list_known(1, NOW)
+        (again,) = list_known(2, NOW + 1000 * SECOND)
         assert again is first
-        (later,) = known(3, NOW + 3 * 86_400 * SECOND)
+        (later,) = list_known(3, NOW + 3 * 86_400 * SECOND)
         assert later == (*first[:3], first[3] + 3)
         assert engine.counts[Kind.OBSERVATION] == 3

@@ -20,7 +20,7 @@ from schemas.wire import Kind
 from schemas.wire.batches import Head
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
-from tests.secured import enrolment
+from tests.secured import make_enrolment
 from tests.waiting import matched, until
 
 RATE = 10_000.0
@@ -116,7 +116,7 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     file = tmp_path / "fleet.json"
-    file.write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+    file.write_text(make_enrolment(vehicles=["car-1"]).model_dump_json())
     with running(
         router, tmp_path / "archive", fleet=file, vehicle_kb_s=1.0, vehicle_burst_kb=64.0
     ) as run:

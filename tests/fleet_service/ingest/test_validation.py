@@ -49,7 +49,7 @@ class Desk:
             len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values()
         )
 
-    def rejected(self) -> list[tuple[int, int, str]]:
+    def list_rejected(self) -> list[tuple[int, int, str]]:
         return [
             r
             for _, ack in self.acks.messages()
@@ -117,7 +117,7 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
         == 0
     )
     assert desk.counts == {f"refused.{rule}": 1}
-    ((seq, row, reason),) = desk.rejected()
+    ((seq, row, reason),) = desk.list_rejected()
     assert (seq, row) == (1, 0)
     assert ": " in reason
     assert "; " in reason
@@ -162,14 +162,16 @@ def test_a_bad_batch_among_good_ones_is_refused_alone(desk: Desk) -> None:
     bad = batch("sim-002", 1, NOW - SECOND, [0.8, 0.7], speed=[1.0, 1e9])
     assert desk.take(message(good()), message(bad), message(good(vehicle="sim-003"))) == 4
     assert desk.counts == {"refused.speed": 1}
-    assert desk.rejected() == [(1, 1, "speed: lies outside [0, 100]; correct it at the source")]
+    assert desk.list_rejected() == [
+        (1, 1, "speed: lies outside [0, 100]; correct it at the source")
+    ]
 
 
 def test_a_refused_batch_that_comes_again_is_refused_again(desk: Desk) -> None:
     bad = batch("sim-001", 1, NOW - SECOND, [0.8], speed=[1e9])
     for _ in range(2):
         assert desk.take(message(bad)) == 0
-        assert len(desk.rejected()) == 1
+        assert len(desk.list_rejected()) == 1
 
 
 def test_a_batch_is_admitted_once_however_often_and_wherever_it_comes(desk: Desk) -> None:
@@ -221,12 +223,12 @@ def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> No
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]
     assert desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString())) == 0
-    ((seq, row, reason),) = desk.rejected()
+    ((seq, row, reason),) = desk.list_rejected()
     assert (seq, row) == (7, -1)
     assert reason.startswith("mu: has 1 records")
     assert desk.counts["refused.mu"] == 1
     pb.vehicle = "sim-002"  # on another's key: whose it is, is not known
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString()))
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), b"\xff" * 40))
-    assert desk.rejected() == []
+    assert desk.list_rejected() == []
     assert desk.counts["refused.payload"] == 1

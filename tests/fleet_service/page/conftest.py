@@ -78,7 +78,7 @@ def drive(session: zenoh.Session, page: RunningPage) -> Drive:
         before = page.service.service.engine.counts[Kind.OBSERVATION]
         named = parts or tuple(street.PARTS)
         seq = street.put(session, named, time.time_ns(), seq)
-        wanted = before + street.known(*named) * len(street.CARS)
+        wanted = before + street.count_known(*named) * len(street.CARS)
         until(
             lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] >= wanted
         )

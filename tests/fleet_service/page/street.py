@@ -121,6 +121,6 @@ def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
     return np.array(cell, np.int64), np.array(sector, np.int64), np.array(mu)
 
 
-def known(*parts: str) -> int:
+def count_known(*parts: str) -> int:
     """Return the number of cells and headings on the map after parts were driven."""
     return sum(len(cells(PARTS[name])) * len(PARTS[name].headings) for name in parts or PARTS)

@@ -18,7 +18,7 @@ from fleet_service.page.basemap import OWN, ZOOMS, BaseMap, TileFile, base_map
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
-from tests.browser import opened
+from tests.browser import open_page
 from tests.fleet_service.page.conftest import page_of
 from tests.fleet_service.page.test_page import READY, waits
 from tests.fleet_service.page.test_server import ask
@@ -114,7 +114,7 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,
-        opened(address) as seen,
+        open_page(address) as seen,
     ):
         seen.page.wait_for_selector(READY, state="attached")
         go = "([x, y, zoom]) => gripmap.view.go(gripmap.view.x = x, gripmap.view.y = y, zoom)"

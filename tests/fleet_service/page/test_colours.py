@@ -18,7 +18,7 @@ from schemas.runtime.palette import (
     LITTLE,
     TWO,
 )
-from tests.sight import SIGHTS, difference, lab
+from tests.sight import SIGHTS, colour_difference, to_lab
 
 LEAST = 10.0
 STEP = 5.0  # of lightness between two classes that follow each other in danger
@@ -38,7 +38,11 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 ) -> None:
     assert len(set(palette)) == 8
     assert (
-        min(difference(lab(a, sight), lab(b, sight)) for a, b in combinations(palette, 2)) >= LEAST
+        min(
+            colour_difference(to_lab(a, sight), to_lab(b, sight))
+            for a, b in combinations(palette, 2)
+        )
+        >= LEAST
     )
 
 
@@ -48,7 +52,7 @@ def test_lightness_is_the_order_of_danger(sight: str) -> None:
     shows the same.
     """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
-        light = [sign * float(lab(colour, sight)[0]) for colour in ladder]
+        light = [sign * float(to_lab(colour, sight)[0]) for colour in ladder]
         assert min(b - a for a, b in pairwise(light)) >= STEP
 
 

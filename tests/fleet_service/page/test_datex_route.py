@@ -106,13 +106,13 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
 def pull(address: str) -> Callable[[], bytes]:
     """Return the page's answer; NOTHING while it has none yet."""
 
-    def pulled() -> bytes:
+    def fetch_publication() -> bytes:
         status, headers, body = ask(address, ROUTE)
         assert status in (200, 503)
         assert status == 503 or headers["content-type"].startswith("application/xml")
         return body if status == 200 else NOTHING
 
-    return pulled
+    return fetch_publication
 
 
 @pytest.mark.campaign

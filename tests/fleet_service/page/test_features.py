@@ -38,7 +38,7 @@ def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 g
     return geopandas.read_parquet(out)
 
 
-def told(page: RunningPage, path: str) -> dict[str, Any]:
+def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
     """A document, which must be there."""
     status, headers, body = ask(page.address, path)
     assert status == 200, body
@@ -47,11 +47,11 @@ def told(page: RunningPage, path: str) -> dict[str, Any]:
     return found
 
 
-def drawn(page: RunningPage, drive: Drive, *parts: str) -> None:
+def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
     """Parts are driven, and the page knows of it."""
     before = count(page)
     drive(*parts)
-    until(lambda: count(page) >= before + street.known(*parts))
+    until(lambda: count(page) >= before + street.count_known(*parts))
 
 
 def count(page: RunningPage) -> int:
@@ -65,13 +65,13 @@ def count(page: RunningPage) -> int:
 def test_readers_of_others_open_it_and_see_bounds_without_a_value(
     page: RunningPage, drive: Drive, reader: str, tmp_path: Path
 ) -> None:
-    drawn(page, drive, "passed", "ice")
+    drive_parts(page, drive, "passed", "ice")
     found = opened_by(reader, page.address, tmp_path)
-    assert len(found) == street.known("passed", "ice")
+    assert len(found) == street.count_known("passed", "ice")
     assert found.crs.to_epsg() == 4326
     measured = found[found["basis"] == "measured"]
     bound = found[found["basis"] == "bound"]
-    assert (len(measured), len(bound)) == (street.known("ice"), street.known("passed"))
+    assert (len(measured), len(bound)) == (street.count_known("ice"), street.count_known("passed"))
     assert bound["mu"].isna().all()
     assert measured["mu"].astype(float).between(0.1, 0.25).all()
     assert measured.geometry.is_valid.all()
@@ -83,7 +83,7 @@ def test_readers_of_others_open_it_and_see_bounds_without_a_value(
 def test_mu_is_a_number_also_to_who_sees_only_bounds_first(
     page: RunningPage, drive: Drive, tmp_path: Path
 ) -> None:
-    drawn(page, drive, "passed")
+    drive_parts(page, drive, "passed")
     found = opened_by("GDAL", page.address, tmp_path)
     assert found["mu"].dtype == np.float64
     assert found["vehicles"].dtype.kind == "i"
@@ -92,53 +92,58 @@ def test_mu_is_a_number_also_to_who_sees_only_bounds_first(
 def test_pages_follow_each_other_and_nothing_is_there_twice(
     page: RunningPage, drive: Drive
 ) -> None:
-    drawn(page, drive, "ice", "wet")
+    drive_parts(page, drive, "ice", "wet")
     found = []
     path = f"{ITEMS}?limit=7"
     pages = 0
     while path:
-        answer = told(page, path)
+        answer = fetch_document(page, path)
         assert answer["numberReturned"] == len(answer["features"]) <= 7
         found += [one["id"] for one in answer["features"]]
         path = next(
             (link["href"] for link in answer["links"] if link["rel"] == "next"), ""
         ).removeprefix(page.address[:-1])
         pages += 1
-    assert pages == -(-street.known("ice", "wet") // 7)
-    assert len(set(found)) == len(found) == street.known("ice", "wet")
-    one = told(page, f"{ITEMS}/{found[3]}")
+    assert pages == -(-street.count_known("ice", "wet") // 7)
+    assert len(set(found)) == len(found) == street.count_known("ice", "wet")
+    one = fetch_document(page, f"{ITEMS}/{found[3]}")
     assert one["id"] == found[3]
     assert one["properties"]["vehicles"] == len(street.CARS)
 
 
 def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
-    drawn(page, drive, "ice", "avenue")
+    drive_parts(page, drive, "ice", "avenue")
     west, south, east, north = (
         float(v) for v in grid.bounds(int(street.cells(street.PARTS["ice"])[2]))
     )
-    inside = told(page, f"{ITEMS}?bbox={west + 1e-7},{south + 1e-7},{east - 1e-7},{north - 1e-7}")
+    inside = fetch_document(
+        page, f"{ITEMS}?bbox={west + 1e-7},{south + 1e-7},{east - 1e-7},{north - 1e-7}"
+    )
     assert {one["properties"]["cell"] for one in inside["features"]} == {
         int(street.cells(street.PARTS["ice"])[2])
     }
-    assert told(page, f"{ITEMS}?bbox={west + 9},{south},{east + 9},{north}")["features"] == []
+    assert (
+        fetch_document(page, f"{ITEMS}?bbox={west + 9},{south},{east + 9},{north}")["features"]
+        == []
+    )
 
 
 def test_a_time_is_the_map_of_then_and_an_interval_what_was_observed_in_it(
     page: RunningPage, drive: Drive
 ) -> None:
-    drawn(page, drive, "ice")
+    drive_parts(page, drive, "ice")
     time.time_ns()
     now = _text(time.time())
     later = _text(time.time() + 3600)
-    drawn(page, drive, "wet")
-    everything = told(page, ITEMS)["features"]
-    assert len(told(page, f"{ITEMS}?datetime=../..")["features"]) == len(everything)
-    assert len(told(page, f"{ITEMS}?datetime={later}")["features"]) == len(everything)
+    drive_parts(page, drive, "wet")
+    everything = fetch_document(page, ITEMS)["features"]
+    assert len(fetch_document(page, f"{ITEMS}?datetime=../..")["features"]) == len(everything)
+    assert len(fetch_document(page, f"{ITEMS}?datetime={later}")["features"]) == len(everything)
     newest = {one["properties"]["last_time"] for one in everything}
     middle = sorted(newest)[len(newest) // 2]
-    since = told(page, f"{ITEMS}?datetime={middle}/..")["features"]
+    since = fetch_document(page, f"{ITEMS}?datetime={middle}/..")["features"]
     assert {one["properties"]["last_time"] for one in since} == {t for t in newest if t >= middle}
-    then = {one["id"] for one in told(page, f"{ITEMS}?datetime={now}")["features"]}
+    then = {one["id"] for one in fetch_document(page, f"{ITEMS}?datetime={now}")["features"]}
     assert then < {one["id"] for one in everything}
 
 
@@ -155,10 +160,10 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
     }
     for link in found["links"]:
         assert ask(page.address, link["href"].removeprefix(page.address[:-1]))[0] == 200
-    assert told(page, "/conformance")["conformsTo"] == list(CONFORMANCE)
-    (one,) = told(page, "/collections")["collections"]
-    assert one["id"] == told(page, "/collections/grip")["id"] == "grip"
-    paths = told(page, "/api")["paths"]
+    assert fetch_document(page, "/conformance")["conformsTo"] == list(CONFORMANCE)
+    (one,) = fetch_document(page, "/collections")["collections"]
+    assert one["id"] == fetch_document(page, "/collections/grip")["id"] == "grip"
+    paths = fetch_document(page, "/api")["paths"]
     assert set(paths) >= {
         "/",
         "/conformance",
@@ -198,6 +203,6 @@ def test_no_service_is_no_empty_map(bare: str) -> None:
 
 
 def test_no_visit_is_no_feature(page: RunningPage, drive: Drive) -> None:
-    drawn(page, drive, "ice")
+    drive_parts(page, drive, "ice")
     nobody = int(street.cells(street.PARTS["dry"])[0])
     assert ask(page.address, f"{ITEMS}/{nobody}-0")[0] == 404

@@ -17,7 +17,7 @@ from fleet_service.archive.format import snapshots
 from fleet_service.page import colours
 from schemas import grid
 from schemas.runtime import palette
-from tests.browser import Opened, opened
+from tests.browser import Opened, open_page
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage
 from tests.structure import ROOT
@@ -35,11 +35,11 @@ def look(seen: Opened, name: str) -> None:
 
 
 @contextmanager
-def shown(
+def open_map(
     page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False
 ) -> Iterator[Opened]:
     """The page, when it is ready; no foreign request and nothing on the console when it is left."""
-    with opened(page.address + state, phone=phone) as seen:
+    with open_page(page.address + state, phone=phone) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         yield seen
         foreign = [
@@ -92,14 +92,16 @@ def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("dry", "snow", "ice", "wet", "passed", "avenue")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"), 17.2)
-        waits(seen, f"document.body.dataset.drawn === '{street.known()}'")
+        waits(seen, f"document.body.dataset.drawn === '{street.count_known()}'")
         found = kinds(seen)
-        assert found[ICE] == street.known("ice")
-        assert found[SNOW] + found[RATHER] == street.known("snow")
-        assert found[HOLLOW] == street.known("passed")
-        assert sum(found[WET : DRY + 1]) + found[RATHER_NOT] == street.known("wet", "dry", "avenue")
+        assert found[ICE] == street.count_known("ice")
+        assert found[SNOW] + found[RATHER] == street.count_known("snow")
+        assert found[HOLLOW] == street.count_known("passed")
+        assert sum(found[WET : DRY + 1]) + found[RATHER_NOT] == street.count_known(
+            "wet", "dry", "avenue"
+        )
         look(seen, "near")
         ice = palette.FOUR[0]
         named = ",".join(str(int(ice[k : k + 2], 16)) for k in (1, 3, 5))
@@ -135,7 +137,7 @@ _COLOURED: Final = """() => {
 
 def test_the_first_picture_that_is_painted_has_cells(page: RunningPage, drive: Drive) -> None:
     drive("ice")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         seen.page.add_init_script(_PAINTED)
         seen.page.reload()
         seen.page.wait_for_selector(READY, state="attached")
@@ -152,7 +154,7 @@ _PAINTED: Final = """
 
 def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive) -> None:
     drive()
-    with shown(page) as seen:
+    with open_map(page) as seen:
         for zoom, level in ((12.0, 18), (6.0, 14)):
             near(seen, cell_of("ice"), zoom)
             waits(
@@ -171,7 +173,7 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
     triples = [
         (mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)
     ]
-    with shown(page) as seen:
+    with open_map(page) as seen:
         there: list[int] = seen.page.evaluate(
             "async triples => { const { kindOf, setColours } = await import('/static/colours.js'); "
             "setColours(gripmap.settings); return triples.map(([m, l, u]) => kindOf(1, m, l, u)) }",
@@ -193,9 +195,9 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice", "passed")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('[data-value=observations]').length === 2")
         told = read(seen, street.EAST)
@@ -235,12 +237,12 @@ def _place(part: str) -> str:
 def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
     page: RunningPage, drive: Drive
 ) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "gripmap.live.state")
         drive("ice")
         waits(seen, "document.body.dataset.alerts === '1'")
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         waits(seen, "document.getElementById('live').dataset.state === 'live'")
         seen.page.locator("#tab-alerts").click()
         said = seen.page.locator("[data-alert]").inner_text()
@@ -250,7 +252,7 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         assert not seen.page.evaluate("gripmap.show.sound"), "off unless it was asked for"
         seen.page.evaluate("gripmap.view.go(.1, .1, 5)")
         seen.page.get_by_role("button", name="show on the map").click()
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         look(seen, "alerts")
 
 
@@ -258,7 +260,7 @@ def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "document.getElementById('live').dataset.state === 'live'")
         assert page.service is not None
@@ -266,13 +268,13 @@ def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
         waits(seen, "!document.getElementById('away').hidden")
         waits(seen, "document.getElementById('live').dataset.state === 'late'")
         assert "No service for 1 region" in seen.page.locator("#away").inner_text()
-        assert kinds(seen)[ICE] == street.known("ice")
+        assert kinds(seen)[ICE] == street.count_known("ice")
         look(seen, "away")
 
 
 @pytest.mark.campaign
 def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         waits(seen, "gripmap.live.state")
         seen.page.evaluate("gripmap.live.source.close()")  # no error event comes of that
         waits(seen, "document.getElementById('live').textContent.startsWith('○ last heard')")
@@ -283,20 +285,20 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("snow")
-    until(lambda: kept(page.archive))
-    before = kept(page.archive)[-1]
+    until(lambda: list_snapshots(page.archive))
+    before = list_snapshots(page.archive)[-1]
     drive("ice")
-    until(lambda: kept(page.archive)[-1] > before + 1)
-    with shown(page) as seen:
+    until(lambda: list_snapshots(page.archive)[-1] > before + 1)
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.evaluate(
             "at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before
         )
         waits(seen, f"document.body.dataset.at === '{before}'")
         assert kinds(seen)[ICE] == 0
-        assert sum(kinds(seen)) == street.known("snow")
+        assert sum(kinds(seen)) == street.count_known("snow")
         assert seen.page.locator("#live").inner_text().startswith("▮▮ showing 20")
         seen.page.evaluate("gripmap.timeline.put(null); gripmap.timeline.chosen()")
         waits(seen, "document.body.dataset.at === 'now'")
@@ -308,7 +310,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
         look(seen, "compare")
 
 
-def kept(archive: Path) -> list[int]:
+def list_snapshots(archive: Path) -> list[int]:
     """The moments of the snapshots."""
     return sorted(
         snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")
@@ -329,7 +331,7 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
     gpx.write_text(
         f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
     )
-    with shown(page) as seen:
+    with open_map(page) as seen:
         seen.page.locator("#tab-route").click()
         seen.page.locator("#gpx").set_input_files(gpx)
         waits(seen, "document.getElementById('route-share')")
@@ -359,15 +361,15 @@ _FITTED: Final = """(() => {
 @pytest.mark.campaign
 def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"), 18.5)
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         seen.page.locator("#map").click()
         seen.page.locator("#tab-legend").click()
         seen.page.locator("#show-bounds").click()
         seen.page.locator("#tab-share").click()
         link = seen.page.locator("#link").input_value()
-    with shown(page, link.removeprefix(page.address)) as again:
+    with open_map(page, link.removeprefix(page.address)) as again:
         waits(again, "gripmap.chosen")
         state: dict[str, Any] = again.page.evaluate(
             "({ x: gripmap.view.x, zoom: gripmap.view.zoom, tab: gripmap.tab, bounds: "
@@ -379,19 +381,23 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
         with again.page.expect_download() as waiting:
             again.page.locator("#geojson").click()
         features = json.loads(Path(waiting.value.path()).read_text())["features"]
-        assert len(features) == street.known("ice")
+        assert len(features) == street.count_known("ice")
         assert all(one["properties"]["basis"] == "measured" for one in features)
         with again.page.expect_download() as waiting:
             again.page.locator("#csv").click()
-        assert len(Path(waiting.value.path()).read_text().splitlines()) == street.known("ice") + 1
+        assert (
+            len(Path(waiting.value.path()).read_text().splitlines())
+            == street.count_known("ice") + 1
+        )
 
 
 def test_a_file_that_leaves_has_no_mu_for_a_bound(page: RunningPage, drive: Drive) -> None:
     drive("passed")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("passed", 3), 17)
         waits(
-            seen, f"document.body.dataset.kinds?.split(',')[{HOLLOW}] == {street.known('passed')}"
+            seen,
+            f"document.body.dataset.kinds?.split(',')[{HOLLOW}] == {street.count_known('passed')}",
         )
         seen.page.locator("#tab-share").click()
         with seen.page.expect_download() as waiting:
@@ -400,13 +406,13 @@ def test_a_file_that_leaves_has_no_mu_for_a_bound(page: RunningPage, drive: Driv
             one["properties"]
             for one in json.loads(Path(waiting.value.path()).read_text())["features"]
         ]
-        assert len(rows) == street.known("passed")
+        assert len(rows) == street.count_known("passed")
         assert all(row["mu"] is None and row["basis"] == "bound" for row in rows)
 
 
 def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
     drive("ice")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         waits(seen, "document.body.dataset.alerts === '1'")
         for _ in range(20):
             seen.page.keyboard.press("Tab")
@@ -414,7 +420,7 @@ def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
                 break
         assert seen.page.evaluate("document.activeElement.id") == "map"
         seen.page.keyboard.press("a")
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         for key in ("ArrowLeft", "ArrowRight", "+", "-", "Enter"):
             seen.page.keyboard.press(key)
         waits(seen, "document.querySelector('[data-value=basis]')?.textContent === 'measured'")
@@ -427,7 +433,7 @@ def test_a_phone_shows_map_and_words_without_scrolling_sideways(
     page: RunningPage, drive: Drive
 ) -> None:
     drive()
-    with shown(page, phone=True) as seen:
+    with open_map(page, phone=True) as seen:
         near(seen, cell_of("ice"), 17)
         waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
         size = seen.page.evaluate(

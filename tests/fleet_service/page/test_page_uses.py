@@ -13,7 +13,16 @@ from schemas import grid
 from tests.browser import Opened
 from tests.fleet_service.page import scan, street
 from tests.fleet_service.page.conftest import Drive, RunningPage
-from tests.fleet_service.page.test_page import ICE, cell_of, kept, kinds, look, near, shown, waits
+from tests.fleet_service.page.test_page import (
+    ICE,
+    cell_of,
+    kinds,
+    list_snapshots,
+    look,
+    near,
+    open_map,
+    waits,
+)
 from tests.waiting import until
 
 WALL: Final = {"width": 3840, "height": 2160}
@@ -36,13 +45,13 @@ _DROP: Final = """text => {
 @pytest.mark.campaign
 def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, drive: Drive) -> None:
     drive("snow")
-    until(lambda: kept(page.archive))
-    first = kept(page.archive)[0]
+    until(lambda: list_snapshots(page.archive))
+    first = list_snapshots(page.archive)[0]
     drive("ice")
-    until(lambda: kept(page.archive)[-1] > first + 2)
-    with shown(page) as seen:
+    until(lambda: list_snapshots(page.archive)[-1] > first + 2)
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         seen.page.evaluate(
             "() => { globalThis.played = []; new MutationObserver(() => "
             "played.push([document.body.dataset.at, "
@@ -65,14 +74,14 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
             "a moment from memory may come before the first snapshot"
         )
         ice = [int(drawn.split(",")[ICE]) for _, drawn in played]
-        assert (ice[0], ice[-1]) == (0, street.known("ice"))
+        assert (ice[0], ice[-1]) == (0, street.count_known("ice"))
         waits(seen, "gripmap.timeline.timer === null")
 
 
 def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
     page: RunningPage, drive: Drive
 ) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         silent = seen.page.context.new_page()
         silent.goto(page.address)
         silent.wait_for_selector("body[data-ready]", state="attached")
@@ -94,9 +103,9 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice", "dry")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"), 17)
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         seen.page.emulate_media(media="print")
         seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
         assert re.fullmatch(
@@ -126,7 +135,7 @@ def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:
     points = "".join(
         f'<rtept lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east)
     )
-    with shown(page) as seen:
+    with open_map(page) as seen:
         gpx = f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><rte>{points}</rte></gpx>'
         assert seen.page.evaluate(_DROP, gpx), "the browser does not open it instead"
         waits(seen, "document.getElementById('route-share')")
@@ -138,10 +147,10 @@ def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(
     page: RunningPage, drive: Drive
 ) -> None:
     drive()
-    with shown(page) as seen:
+    with open_map(page) as seen:
         seen.page.set_viewport_size(WALL)  # type: ignore[arg-type]
         near(seen, cell_of("ice"), 18.5)
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         waits(seen, f"document.getElementById('map').width > {WALL['width'] // 2}")
         size = seen.page.evaluate(
             "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, "
@@ -162,7 +171,7 @@ def test_axe_finds_nothing_serious_in_any_panel(
     page: RunningPage, drive: Drive, phone: bool
 ) -> None:
     drive("ice", "passed", "dry")
-    with shown(page, phone=phone) as seen:
+    with open_map(page, phone=phone) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "document.body.dataset.alerts === '1'")
         _choose(seen, cell_of("ice"))
@@ -173,7 +182,7 @@ def test_axe_finds_nothing_serious_in_any_panel(
 
 
 def test_axe_would_see_a_button_without_a_name(page: RunningPage) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         seen.page.evaluate(
             "document.getElementById('controls').append(document.createElement('button'))"
         )

@@ -11,7 +11,7 @@ import pytest
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.runtime import palette
-from tests.browser import opened
+from tests.browser import open_page
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
 from tests.fleet_service.page.test_page import (
@@ -22,7 +22,7 @@ from tests.fleet_service.page.test_page import (
     cell_of,
     look,
     near,
-    shown,
+    open_map,
     waits,
 )
 
@@ -57,7 +57,7 @@ _ALL: Final = """() => {
 
 
 def test_unknown_share_shows_in_the_smallest_square(page: RunningPage) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         for side in (3.3, 4.0, 4.7, 5.6, 7.9, 12.2):
             for unknown in (1, 60, 127, 253):
                 edge, most, white, whole = seen.page.evaluate(_ROW, [side, 1.3, unknown])
@@ -68,7 +68,7 @@ def test_unknown_share_shows_in_the_smallest_square(page: RunningPage) -> None:
 
 
 def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> None:
-    with shown(page) as seen:
+    with open_map(page) as seen:
         for side in (3.25, 4.1, 7.75, 7.5, 10.0 / 3.0):
             for first in (0.5, 1.25, 2.0 + 1e-9, 0.5 - 1e-9):
                 assert seen.page.evaluate(_ROW, [side, first, 0])[2] == 0, (side, first)
@@ -79,10 +79,12 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
 ) -> None:
     """Paint a tile that has changed since it was first received."""
     drive("dry")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
         drive("ice")
-        waits(seen, f"document.body.dataset.kinds?.split(',')[{ICE}] >= {street.known('ice')}")
+        waits(
+            seen, f"document.body.dataset.kinds?.split(',')[{ICE}] >= {street.count_known('ice')}"
+        )
         assert seen.page.evaluate(
             "[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)"
         )
@@ -107,7 +109,7 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
         [float(v) for v in reversed(grid.centre(street.cells(street.PARTS["ice"])[k]))]
         for k in (0, 4)
     ]
-    with shown(page) as seen:
+    with open_map(page) as seen:
         for zoom in (16.0, 18.0):
             near(seen, cell_of("ice", 2), zoom)
             waits(
@@ -129,7 +131,7 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
 
 
 def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) -> None:
-    with opened(bare) as seen:
+    with open_page(bare) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         waits(seen, "gripmap.live.state && !gripmap.frame")
         waits(seen, f"({_ALL})() > 10000")
@@ -138,10 +140,10 @@ def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) 
 
 def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, drive: Drive) -> None:
     drive("ice")
-    with shown(page) as seen:
+    with open_map(page) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "document.body.dataset.alerts === '1'")
-        waits(seen, f"document.body.dataset.kinds.split(',')[{ICE}] == {street.known('ice')}")
+        waits(seen, f"document.body.dataset.kinds.split(',')[{ICE}] == {street.count_known('ice')}")
         seen.page.evaluate("gripmap.alerts[0].headings = ['west']")
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('.heading').length === 2")
@@ -157,7 +159,7 @@ def test_words_stand_beside_what_they_name_on_every_screen(
     router: ZenohSettings, width: int
 ) -> None:
     size: Any = {"width": width, "height": 900}
-    with page_of(router) as address, opened(address) as seen:
+    with page_of(router) as address, open_page(address) as seen:
         seen.page.set_viewport_size(size)
         seen.page.wait_for_selector(READY, state="attached")
         seen.page.locator("#tab-legend").click()

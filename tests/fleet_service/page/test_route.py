@@ -19,7 +19,7 @@ from tests.fleet_service.examples import START, at_least, observations, value
 from tests.fleet_service.page import street
 
 
-def told() -> pa.Table:
+def make_ice_table() -> pa.Table:
     """Ice for five cells eastward, then cells that were only passed."""
     ice = street.cells(street.PARTS["ice"])
     passed = street.cells(street.PARTS["passed"])
@@ -45,7 +45,7 @@ def shares(found: dict[str, Any]) -> dict[str, float]:
 
 
 def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
-    found = profile(ends(-20, 30), told())
+    found = profile(ends(-20, 30), make_ice_table())
     stretches = found["stretches"]
     assert stretches[0]["from_m"] == 0.0
     assert stretches[-1]["to_m"] == pytest.approx(found["length_m"], abs=0.1)
@@ -65,7 +65,7 @@ def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
 
 
 def test_the_other_direction_is_another_road() -> None:
-    found = profile(ends(10, -10), told())
+    found = profile(ends(10, -10), make_ice_table())
     assert found["share"]["unknown"] == pytest.approx(1.0)
     assert found["worst"] is None
 

@@ -181,7 +181,7 @@ def test_who_connects_is_told_what_stands_and_then_what_changes(
         count = HEAD.unpack_from(body, at)[3]
         heads = heads + count
         at = at + HEAD.size + (13 * count + 3) // 4 * 4
-    assert heads >= street.known("ice")
+    assert heads >= street.count_known("ice")
 
 
 def test_an_alert_reaches_who_listens_with_its_reason(page: RunningPage, drive: Drive) -> None:
@@ -236,11 +236,11 @@ def test_one_cell_is_told_as_the_service_has_it(page: RunningPage, drive: Drive)
     drive("ice", "passed")
     ice, passed = (int(street.cells(street.PARTS[name])[1]) for name in ("ice", "passed"))
 
-    def reported() -> dict[str, Any]:
+    def fetch_cell() -> dict[str, Any]:
         return dict(json.loads(ask(page.address, f"/cell/{ice}/{street.EAST}")[2]) or {})
 
-    until(lambda: reported().get("observations") == len(street.CARS))  # all cars are on the map
-    told = reported()
+    until(lambda: fetch_cell().get("observations") == len(street.CARS))  # all cars are on the map
+    told = fetch_cell()
     assert told["mu_lower"] < told["mu"] < 0.25
     assert told["safe_speed"]["50"] < told["safe_speed"]["100"] < 15.0
     assert told["observations"] == len(street.CARS)

@@ -12,11 +12,11 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
 from schemas.errors import InputError
-from tests.fleet_service.fusion.test_order import LATENESS_S, delayed, drive
+from tests.fleet_service.fusion.test_order import LATENESS_S, delay_arrivals, drive
 from tests.fleet_service.fusion.test_weather import RAIN, reports
 
 
-def stored(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
+def store_tables(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
     """Written as Parquet and read again."""
     out = {}
     for name, table in tables.items():
@@ -29,11 +29,11 @@ def stored(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
 @pytest.mark.parametrize("cut", [0, 1, 700, 1500])
 def test_fusion_from_its_checkpoint_continues_bit_for_bit(cut: int) -> None:
     o = drive(11, 1500, 8.0 * 3600.0)  # longer than vehicles are remembered
-    order = delayed(o, 100.0, 12)
+    order = delay_arrivals(o, 100.0, 12)
     whole = Fusion(LATENESS_S)
     whole.update_weather(reports((0.5, RAIN)))
     whole.update(o.take(order[:cut]))
-    again = fusion_from(stored(tables_of(whole)), LATENESS_S)
+    again = fusion_from(store_tables(tables_of(whole)), LATENESS_S)
     for part in np.array_split(order[cut:], 9):
         for fusion in (whole, again):
             fusion.update(o.take(part))

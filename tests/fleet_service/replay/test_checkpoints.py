@@ -53,12 +53,12 @@ def keep(engine: Engine, root: Path) -> Path:
     thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(stop)))
     thread.start()
 
-    def settled() -> bool:
+    def is_taken() -> bool:
         engine.settlement.flush()
         return bool(taken)
 
     try:
-        until(settled)
+        until(is_taken)
     finally:
         stop.set()
         thread.join()
@@ -79,12 +79,12 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     rows: list[int] = []
     in_order: Callable[..., Iterable[pa.Table]] = rebuild.in_order
 
-    def counted(listing: reading.Listing, most: int | None) -> list[pa.Table]:
+    def count_rows(listing: reading.Listing, most: int | None) -> list[pa.Table]:
         found = list(in_order(listing, most))
         rows.append(sum(table.num_rows for table in found))
         return found
 
-    monkeypatch.setattr(rebuild, "in_order", counted)
+    monkeypatch.setattr(rebuild, "in_order", count_rows)
     return rows
 
 
@@ -119,7 +119,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
     assert replayed == [20, 60]
 
 
-def known(engine: Engine) -> dict[str, NDArray[Any]]:
+def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
     """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
@@ -189,12 +189,12 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
                 compact(tmp_path)
                 keep(engine, tmp_path)
         keep(engine, tmp_path)  # and nothing after it
-        live = known(engine)
+        live = read_state(engine)
         assert engine.state.fusion.waiting
     for kept in (2, 1, 0):  # from the last checkpoint, from the one before, from the log alone
         assert len(checkpoints.newest(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
-            found = known(again)
+            found = read_state(again)
             assert (again.seen, again.counts["checkpoints_refused"]) == (
                 again.state.streams.newest,
                 0,

@@ -14,7 +14,7 @@ from fleet_service.ingest.weather import archived_reports as archived_weather
 from schemas import keys, weather, wire
 from tests.buckets import BucketServer
 from tests.fleet_service.replication.test_lease import Machine
-from tests.standbys import restored
+from tests.standbys import restore_archive
 
 
 def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
@@ -58,7 +58,7 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
         None,
     )  # as if it had been frozen right behind its looks
     one.copy.sync()
-    found = restored(tmp_path / "new", bucket)
+    found = restore_archive(tmp_path / "new", bucket)
     held = vehicle_ids.read(found / "keys")
     assert {name: held.get(name) for name in known_there} == known_there
     assert set(archived_weather(found).region.tolist()) == {1, 2, 3, 4}

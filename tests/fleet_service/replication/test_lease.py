@@ -29,26 +29,26 @@ from schemas.errors import InputError
 from schemas.wire import Batch, Kind
 from tests.buckets import BucketServer
 from tests.fleet_service.app.test_copy import BATCHES, PATIENCE_S, reports
-from tests.fleet_service.app.test_kill import archived, identities
+from tests.fleet_service.app.test_kill import identities, list_archived
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.archive.rows import identities as rows_in
 from tests.fleet_service.archive.rows import rows_of
-from tests.schemas.runtime.test_metrics import fetch
-from tests.standbys import Host, hosts, restored
+from tests.schemas.runtime.test_metrics import fetch_page
+from tests.standbys import Host, open_hosts, restore_archive
 from tests.waiting import until
 
 RESEND_S = 1.0
 LEASE_S = 4.0  # of who is no process: a request may take a quarter of it
 
 
-def frozen(host: Host) -> None:
+def freeze_host(host: Host) -> None:
     host.part.send_signal(signal.SIGSTOP)
 
 
 GONE: dict[str, Callable[[Host], None]] = {
     "killed": lambda host: host.part.kill(),
     "stopped": lambda host: host.part.send_signal(signal.SIGTERM),
-    "frozen": frozen,
+    "frozen": freeze_host,
     "cut from the bucket": lambda host: host.to_bucket.cut(),
     "cut from the routers": lambda host: host.to_router.cut(),
 }
@@ -61,55 +61,55 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 ) -> None:
     fleet = Fleet(session)
     before, during, after = (reports(0.8, n * BATCHES + 1, (n + 1) * BATCHES) for n in range(3))
-    with hosts(tmp_path, ["one", "two"], router.connect[0], bucket, lease_s=3.0) as (one, two):
+    with open_hosts(tmp_path, ["one", "two"], router.connect[0], bucket, lease_s=3.0) as (one, two):
         one.part.start()
         one.part.line_with("ready: ")
         two.part.start()
         two.part.line_with("standby: ")
-        until(driven(fleet, before), PATIENCE_S)
+        until(make_driver(fleet, before), PATIENCE_S)
         for sent in during[: len(during) // 2]:
             fleet.publish(sent)
         GONE[how](one)
         two.part.line_with("ready: ")
-        until(driven(fleet, during), PATIENCE_S)
+        until(make_driver(fleet, during), PATIENCE_S)
         if how == "frozen":
             one.part.send_signal(signal.SIGCONT)
-        one.to_router.mend()
+        one.to_router.restore()
         if how not in {
             "killed",
             "stopped",
         }:  # cut from the bucket, it hears of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
-            assert one.said("lease lost to another service")
-        one.to_bucket.mend()
+            assert one.has_said("lease lost to another service")
+        one.to_bucket.restore()
         one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
         one.part.line_with("standby: ")
         two.part.stop()
         one.part.line_with("ready: ")
-        until(driven(fleet, after), PATIENCE_S)
+        until(make_driver(fleet, after), PATIENCE_S)
         assert one.part.stop() == 0
     _whole(fleet, before + during + after, tmp_path / "one")
-    restored(tmp_path / "new", bucket)
+    restore_archive(tmp_path / "new", bucket)
     _whole(fleet, before + during + after, tmp_path / "new")
 
 
-def driven(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
+def make_driver(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
     """Return True if all is acknowledged; the rest is sent again each second, as outboxes do."""
     last = [0.0]
 
-    def done() -> bool:
+    def is_done() -> bool:
         if time.monotonic() - last[0] < RESEND_S:
-            return not fleet.unsettled(sent)
+            return not fleet.list_unsettled(sent)
         last[0] = time.monotonic()
-        for one in fleet.unsettled(sent):
+        for one in fleet.list_unsettled(sent):
             fleet.publish(one)
         return False
 
-    return done
+    return is_done
 
 
 def _whole(fleet: Fleet, sent: list[Batch], folder: Path) -> None:
-    found = archived(folder)
+    found = list_archived(folder)
     assert len(found) == len(set(found)) == 3 * len(sent)
     assert sorted(found) == sorted(identities(fleet, folder))
 
@@ -120,7 +120,7 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 ) -> None:
     fleet = Fleet(session)
     sent = reports(0.8, 1, BATCHES)
-    with hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (
+    with open_hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (
         one,
         two,
         three,
@@ -130,12 +130,12 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
         for host in (two, three):
             host.part.start()
             host.part.line_with("standby: ")
-        until(driven(fleet, sent), PATIENCE_S)
+        until(make_driver(fleet, sent), PATIENCE_S)
         one.part.kill()
-        until(lambda: two.said("ready: ") or three.said("ready: "), PATIENCE_S)
-        first, second = (two, three) if two.said("ready: ") else (three, two)
-        until(lambda: second.said("standby: shard-0 is served under lease 2"), PATIENCE_S)
-        assert not second.said("ready: ")
+        until(lambda: two.has_said("ready: ") or three.has_said("ready: "), PATIENCE_S)
+        first, second = (two, three) if two.has_said("ready: ") else (three, two)
+        until(lambda: second.has_said("standby: shard-0 is served under lease 2"), PATIENCE_S)
+        assert not second.has_said("ready: ")
         first.part.kill()
         second.part.line_with("ready: ")
         assert second.part.stop() == 0
@@ -215,16 +215,16 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     one.copy._may = lambda: True  # as if it had been frozen right behind the look at its lease
     with pytest.raises(CopyError, match="another service has the lease"):
         one.copy.sync()
-    names = bucket.objects()
+    names = bucket.read_objects()
     assert any(name.startswith("observations/") for name in names)
     assert sum(name.startswith("inbox/") for name in names) == 4  # nothing was deleted
     compact(two.root)
     two.copy.sync()
-    for root in (two.root, restored(tmp_path / "new", bucket)):
+    for root in (two.root, restore_archive(tmp_path / "new", bucket)):
         assert sorted(rows_in(root, Kind.OBSERVATION)) == sorted(before)
     two.close()
     again = Machine(tmp_path / "two", bucket)  # its start takes away what does not count
-    assert not [name for name in bucket.objects() if name.startswith("inbox/")]
+    assert not [name for name in bucket.read_objects() if name.startswith("inbox/")]
     again.close()
     one.close()
     back = Machine(tmp_path / "one", bucket)
@@ -260,12 +260,12 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     goes_on = threading.Event()
     place = compaction._place
 
-    def placed(*args: Any) -> int:  # noqa: ANN401
+    def count_placed(*args: Any) -> int:  # noqa: ANN401
         has_read.set()
         goes_on.wait()
         return place(*args)
 
-    monkeypatch.setattr(compaction, "_place", placed)
+    monkeypatch.setattr(compaction, "_place", count_placed)
     still = threading.Thread(target=compact, args=(one.root,))
     still.start()
     has_read.wait()
@@ -288,7 +288,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     for thread in (still, start):
         thread.join(PATIENCE_S)
     back[0].copy.sync()
-    for root in (one.root, restored(tmp_path / "new", bucket)):
+    for root in (one.root, restore_archive(tmp_path / "new", bucket)):
         assert len(rows_in(root, Kind.OBSERVATION)) == 5
     back[0].close()
 
@@ -319,9 +319,9 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
     holder = Machine(tmp_path / "one", bucket)
     with (
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told,
-        hosts(tmp_path, ["two"], router.connect[0], bucket, lease_s=LEASE_S, metrics_port=0) as (
-            two,
-        ),
+        open_hosts(
+            tmp_path, ["two"], router.connect[0], bucket, lease_s=LEASE_S, metrics_port=0
+        ) as (two,),
     ):
         told.bind(str(tmp_path / "notify"))
         told.settimeout(PATIENCE_S)
@@ -331,11 +331,14 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
         address = two.part.line_with("standby: shard-0 ").rpartition(", ")[2]
         for _ in range(3):
             assert told.recv(100) == b"READY=1\nWATCHDOG=1"
-        assert 'gripmap_serves{regions="*/*/*"} 0.0' in fetch(f"{address}/metrics")[2].splitlines()
-        assert fetch(f"{address}/healthz")[0] == 200
+        assert (
+            'gripmap_serves{regions="*/*/*"} 0.0'
+            in fetch_page(f"{address}/metrics")[2].splitlines()
+        )
+        assert fetch_page(f"{address}/healthz")[0] == 200
         holder.close()
         two.part.line_with("ready: ")
-        lines = fetch(f"{two.part.line_with('ready: ').rpartition(', ')[2]}/metrics")[
+        lines = fetch_page(f"{two.part.line_with('ready: ').rpartition(', ')[2]}/metrics")[
             2
         ].splitlines()
         assert 'gripmap_serves{regions="*/*/*"} 1.0' in lines

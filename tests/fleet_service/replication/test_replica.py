@@ -26,7 +26,7 @@ from fleet_service.replication.upload_journal import last_copy_url
 from schemas.config import ServiceConfig, load
 from schemas.errors import InputError
 from schemas.wire import Kind
-from tests.buckets import SECRET, BucketServer, held
+from tests.buckets import SECRET, BucketServer, list_copied_files
 from tests.fleet_service.archive.rows import identities, rows_of
 from tests.waiting import until
 
@@ -39,22 +39,22 @@ def make(bucket: BucketServer) -> Iterator[Make]:
     """A copy of an archive, which was begun."""
     made: list[BucketReplica] = []
 
-    def begun(root: Path) -> BucketReplica:
+    def begin_replica(root: Path) -> BucketReplica:
         root.mkdir(exist_ok=True)
         made.append(BucketReplica(root, bucket.url, bucket.store))
         made[-1].sync_without_lease(NAME)
         return made[-1]
 
-    yield begun
+    yield begin_replica
     for copy in made:
         copy.close()
 
 
 def there(bucket: BucketServer) -> dict[str, bytes]:
-    return {name: content for name, content in bucket.objects().items() if name != OWNER}
+    return {name: content for name, content in bucket.read_objects().items() if name != OWNER}
 
 
-def filled(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
+def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
     """A log with segments of both kinds, which are settled."""
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)
@@ -69,9 +69,9 @@ def test_what_is_settled_is_in_the_bucket_byte_for_byte(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
-    with closing(filled(root, make(root))):
+    with closing(fill_log(root, make(root))):
         assert len(there(bucket)) == 2 * 3 + 1
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
 
 
 def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
@@ -79,7 +79,7 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
 ) -> None:
     root = tmp_path / "archive"
     copy = make(root)
-    with closing(filled(root, copy)) as log:
+    with closing(fill_log(root, copy)) as log:
         bucket.stop()
         log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 7), [7])
         with pytest.raises(CopyError):
@@ -96,17 +96,17 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
         bucket.start()
         done: list[int] = []
 
-        def settled() -> bool:
+        def has_settled() -> bool:
             try:
                 done.extend(log.flush())
             except CopyError:
                 return False
             return True
 
-        until(settled)
+        until(has_settled)
         assert done == [7, 8]
         assert copy.trouble is None
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
     assert len(identities(root, Kind.OBSERVATION)) == 5 * 5
 
 
@@ -115,12 +115,12 @@ def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(
 ) -> None:
     root = tmp_path / "archive"
     copy = make(root)
-    with closing(filled(root, None)):
+    with closing(fill_log(root, None)):
         (first, *others) = segments.paths(root, Kind.OBSERVATION)
-        bucket.place("inbox").mkdir(parents=True)
-        bucket.place(f"inbox/{first.name}").write_bytes(first.read_bytes())
+        bucket.path_of("inbox").mkdir(parents=True)
+        bucket.path_of(f"inbox/{first.name}").write_bytes(first.read_bytes())
         copy.upload_segments([first])
-        bucket.place(f"inbox/{others[0].name}").write_bytes(b"another's")
+        bucket.path_of(f"inbox/{others[0].name}").write_bytes(b"another's")
         with pytest.raises(CopyError, match="another service"):
             copy.upload_segments([others[0]])
 
@@ -130,17 +130,17 @@ def test_the_copy_follows_compaction_and_retention(
 ) -> None:
     root = tmp_path / "archive"
     copy = make(root)
-    with closing(filled(root, copy)):
+    with closing(fill_log(root, copy)):
         assert compact(root).segments == 6
         assert any(name.startswith("inbox/") for name in there(bucket))
         assert copy.sync() > 0
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
         assert not any(name.startswith("inbox/") for name in there(bucket))
         assert copy.sync() == 0
         retire_rows(root, 31, date(2100, 1, 1))
         assert not list(layout.compacted_files(root, Kind.OBSERVATION))
         copy.sync()
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
 
 
 def test_segment_compacted_before_its_upload_is_settled_by_the_result(
@@ -148,11 +148,11 @@ def test_segment_compacted_before_its_upload_is_settled_by_the_result(
 ) -> None:
     root = tmp_path / "archive"
     copy = make(root)
-    with closing(filled(root, None)):
+    with closing(fill_log(root, None)):
         gone = segments.paths(root, Kind.OBSERVATION)
         compact(root)
         copy.upload_segments(gone)
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
         assert any(name.startswith("observations/") for name in there(bucket))
 
 
@@ -162,17 +162,17 @@ def test_an_empty_disk_has_all_of_it_again(
     root = tmp_path / "archive"
     new = tmp_path / "new"
     copy = make(root)
-    with closing(filled(root, copy)):
+    with closing(fill_log(root, copy)):
         compact(root)
         copy.sync()
-    with closing(filled(root, copy, range(3, 5))):
+    with closing(fill_log(root, copy, range(3, 5))):
         pass
-    (half := bucket.place("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(
+    (half := bucket.path_of("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(
         parents=True
     )
     half.write_bytes(b"half a checkpoint")
     make(new)
-    assert held(new) == held(root)
+    assert list_copied_files(new) == list_copied_files(root)
     assert len(identities(new, Kind.OBSERVATION)) == 5 * 5
     assert {path.stat().st_mode & 0o777 for path in (new / "keys").iterdir()} == {0o600}
     assert last_copy_url(new) == bucket.url
@@ -183,19 +183,19 @@ def test_what_was_cut_off_is_made_good_at_the_next_start(
 ) -> None:
     root = tmp_path / "archive"
     copy = make(root)
-    with closing(filled(root, copy)):
+    with closing(fill_log(root, copy)):
         copy.close()
-    with closing(filled(root, None, range(3, 4))):  # written and not put
+    with closing(fill_log(root, None, range(3, 4))):  # written and not put
         damaged = segments.paths(root, Kind.OBSERVATION)[0]
         whole = damaged.read_bytes()
         set_aside(damaged, "a bit has turned")
-        lost = bucket.place(f"inbox/{segments.paths(root, Kind.OBSERVATION)[1].name}")
+        lost = bucket.path_of(f"inbox/{segments.paths(root, Kind.OBSERVATION)[1].name}")
         lost.unlink()
         make(root)
         assert damaged.read_bytes() == whole
         assert not list(root.rglob("*.bad"))
         assert lost.exists()
-        assert there(bucket) == held(root)
+        assert there(bucket) == list_copied_files(root)
 
 
 def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(replica, "SLOW_S", 1.0)
-    bucket.away(kind)
+    bucket.take_away(kind)
     with (
         closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy,
         pytest.raises(InputError) as told,

@@ -112,7 +112,7 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
     assert not alerts.update(updated.slots)
 
 
-def called(
+def report_in_turn(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
     """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it
@@ -132,12 +132,12 @@ def called(
 
 
 def test_two_witnesses_of_new_ice_raise_an_alert_on_a_dry_road() -> None:
-    _, under = called(0.85, range(20), 0.2, range(5, 11), wait=700.0)
+    _, under = report_in_turn(0.85, range(20), 0.2, range(5, 11), wait=700.0)
     assert under == [False, True, True, True, True, True]
 
 
 def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> None:
-    fusion, under = called(0.85, range(20), 0.2, range(5, 11), wait=200.0)
+    fusion, under = report_in_turn(0.85, range(20), 0.2, range(5, 11), wait=200.0)
     assert slippery(belief(fusion)) > 0.9
     assert under == [False, False, False, True, True, True]
 
@@ -186,13 +186,13 @@ def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None
 def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(
     wait: float, needed: int
 ) -> None:
-    fusion, under = called(0.2, range(20), 0.85, range(5, 11), wait)
+    fusion, under = report_in_turn(0.2, range(20), 0.85, range(5, 11), wait)
     assert slippery(belief(fusion)) < 0.05
     assert under == [True] * (needed - 1) + [False] * (7 - needed)
 
 
 def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
-    fusion, _ = called(0.2, range(4), 0.2, range(0))
+    fusion, _ = report_in_turn(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
     assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
     rng = np.random.default_rng(3)

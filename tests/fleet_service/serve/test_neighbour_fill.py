@@ -18,7 +18,7 @@ EAST: IntArray = grid.interleave(
 ROUTE = EAST * grid.SECTORS
 
 
-def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
+def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
     """Return the beliefs that thirty cells in a row borrow, in all tiles, when three vehicles gave
     a value of some of them."""
     fusion = Fusion(120.0)
@@ -43,7 +43,7 @@ def widths(cells: CellView) -> dict[int, float]:
 
 
 def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
-    cells = borrowed({5: 0.3})
+    cells = borrow_beliefs({5: 0.3})
     assert cells.imputed.all()
     near = cells.belief[np.argsort(cells.cell)] @ (mugrid.CENTRES < 0.4)
     place = np.sort([np.flatnonzero(c == EAST)[0] for c in cells.cell])
@@ -55,7 +55,7 @@ def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
 
 
 def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
-    cells = borrowed({5: 0.2, 12: 0.9})
+    cells = borrow_beliefs({5: 0.2, 12: 0.9})
     found = {
         int(np.flatnonzero(c == EAST)[0]): b for c, b in zip(cells.cell, cells.belief, strict=True)
     }
@@ -67,6 +67,6 @@ def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
 
 
 def test_without_a_route_only_what_adjoins_is_borrowed() -> None:
-    cells = borrowed({5: 0.3}, route=None)
+    cells = borrow_beliefs({5: 0.3}, route=None)
     assert len(cells.cell) == 8
-    assert set(widths(borrowed({5: 0.3}))) >= {4, 6}
+    assert set(widths(borrow_beliefs({5: 0.3}))) >= {4, 6}

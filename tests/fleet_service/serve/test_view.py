@@ -18,7 +18,7 @@ def belief_around(mu: float, std: float) -> FloatArray:
     return np.asarray(shape / shape.sum())
 
 
-def seen(belief: FloatArray, values: float) -> CellView:
+def make_view(belief: FloatArray, values: float) -> CellView:
     one = np.ones(1, np.int64)
     return CellView(
         one * CELL,
@@ -35,7 +35,7 @@ def seen(belief: FloatArray, values: float) -> CellView:
 
 @pytest.mark.parametrize("mu", [0.15, 0.2, 0.3])
 def test_a_slippery_belief_without_values_of_its_own_is_measured(mu: float) -> None:
-    row = batch_of(seen(belief_around(mu, 0.05), 0.0), START + 1).to_pylist()[0]
+    row = batch_of(make_view(belief_around(mu, 0.05), 0.0), START + 1).to_pylist()[0]
     assert row["p_slippery"] > 0.5
     assert row["basis"] == "measured"
     assert row["mu"] is not None
@@ -43,7 +43,7 @@ def test_a_slippery_belief_without_values_of_its_own_is_measured(mu: float) -> N
 
 def test_a_belief_that_is_probably_not_slippery_stays_a_bound() -> None:
     passed = np.where(mugrid.CENTRES > 0.3, PRIOR, 0.0)
-    row = batch_of(seen(passed / passed.sum(), 0.0), START + 1).to_pylist()[0]
+    row = batch_of(make_view(passed / passed.sum(), 0.0), START + 1).to_pylist()[0]
     assert row["basis"] == "bound"
     assert row["mu"] is None
 

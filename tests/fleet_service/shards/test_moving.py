@@ -19,9 +19,9 @@ from fleet_service.replication.ownership import acquire_archive
 from fleet_service.shards.serving import standby_signs
 from schemas.config import ServiceConfig, ZenohSettings
 from tests.buckets import BucketServer
-from tests.fleet_service.app.test_copy import BATCHES, known, reports
+from tests.fleet_service.app.test_copy import BATCHES, read_image, reports
 from tests.fleet_service.app.test_service import Fleet
-from tests.fleet_service.replication.test_lease import driven
+from tests.fleet_service.replication.test_lease import make_driver
 from tests.waiting import until
 
 PATIENCE_S = 120.0
@@ -50,9 +50,9 @@ class Machine:
 
     def start(self, awaited: str) -> None:
         self._thread.start()
-        until(lambda: self.said(awaited), PATIENCE_S)
+        until(lambda: self.has_said(awaited), PATIENCE_S)
 
-    def said(self, start: str) -> bool:
+    def has_said(self, start: str) -> bool:
         return any(line.startswith(start) for line in self.lines)
 
     def end(self) -> Service:
@@ -93,23 +93,23 @@ def test_a_region_is_handed_over_with_all_that_was_known(
     with machines(router, bucket, tmp_path, "north-a", "north-b") as (one, two):
         one.start("ready: ")
         two.start("standby: north-a ")
-        until(driven(fleet, sent), PATIENCE_S)
+        until(make_driver(fleet, sent), PATIENCE_S)
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", *connect]) == 0
         told = capsys.readouterr().out.splitlines()
         assert told[0] == f"north-a hands over {EVERYWHERE}"
         assert told[1].startswith(f"north-b serves {EVERYWHERE}; nobody did for ")
         former = one.end()
         assert former.exit_code == 0
-        until(lambda: two.said("ready: "), PATIENCE_S)
+        until(lambda: two.has_said("ready: "), PATIENCE_S)
         assert two.service is not None
         engine = two.service.engine
         assert engine.alerts.count > 0
-        expected = known(former.engine)
-        found = known(engine)
+        expected = read_image(former.engine)
+        found = read_image(engine)
         assert expected.keys() == found.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         again = Fleet(session)  # what comes again is known there
-        until(driven(again, sent), PATIENCE_S)
+        until(make_driver(again, sent), PATIENCE_S)
         assert engine.counts["duplicates"] >= len(sent)
         config = tmp_path / "config.json"
         config.write_text(json.dumps({"zenoh": router.model_dump()}))
@@ -132,7 +132,7 @@ def test_a_region_stays_where_nobody_stands_by_for_it(
             "error: to: no 'north-b' stands by, not for */*/*; start it with --standby"
             in capsys.readouterr().err
         )
-        assert not one.said("handing over: ")
+        assert not one.has_said("handing over: ")
         one.stop.set()
         one.end()
 

@@ -166,7 +166,7 @@ def test_a_second_service_of_a_region_refuses_to_start(
 ) -> None:
     wide = NAMES[1].rpartition("/")[0] + "/*"
 
-    def refused(name: str) -> None:
+    def assert_refused(name: str) -> None:
         with (
             pytest.raises(
                 InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"
@@ -181,7 +181,7 @@ def test_a_second_service_of_a_region_refuses_to_start(
         ThreadPoolExecutor() as both,
     ):
         list(
-            both.map(refused, ("first", "second"))
+            both.map(assert_refused, ("first", "second"))
         )  # also one of the same name, on another machine
     with (
         zenoh_session(router) as other,
@@ -206,14 +206,14 @@ def test_region_is_announced_only_while_queries_are_answered(
     answering = Service._declared
 
     @contextmanager
-    def looked(service: Service, session: zenoh.Session) -> Iterator[None]:
+    def record_tokens(service: Service, session: zenoh.Session) -> Iterator[None]:
         with answering(service, session):
             seen.append(tokens.active_tokens(session))
             yield
             until(lambda: not tokens.active_tokens(session))
             seen.append(set())
 
-    monkeypatch.setattr(Service, "_declared", looked)
+    monkeypatch.setattr(Service, "_declared", record_tokens)
     with (
         running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
         zenoh_session(router) as other,
@@ -231,16 +231,16 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
         mine = frozenset({keys.ServiceToken(NAMES[1], "late", "1f")})
         coming = announce_regions(other, mine)
 
-        def come(*_: object) -> bool:
+        def let_come(*_: object) -> bool:
             coming.__enter__()
             until(lambda: tokens.active_tokens(third) == mine)
             return True
 
         with monkeypatch.context() as meanwhile:
             meanwhile.setattr(
-                map_client, "query_replies", lambda *_: iter([] if late else [come()][1:])
+                map_client, "query_replies", lambda *_: iter([] if late else [let_come()][1:])
             )
-            meanwhile.setattr(map_client, "is_served", come)
+            meanwhile.setattr(map_client, "is_served", let_come)
             answer = ask(router, bbox=inside)
         assert (answer.gap_description is None, answer.served) == (False, False)
         coming.__exit__(None, None, None)

@@ -28,7 +28,7 @@ _FLOAT = st.floats(width=32)
 
 
 @st.composite
-def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobuf messages are untyped
+def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobuf messages are untyped
     """A message with records, some of its columns, and anything in them."""
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](
@@ -50,7 +50,7 @@ def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobu
     return message
 
 
-def agrees(kind: Kind, payload: bytes) -> bool:
+def is_agreed(kind: Kind, payload: bytes) -> bool:
     """Return True if the scanner understands the bytes; fail if it then reads something else
     than the library.
     """
@@ -80,17 +80,17 @@ def agrees(kind: Kind, payload: bytes) -> bool:
 
 
 @compiled
-@given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), sent(kind))))
+@given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), draw_message(kind))))
 def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(
     case: tuple[Kind, Any],
 ) -> None:
     kind, message = case
-    assert agrees(kind, message.SerializeToString())
+    assert is_agreed(kind, message.SerializeToString())
 
 
 @compiled
 @given(
-    KINDS.flatmap(lambda kind: st.tuples(st.just(kind), sent(kind))),
+    KINDS.flatmap(lambda kind: st.tuples(st.just(kind), draw_message(kind))),
     st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=4),
     st.integers(0, 2000),
     st.binary(max_size=12),
@@ -102,10 +102,10 @@ def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
     payload = bytearray(message.SerializeToString())
     for place, value in flips:
         payload[place % len(payload)] = value
-    agrees(kind, bytes(payload))
+    is_agreed(kind, bytes(payload))
     place = cut % len(payload)
-    agrees(kind, bytes(payload[:place]))
-    agrees(kind, bytes(payload[:place]) + inserted + bytes(payload[place:]))
+    is_agreed(kind, bytes(payload[:place]))
+    is_agreed(kind, bytes(payload[:place]) + inserted + bytes(payload[place:]))
 
 
 @compiled
@@ -113,10 +113,10 @@ def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
 def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(
     payload: bytes, kind: Kind
 ) -> None:
-    agrees(kind, payload)
+    is_agreed(kind, payload)
 
 
-def _example() -> Any:  # noqa: ANN401
+def _make_example() -> Any:  # noqa: ANN401
     message = pb.ObservationBatch(vehicle="sim-001", boot=7, region=5, seq=3, first_held=2)
     message.enter_time.extend([1, 2])
     message.latitude.extend([57.0, 57.0])
@@ -125,41 +125,43 @@ def _example() -> Any:  # noqa: ANN401
     return message
 
 
-def _run(number: int, body: bytes) -> bytes:
+def _encode_run(number: int, body: bytes) -> bytes:
     return bytes([(number << 3 & 127 | 2) | 128, number >> 4, len(body)]) + body
 
 
 @pytest.mark.parametrize(
     "more",
     [
-        _run(40, b"unknown"),
-        _run(31, bytes([1, 1])),  # health a second time, which appends
-        _run(25, struct.pack("<2f", 1.0, 2.0)) + _run(25, b""),
+        _encode_run(40, b"unknown"),
+        _encode_run(31, bytes([1, 1])),  # health a second time, which appends
+        _encode_run(25, struct.pack("<2f", 1.0, 2.0)) + _encode_run(25, b""),
         b"\x98\x00" + b"\x01",  # field 3 by a tag that is longer than it need be
         bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", 1.0),  # speed, not packed
         bytes([2 << 3 | 1]) + bytes(8),  # boot a second time, which replaces
-        _run(33, b"\x00" * 7),
-        _run(32, b"\x80" * 9 + b"\x02" + b"\x00"),  # more than 64 bits
-        _run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # more than 32 bits
+        _encode_run(33, b"\x00" * 7),
+        _encode_run(32, b"\x80" * 9 + b"\x02" + b"\x00"),  # more than 64 bits
+        _encode_run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # more than 32 bits
     ],
 )
 def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> None:
-    payload = _example().SerializeToString()
-    assert agrees(Kind.OBSERVATION, payload)
-    assert not agrees(Kind.OBSERVATION, payload + more)
+    payload = _make_example().SerializeToString()
+    assert is_agreed(Kind.OBSERVATION, payload)
+    assert not is_agreed(Kind.OBSERVATION, payload + more)
     with_error = decode_many(Kind.OBSERVATION, [(payload, ""), (payload + more, ""), (payload, "")])
     assert with_error.indices[0] == 0
     assert with_error.indices[-1] == 2
 
 
 def test_unknown_fields_and_unpacked_columns_are_read() -> None:
-    message = _example()
+    message = _make_example()
     plain = decode(message.SerializeToString(), "", Kind.OBSERVATION)
     unpacked = b"".join(
         bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", v) for v in (3.0, 4.0)
     )
     odd = decode(
-        _run(40, b"later version") + message.SerializeToString() + unpacked, "", Kind.OBSERVATION
+        _encode_run(40, b"later version") + message.SerializeToString() + unpacked,
+        "",
+        Kind.OBSERVATION,
     )
     assert odd.columns["speed"].tolist() == [3.0, 4.0]
     assert (odd.vehicle, odd.boot, odd.seq) == (plain.vehicle, plain.boot, plain.seq)
@@ -167,10 +169,10 @@ def test_unknown_fields_and_unpacked_columns_are_read() -> None:
 
 
 def test_non_ascii_names_go_to_the_library_and_broken_ones_are_refused() -> None:
-    message = _example()
+    message = _make_example()
     message.vehicle = "müller"
     payload = message.SerializeToString()
-    assert not agrees(Kind.OBSERVATION, payload)
+    assert not is_agreed(Kind.OBSERVATION, payload)
     assert decode(payload, ENCODING[Kind.OBSERVATION], Kind.OBSERVATION).vehicle == "müller"
     with pytest.raises(WireError, match="^payload: "):
         decode(payload.replace("ü".encode(), b"\xff\xff"), "", Kind.OBSERVATION)

@@ -45,13 +45,13 @@ def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseExcepti
     path = tmp_path / "a"
     path.write_bytes(b"old")
 
-    def half() -> None:
+    def write_half() -> None:
         with open_durably(path) as file:
             file.write(b"new")
             raise error
 
     with pytest.raises(type(error)):
-        half()
+        write_half()
     assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"old", ["a"])
 
 

@@ -28,7 +28,7 @@ def test_figure_holds_on_the_right_side_and_never_when_missing(figure: Figure, h
     assert figure.holds is holds
 
 
-def _git(folder: Path, *words: str) -> str:
+def _run_git(folder: Path, *words: str) -> str:
     who = ("-c", "user.name=nobody", "-c", "user.email=nobody@example.org")
     done = subprocess.run(
         ["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True
@@ -45,10 +45,10 @@ def test_the_commit_is_that_of_the_source_and_says_whether_it_was_changed(
     source.parent.mkdir(parents=True)
     source.write_text("1")
     assert commit(source) == "unknown"
-    _git(source.parent, "init", "-q")
-    _git(source.parent, "add", ".")
-    _git(source.parent, "commit", "-qm", "first")
-    head = _git(source.parent, "rev-parse", "--short=7", "HEAD")
+    _run_git(source.parent, "init", "-q")
+    _run_git(source.parent, "add", ".")
+    _run_git(source.parent, "commit", "-qm", "first")
+    head = _run_git(source.parent, "rev-parse", "--short=7", "HEAD")
     assert commit(source) == head
     other.write_text("installed here, and no part of it")
     assert commit(other) == "unknown"

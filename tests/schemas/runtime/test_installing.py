@@ -41,8 +41,8 @@ def test_the_hint_installs_from_the_same_place(
 def test_a_source_tree_that_was_never_installed_has_a_hint_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def missing(_: str) -> None:
+    def raise_missing(_: str) -> None:
         raise metadata.PackageNotFoundError
 
-    monkeypatch.setattr(metadata, "distribution", missing)
+    monkeypatch.setattr(metadata, "distribution", raise_missing)
     assert "[metrics]" in install_command("metrics")

@@ -27,7 +27,7 @@ def inner(x: float) -> float:
 FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
 
 
-def run(folder: Path, factor: str, before: str = "") -> str:
+def run_outer(folder: Path, factor: str, before: str = "") -> str:
     """Return the result of outer(1.0) in a new process, with `inner` multiplying by `factor`."""
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
@@ -49,8 +49,8 @@ def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> N
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()
     (tmp_path / "kernels" / "outer.py").write_text(CALLER)
-    assert run(tmp_path, "2.0") == "3.0"
-    assert run(tmp_path, "5.0") == "6.0"
+    assert run_outer(tmp_path, "2.0") == "3.0"
+    assert run_outer(tmp_path, "5.0") == "6.0"
     assert len(list((tmp_path / "cache" / "gripmap").glob("kernels-*"))) == 2
 
 
@@ -58,7 +58,7 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()
     (tmp_path / "kernels" / "outer.py").write_text(CALLER)
-    assert run(tmp_path, "2.0", FULL_DISK) == "3.0"
+    assert run_outer(tmp_path, "2.0", FULL_DISK) == "3.0"
     assert not list((tmp_path / "cache").rglob("*.nbc"))
 
 
@@ -74,10 +74,12 @@ def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, 
         "import os, tempfile; from pathlib import Path; tempfile.tempdir = '/proc/nowhere'; "
         f"os.environ.update(HOME='/proc/nowhere', XDG_CACHE_HOME={place!r}); "
     )
-    assert run(tmp_path, "2.0", homeless) == "3.0"
+    assert run_outer(tmp_path, "2.0", homeless) == "3.0"
     assert not (tmp_path / "cache").exists()
     assert (
-        run(tmp_path, "2.0", homeless.replace("'/proc/nowhere'; from", f"{str(tmp_path)!r}; from"))
+        run_outer(
+            tmp_path, "2.0", homeless.replace("'/proc/nowhere'; from", f"{str(tmp_path)!r}; from")
+        )
         == "3.0"
     )
 
@@ -90,7 +92,7 @@ def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
     shared.mkdir(parents=True)
     shared.chmod(0o777)
     assert (
-        run(tmp_path, "2.0", f"import os; os.environ['HOME'] = {str(tmp_path / 'home')!r}; ")
+        run_outer(tmp_path, "2.0", f"import os; os.environ['HOME'] = {str(tmp_path / 'home')!r}; ")
         == "3.0"
     )
     assert not list(shared.iterdir())

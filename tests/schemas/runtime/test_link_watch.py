@@ -14,7 +14,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.link_watch import LinkWatch, link_metrics, router_metrics
 from schemas.runtime.zenoh_session import configuration
 from tests.fleet_service.examples import key
-from tests.secured import READER, ROUTERS, VEHICLES, network
+from tests.secured import READER, ROUTERS, VEHICLES, open_network
 from tests.waiting import until
 
 RETRY = {
@@ -60,7 +60,7 @@ def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFi
 
 
 def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) -> None:
-    with network(tmp_path, protocol="quic") as there:
+    with open_network(tmp_path, protocol="quic") as there:
         quic = there.endpoints[ROUTERS[0]]
         tls = there.between[ROUTERS[0]]
         closed = "quic/127.0.0.1:9"
@@ -76,26 +76,26 @@ def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: 
     sent = 200
     heard = dict.fromkeys(VEHICLES, 0)
 
-    def count(sample: zenoh.Sample) -> None:
+    def count_message(sample: zenoh.Sample) -> None:
         heard[str(sample.key_expr).rpartition("/")[2]] += 1
 
-    def reaches(session: zenoh.Session, name: str) -> bool:
+    def has_reached(session: zenoh.Session, name: str) -> bool:
         session.put(key(name), b"")
         return bool(heard[name])
 
     with (
-        network(tmp_path, protocol="quic", capped=capped) as there,
-        there.session("shard-0") as service,
-        there.session(VEHICLES[0]) as car,
-        there.session(VEHICLES[1]) as other,
+        open_network(tmp_path, protocol="quic", capped=capped) as there,
+        there.open_session("shard-0") as service,
+        there.open_session(VEHICLES[0]) as car,
+        there.open_session(VEHICLES[1]) as other,
     ):
-        service.declare_subscriber("gripmap/v1/obs/**", count)
+        service.declare_subscriber("gripmap/v1/obs/**", count_message)
         for session, name in ((car, VEHICLES[0]), (other, VEHICLES[1])):
-            until(partial(reaches, session, name))
+            until(partial(has_reached, session, name))
         heard.update(dict.fromkeys(VEHICLES, 0))
         for _ in range(sent):
             car.put(key(VEHICLES[0]), b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        until(partial(reaches, other, VEHICLES[1]))
+        until(partial(has_reached, other, VEHICLES[1]))
         if capped:
             assert heard[VEHICLES[0]] < sent / 2
         else:

@@ -20,7 +20,7 @@ from schemas.runtime.process import LogLine, line_logger, log_as
 HOSTILE = 'a"b\\c\nd<script>'
 
 
-def read() -> Sequence[Metric]:
+def read_metrics() -> Sequence[Metric]:
     return [
         Metric(
             "refused_messages", "counter", "refused, by reason", {"time": 3, HOSTILE: 4}, "reason"
@@ -29,7 +29,7 @@ def read() -> Sequence[Metric]:
     ]
 
 
-def fetch(address: str) -> tuple[int, str, str]:
+def fetch_page(address: str) -> tuple[int, str, str]:
     try:
         with urllib.request.urlopen(address, timeout=10) as reply:
             return reply.status, reply.headers["Content-Type"], reply.read().decode()
@@ -39,8 +39,8 @@ def fetch(address: str) -> tuple[int, str, str]:
 
 
 def test_metric_values_survive_the_formats_own_parser() -> None:
-    with serve_metrics("127.0.0.1", 0, read, list) as address:
-        status, form, text = fetch(f"{address}/metrics")
+    with serve_metrics("127.0.0.1", 0, read_metrics, list) as address:
+        status, form, text = fetch_page(f"{address}/metrics")
     families = {family.name: family for family in text_string_to_metric_families(text)}
     assert status == 200
     assert form.startswith("application/openmetrics-text; version=1.0.0")
@@ -54,13 +54,13 @@ def test_metric_values_survive_the_formats_own_parser() -> None:
 
 def test_health_follows_the_troubles() -> None:
     troubles: list[str] = []
-    with serve_metrics("127.0.0.1", 0, read, lambda: troubles) as address:
-        assert fetch(f"{address}/healthz")[0] == 200
+    with serve_metrics("127.0.0.1", 0, read_metrics, lambda: troubles) as address:
+        assert fetch_page(f"{address}/healthz")[0] == 200
         troubles.append("the disk is full")
-        status, form, text = fetch(f"{address}/healthz")
+        status, form, text = fetch_page(f"{address}/healthz")
         assert (status, form) == (503, "application/json")
         assert json.loads(text) == {"status": "trouble", "troubles": ["the disk is full"]}
-        assert fetch(f"{address}/elsewhere")[0] == 404
+        assert fetch_page(f"{address}/elsewhere")[0] == 404
         request = urllib.request.Request(f"{address}/metrics", data=b"x", method="POST")
         with pytest.raises(urllib.error.HTTPError, match="501") as refused:
             urllib.request.urlopen(request, timeout=10)
@@ -68,7 +68,7 @@ def test_health_follows_the_troubles() -> None:
 
 
 def test_without_a_port_nothing_listens() -> None:
-    with serve_metrics("127.0.0.1", None, read, list) as address:
+    with serve_metrics("127.0.0.1", None, read_metrics, list) as address:
         assert address is None
 
 
@@ -78,7 +78,7 @@ def test_a_taken_port_is_said() -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"^metrics_port: cannot listen on 127.0.0.1:{port}"):
-            serve_metrics("127.0.0.1", port, read, list).__enter__()
+            serve_metrics("127.0.0.1", port, read_metrics, list).__enter__()
 
 
 def test_lines_are_text_for_people_and_json_for_programs() -> None:

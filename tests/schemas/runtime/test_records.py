@@ -45,7 +45,7 @@ class Widest(Wider):
 
 
 @compiled
-def fill(rows: Records[Row], first: int, last: int) -> None:
+def fill_rows(rows: Records[Row], first: int, last: int) -> None:
     for n in range(first, last):
         row = rows[n]
         row.begun = True
@@ -73,7 +73,7 @@ def test_the_annotations_are_the_fields_and_those_of_a_base_come_first() -> None
 def test_a_kernel_reads_and_writes_the_rows_it_is_given_and_no_other() -> None:
     rows = records(Outer, 4)
     rows["inner"]["level"] = 0.5
-    fill(rows, 1, 3)
+    fill_rows(rows, 1, 3)
     assert rows["begun"].tolist() == [False, True, True, False]
     assert rows["seen"].tolist() == [0, 1, 2, 0]
     assert rows["inner"]["curve"][:, 1].tolist() == [0.0, 1.5, 2.5, 0.0]

@@ -41,13 +41,13 @@ def test_waiting_for_a_router_is_reported_once_without_build_paths(
     stop = threading.Event()
     configured = zenoh_session.configuration
 
-    def counted(settings: ZenohSettings, name: str = "") -> object:
+    def count_tries(settings: ZenohSettings, name: str = "") -> object:
         tries.append(1)
         if len(tries) == 3:
             stop.set()
         return configured(settings, name)
 
-    monkeypatch.setattr(zenoh_session, "configuration", counted)
+    monkeypatch.setattr(zenoh_session, "configuration", count_tries)
     with socket.create_server(("127.0.0.1", 0)) as taken:  # a port at which nobody listens any more
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     with caplog.at_level(logging.WARNING):

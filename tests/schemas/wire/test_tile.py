@@ -17,7 +17,7 @@ from schemas.wire import tile
 from schemas.wire.tile import decode_tile
 
 
-def table(rows: int) -> pa.Table:
+def make_table(rows: int) -> pa.Table:
     columns = [
         pa.array(["measured"] * rows)
         if f.type == pa.string()
@@ -27,7 +27,7 @@ def table(rows: int) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=tables.MAP_SCHEMA)
 
 
-def stream(content: pa.Table, compression: Literal["lz4", "zstd"] | None = None) -> bytes:
+def encode_stream(content: pa.Table, compression: Literal["lz4", "zstd"] | None = None) -> bytes:
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(
         sink, content.schema, options=pa.ipc.IpcWriteOptions(compression=compression)
@@ -38,30 +38,30 @@ def stream(content: pa.Table, compression: Literal["lz4", "zstd"] | None = None)
 
 @pytest.mark.parametrize("rows", [0, 1, 300])
 def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
-    assert decode_tile(stream(table(rows))).equals(table(rows))
+    assert decode_tile(encode_stream(make_table(rows))).equals(make_table(rows))
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_what_would_have_to_be_unpacked_is_refused_before_it_is(
     compression: Literal["zstd", "lz4"],
 ) -> None:
-    bomb = stream(table(tile.MAX_ROWS), compression)
-    assert len(bomb) < 0.2 * table(tile.MAX_ROWS).nbytes
+    bomb = encode_stream(make_table(tile.MAX_ROWS), compression)
+    assert len(bomb) < 0.2 * make_table(tile.MAX_ROWS).nbytes
     with pytest.raises(WireError, match="^tile: is compressed; "):
         decode_tile(bomb)
 
 
 def test_too_many_cells_are_refused() -> None:
     with pytest.raises(WireError, match="^tile: has more than 131072 cells"):
-        decode_tile(stream(table(tile.MAX_ROWS + 1)))
+        decode_tile(encode_stream(make_table(tile.MAX_ROWS + 1)))
 
 
 def test_other_columns_are_refused() -> None:
     with pytest.raises(WireError, match="^tile: has other columns"):
-        decode_tile(stream(pa.table({"nothing": pa.nulls(1 << 30)})))
+        decode_tile(encode_stream(pa.table({"nothing": pa.nulls(1 << 30)})))
 
 
-GOOD = stream(table(20))
+GOOD = encode_stream(make_table(20))
 
 
 @given(st.data())

@@ -20,17 +20,17 @@ from tests.schemas.examples import (
     DATA,
     LATER,
     MESSAGES,
-    acknowledgement,
-    alert,
     batch,
     batch_of_version_1,
+    make_acknowledgement,
+    make_alert,
 )
 
 NUMPY_OF = {"double": "float64", "float": "float32", "sfixed64": "int64"}
 HEADER = {"vehicle", "boot", "region", "seq", "first_held", "estimator"}
 
 
-def same(a: Batch, b: Batch) -> None:
+def assert_same(a: Batch, b: Batch) -> None:
     assert (a.kind, a.vehicle, a.boot, a.region, a.seq, a.first_held, a.estimator) == (
         b.kind,
         b.vehicle,
@@ -49,7 +49,7 @@ def same(a: Batch, b: Batch) -> None:
 @pytest.mark.parametrize("kind", Kind)
 def test_a_batch_comes_back_as_it_was_sent(kind: Kind) -> None:
     sent = batch(kind, 50)
-    same(decode(wire.encode(sent), wire.ENCODING[kind], kind), sent)
+    assert_same(decode(wire.encode(sent), wire.ENCODING[kind], kind), sent)
 
 
 @pytest.mark.parametrize("kind", Kind)
@@ -59,7 +59,7 @@ def test_the_json_mapping_says_the_same_as_the_bytes(kind: Kind) -> None:
         wire.encode(sent)
     )
     text = json_format.MessageToJson(message, preserving_proto_field_name=True)
-    same(decode(text.encode(), wire.JSON, kind), sent)
+    assert_same(decode(text.encode(), wire.JSON, kind), sent)
 
 
 @pytest.mark.parametrize(
@@ -105,11 +105,11 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
             (column == -1 if name in FLAGS else np.isnan(column)).all()
             for name, column in absent.items()
         )
-        same(found, sent)
+        assert_same(found, sent)
     elif name == "ack":
-        assert wire.decode_ack(kept) == acknowledgement()
+        assert wire.decode_ack(kept) == make_acknowledgement()
     else:
-        assert wire.decode_alert(kept) == alert()
+        assert wire.decode_alert(kept) == make_alert()
     assert MESSAGES[name]() == kept
 
 

@@ -18,7 +18,7 @@ from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 
 
-def equipped(
+def equip_vehicle(
     preset: str, *, tcs: float = 1.0, esc: float = 1.0, regeneration: float = 0.0
 ) -> TrueVehicle:
     vehicle = replace(PRESETS[preset], relaxation=0.4, abs_hz=8.0)
@@ -32,7 +32,12 @@ def column(log: pa.Table, name: str) -> FloatArray:
 @pytest.mark.parametrize("preset", ["small", "sedan", "van"])
 def test_anti_lock_brakes_work_in_cycles_and_use_most_of_the_grip_of_snow(preset: str) -> None:
     log, _ = simulate_manoeuvre(
-        "braking", mu=0.3, speed=20.0, vehicle=equipped(preset), sensors="ideal", duration_s=6.0
+        "braking",
+        mu=0.3,
+        speed=20.0,
+        vehicle=equip_vehicle(preset),
+        sensors="ideal",
+        duration_s=6.0,
     )
     works = np.flatnonzero((column(log, "true_abs_active") > 0.0) & (column(log, "true_vx") > 4.0))
     torque = column(log, "torque_fl")[works]
@@ -46,7 +51,7 @@ def test_anti_lock_brakes_work_in_cycles_and_use_most_of_the_grip_of_snow(preset
 def test_traction_control_ends_a_spin_which_is_endless_without_it() -> None:
     faster = {}
     for tcs in (0.0, 1.0):
-        vehicle = equipped("small", tcs=tcs)
+        vehicle = equip_vehicle("small", tcs=tcs)
         log, _ = simulate_manoeuvre(
             "acceleration", mu=0.2, speed=3.0, vehicle=vehicle, sensors="ideal", duration_s=6.0
         )
@@ -64,7 +69,7 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
             "double-lane-change",
             mu=0.3,
             speed=16.0,
-            vehicle=equipped("small", esc=esc),
+            vehicle=equip_vehicle("small", esc=esc),
             sensors="ideal",
         )
         drift[esc] = np.abs(np.arctan2(column(log, "true_vy"), column(log, "true_vx"))).max()
@@ -74,7 +79,9 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
 
 def test_no_controller_works_in_ordinary_driving_on_dry_road() -> None:
     for manoeuvre in ("gentle-braking", "straight", "stop-and-go", "j-turn"):
-        log, _ = simulate_manoeuvre(manoeuvre, mu=0.9, vehicle=equipped("van"), sensors="ideal")
+        log, _ = simulate_manoeuvre(
+            manoeuvre, mu=0.9, vehicle=equip_vehicle("van"), sensors="ideal"
+        )
         assert not any(
             column(log, f"true_{name}_active").any() for name in ("abs", "tcs", "esc")
         ), manoeuvre
@@ -84,7 +91,7 @@ def test_regeneration_brakes_the_driven_axle_alone() -> None:
     log, _ = simulate_manoeuvre(
         "gentle-braking",
         mu=0.9,
-        vehicle=equipped("van", regeneration=3.0),
+        vehicle=equip_vehicle("van", regeneration=3.0),
         sensors="ideal",
         duration_s=9.0,
     )
@@ -107,7 +114,7 @@ def test_a_tyre_builds_up_its_side_force_over_its_relaxation_length() -> None:
 
 def test_split_road_makes_unlike_brake_torques() -> None:
     log, _ = simulate_manoeuvre(
-        "split-braking", mu=split(0.8, 0.15), vehicle=equipped("sedan"), sensors="ideal"
+        "split-braking", mu=split(0.8, 0.15), vehicle=equip_vehicle("sedan"), sensors="ideal"
     )
     works = np.flatnonzero(column(log, "true_abs_active"))
     left, right = (np.abs(column(log, f"torque_{side}")[works].mean()) for side in ("fl", "fr"))

@@ -34,7 +34,7 @@ LEVEL = 0.35
 HOUR = 3600
 
 
-def measured(
+def measure_contract(
     *slot_mu: tuple[int, float], std: float = 0.01, span: tuple[int, int] | None = None
 ) -> Any:  # noqa: ANN401
     slot, mu = (np.array(column) for column in zip(*slot_mu, strict=True))
@@ -44,7 +44,7 @@ def measured(
 
 
 def test_a_breach_runs_from_the_first_slot_below_to_the_next_that_is_not() -> None:
-    by_mean, least, most, begin = measured(
+    by_mean, least, most, begin = measure_contract(
         (10, 0.8), (11, 0.2), (12, 0.2), (13, 0.8), (14, 0.2), (15, 0.8)
     )
     assert (by_mean, least, most) == (2 * SLOT_S, 2 * SLOT_S, 2 * SLOT_S)
@@ -53,22 +53,22 @@ def test_a_breach_runs_from_the_first_slot_below_to_the_next_that_is_not() -> No
 
 def test_between_two_measurements_nobody_knows() -> None:
     far = 20 + GAP_S // SLOT_S
-    by_mean, least, most, _ = measured((10, 0.8), (20, 0.2), (far + 1, 0.2), (far + 9, 0.8))
+    by_mean, least, most, _ = measure_contract((10, 0.8), (20, 0.2), (far + 1, 0.2), (far + 9, 0.8))
     assert least == SLOT_S, "two breaches, surely"
     assert by_mean == (far + 9 - 20) * SLOT_S
     assert most == (far + 9 - 11) * SLOT_S
 
 
 def test_what_is_not_sure_is_neither_below_nor_kept() -> None:
-    by_mean, least, most, _ = measured((10, 0.8), (11, 0.3), (12, 0.8), std=0.1)
+    by_mean, least, most, _ = measure_contract((10, 0.8), (11, 0.3), (12, 0.8), std=0.1)
     assert (by_mean, least, most) == (SLOT_S, 0, SLOT_S)
-    assert measured((10, 0.4), (11, 0.4), std=0.2)[1:3] == (0, 2 * SLOT_S)
+    assert measure_contract((10, 0.4), (11, 0.4), std=0.2)[1:3] == (0, 2 * SLOT_S)
 
 
 def test_before_the_first_and_after_the_last_measurement_it_is_unknown() -> None:
-    *_, most, _ = measured((10, 0.8), span=(0, 30 * SLOT_S))
+    *_, most, _ = measure_contract((10, 0.8), span=(0, 30 * SLOT_S))
     assert most == 19 * SLOT_S
-    assert measured((5, 0.8), (6, 0.8))[:3] == (0, 0, 0)
+    assert measure_contract((5, 0.8), (6, 0.8))[:3] == (0, 0, 0)
 
 
 def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
@@ -193,6 +193,6 @@ def test_a_breach_lies_within_the_measurements() -> None:
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)
-    by_mean, least, most, since = measured((100, 0.2), (101, 0.2), span=span)
+    by_mean, least, most, since = measure_contract((100, 0.2), (101, 0.2), span=span)
     assert least <= by_mean <= most == 1897
     assert since == begin
