@@ -94,7 +94,7 @@ class _OneFence:
     def __init__(self, content: bytes) -> None:
         self._content = content
 
-    def names(self, _: str) -> list[str]:
+    def list_names(self, _: str) -> list[str]:
         """Return the name of the object."""
         return ["fence/0000000001-000001.json.gz"]
 

@@ -102,7 +102,9 @@ BARS: Final = {
     "faults.history.acknowledged": Bar("batches", 2000, "more"),
     "faults.fuzz_parsers.crashes": Bar("inputs that raise what is not documented", 0),
     "faults.fuzz_parsers.hangs": Bar("inputs that take more than five seconds", 0),
-    "faults.fuzz_parsers.executions": Bar("executions", 5000, "more"),
+    "faults.fuzz_parsers.executions": Bar(
+        "executions", 5000, "more"
+    ),  # ten million in the full form
     "faults.fuzz_parsers.lines": Bar("pairs of lines that ran one after the other", 200, "more"),
     "faults.path.implausible_accepted": Bar(
         "reports of places that their car cannot have reached", 0
@@ -112,6 +114,11 @@ BARS: Final = {
     "faults.path.two_car_alerts": Bar("of 210 places on idle roads, the worst of three ways", 2),
     "faults.path.pair_alerts": Bar("of 20 icy places, by two honest cars alone", 2, "more"),
     "faults.path.honest_alerts": Bar("of 20 icy places, by three honest cars", 20, "more"),
+    "faults.availability.other_reader_served": Bar(
+        "of another reader's requests, next to the worst attacker", 0.95, "more"
+    ),
+    "faults.availability.attackers": Bar("kinds of attackers", 7, "more"),
+    "faults.availability.log_bytes": Bar("bytes that the page logged meanwhile", 100_000),
     "faults.privacy.position_over_chance": Bar(
         "of the puts a reader finds a lone car within 25 m, over a place drawn at random", 0.05
     ),

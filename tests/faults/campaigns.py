@@ -7,6 +7,7 @@ from typing import Final
 from tests.faults import (
     age,
     alerts,
+    availability,
     away,
     bitrot,
     clocks,
@@ -215,6 +216,14 @@ CAMPAIGNS: Final = (
             *("faults.privacy.position_over_chance", "faults.privacy.street_over_chance"),
             *("faults.privacy.slippery_delay_s", "faults.privacy.puts"),
             "faults.privacy.control_position",
+        ),
+    ),
+    Campaign(
+        "availability",
+        availability.run,
+        (
+            *("faults.availability.other_reader_served", "faults.availability.attackers"),
+            "faults.availability.log_bytes",
         ),
     ),
     Campaign(
